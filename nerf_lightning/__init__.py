@@ -1,0 +1,22 @@
+"""nerf_lightning: photos in, radiance field out, on the machine you have.
+
+The tree is the data flow, seven stages in order:
+
+    photos -> cameras -> rays -> samples -> field -> renderer -> pixels
+
+    dataset/    photos and poses become a Scene; data modules draw pixels or rays from it
+    cameras/    Cameras (K, c2w, size) turn pixel coordinates into Rays; Bounds say where the content is
+    sampler/    Rays become Samples: where along each ray the field is asked
+    model/      fields: position, direction -> density, rgb; encodings; 2D fields
+    renderer/   Samples with density and rgb become colour, opacity, depth
+    system/     NeRF2D and NeRF3D: LightningModules that hold step, loss, metrics, optimiser
+    callbacks/  budget, held-out PSNR, snapshots, orbit, checkpoints, progress, results.json
+    build.py    config -> objects, the only place that instantiates
+    __main__.py the command line: compose -> build -> fit -> test -> results.json
+
+Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples
+(or points), L levels or frequencies, F features. Cameras follow OpenCV: x right, y down, z forward; `c2w` maps camera to world;
+pixel centres lie at +0.5. Lengths are in the scene's own unit, colours are sRGB in [0, 1].
+"""
+
+__version__ = "0.1.0"

@@ -1,0 +1,20 @@
+"""Stage 1, cameras: pixels -> Rays, and the Bounds that say where along them the content is."""
+
+from nerf_lightning.cameras.bounds import Bounds
+from nerf_lightning.cameras.cameras import Cameras, Rays
+from nerf_lightning.cameras.orbit import focus_point, look_at, orbit_around, orbit_like
+from nerf_lightning.cameras.transforms import pixel_to_camera, pixel_to_ray, transform, transform_directions
+
+__all__ = [
+    "Bounds",
+    "Cameras",
+    "Rays",
+    "focus_point",
+    "look_at",
+    "orbit_around",
+    "orbit_like",
+    "pixel_to_camera",
+    "pixel_to_ray",
+    "transform",
+    "transform_directions",
+]

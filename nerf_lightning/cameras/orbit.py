@@ -1,0 +1,65 @@
+"""Camera paths around a subject."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.cameras.cameras import Cameras
+
+
+def look_at(eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "*batch 4 4"]:
+    """Poses at `eye` whose z axis points at `target` and whose y axis points away from `up` (OpenCV, camera to world)."""
+    forward = torch.nn.functional.normalize(target - eye, dim=-1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.expand_as(forward)), dim=-1)
+    down = torch.linalg.cross(forward, right)
+    c2w = torch.eye(4, dtype=eye.dtype, device=eye.device).repeat(*eye.shape[:-1], 1, 1)
+    c2w[..., :3, :] = torch.stack([right, down, forward, eye], dim=-1)
+    return c2w
+
+
+def focus_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
+    """The point nearest to all optical axes in the least-squares sense: what the cameras look at.
+
+    Solves sum_v (I - d_v d_v^T) (x - o_v) = 0; a small ridge pulls toward the mean centre, so that parallel axes
+    (one view, a flat sweep) still give a finite answer.
+    """
+    centres, axes = c2w[:, :3, 3].double(), c2w[:, :3, 2].double()
+    eye = torch.eye(3, dtype=torch.float64, device=c2w.device)
+    projectors = eye - axes[:, :, None] * axes[:, None, :]
+    mean = centres.mean(0)
+    A = projectors.mean(0) + 1e-6 * eye
+    b = (projectors @ (centres - mean)[:, :, None]).mean(0)[:, 0]
+    return (mean + torch.linalg.solve(A, b)).to(c2w.dtype)
+
+
+def orbit_around(
+    centre: Float[Tensor, "3"], up: Float[Tensor, "3"], radius: float, elevation: float, frames: int
+) -> Float[Tensor, "frames 4 4"]:
+    """A full circle of poses around `centre`, all looking at it.
+
+    Args:
+        centre: the subject, world frame.
+        up: unit vector, the circle's axis.
+        radius: distance to the subject, scene's unit.
+        elevation: angle above the plane through `centre` orthogonal to `up`, radians.
+        frames: how many poses; the last stops one step short of the first, so that a loop is smooth.
+    """
+    helper = torch.eye(3, dtype=up.dtype, device=up.device)[int(up.abs().argmin())]
+    a = torch.nn.functional.normalize(torch.linalg.cross(up, helper), dim=-1)
+    b = torch.linalg.cross(up, a)
+    angle = torch.arange(frames, dtype=up.dtype, device=up.device)[:, None] * (2 * math.pi / frames)
+    ring = math.cos(elevation) * (torch.cos(angle) * a + torch.sin(angle) * b) + math.sin(elevation) * up
+    return look_at(centre + radius * ring, centre, up)
+
+
+def orbit_like(cameras: Cameras, frames: int = 60) -> Cameras:
+    """An orbit around what `cameras` look at, at their mean distance and height, with their size and first intrinsics."""
+    centre = focus_point(cameras.c2w)
+    up = torch.nn.functional.normalize(-cameras.c2w[:, :3, 1].mean(0), dim=-1)
+    offset = cameras.centres - centre
+    radius = float(offset.norm(dim=-1).mean())
+    elevation = math.asin(max(-0.95, min(0.95, float((offset @ up).mean()) / max(radius, 1e-9))))
+    c2w = orbit_around(centre, up, radius, elevation, frames)
+    return Cameras(cameras.K[:1].repeat(frames, 1, 1), c2w, cameras.width, cameras.height)

@@ -1,0 +1,46 @@
+"""Pinhole geometry in pure functions. OpenCV frame: x right, y down, z forward; pixel centres at +0.5."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def transform(c2w: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Maps points from camera to world: x_w = R x_c + t, with c2w = [R t; 0 1]. Batches broadcast."""
+    return transform_directions(c2w, points) + c2w[..., :3, 3]
+
+
+def transform_directions(
+    c2w: Float[Tensor, "*#batch 4 4"], directions: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Rotates directions from camera to world (no translation). Batches broadcast."""
+    return (c2w[..., :3, :3] * directions[..., None, :]).sum(-1)
+
+
+def pixel_to_camera(
+    K: Float[Tensor, "*#batch 3 3"], uv: Float[Tensor, "*#batch 2"], depth: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*batch 3"]:
+    """Lifts pixels to the camera frame: x_c = depth * K^-1 [u, v, 1].
+
+    Args:
+        K: intrinsics [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels.
+        uv: continuous pixel coordinates (x right, y down); the centre of pixel (row, col) is (col + 0.5, row + 0.5).
+        depth: distance along the camera's z axis, in the scene's unit.
+    """
+    # K is upper triangular with a unit corner, so K^-1 is back-substitution: cheaper and more exact than inverse().
+    y = (uv[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
+    x = (uv[..., 0] - K[..., 0, 2] - K[..., 0, 1] * y) / K[..., 0, 0]
+    return torch.stack([x * depth, y * depth, depth.expand_as(x)], dim=-1)
+
+
+def pixel_to_ray(
+    K: Float[Tensor, "*#batch 3 3"], c2w: Float[Tensor, "*#batch 4 4"], uv: Float[Tensor, "*#batch 2"]
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
+    """Casts a ray through each pixel.
+
+    Returns:
+        Origins (the camera centres) and unit directions, both in the world frame.
+    """
+    camera = pixel_to_camera(K, uv, torch.ones_like(uv[..., 0]))
+    directions = torch.nn.functional.normalize(transform_directions(c2w, camera), dim=-1)
+    return c2w[..., :3, 3].expand_as(directions), directions

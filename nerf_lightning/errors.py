@@ -1,0 +1,21 @@
+"""The one exception for bad input: a single line a user can act on."""
+
+
+class InputError(ValueError):
+    """Bad input from outside: a file, a config key, a command-line value.
+
+    The message is one line that names where, what key, what was found, what was expected and what to do.
+    The command line prints it and exits with code 2.
+
+    Args:
+        where: file, folder or config key that holds the problem.
+        key: entry inside it ("" when `where` says it all).
+        found: what stands there, in words.
+        expected: what should stand there, in words.
+        todo: what the user can do about it ("" when `expected` says it all).
+    """
+
+    def __init__(self, where: object, key: str, found: str, expected: str, todo: str = ""):
+        place = f"{where}: {key}" if key else f"{where}"
+        line = f"{place}: found {found}, expected {expected}" + (f"; {todo}" if todo else "")
+        super().__init__(" ".join(line.split()))
