@@ -1,6 +1,6 @@
 """Stage 1, cameras: pixels -> Rays, and the Bounds that say where along them the content is."""
 
-from nerf_lightning.cameras.bounds import Bounds
+from nerf_lightning.cameras.bounds import Bounds, InBounds
 from nerf_lightning.cameras.cameras import Cameras, Rays
 from nerf_lightning.cameras.orbit import focus_point, look_at, orbit_around, orbit_like
 from nerf_lightning.cameras.transforms import pixel_to_camera, pixel_to_ray, transform, transform_directions
@@ -8,6 +8,7 @@ from nerf_lightning.cameras.transforms import pixel_to_camera, pixel_to_ray, tra
 __all__ = [
     "Bounds",
     "Cameras",
+    "InBounds",
     "Rays",
     "focus_point",
     "look_at",

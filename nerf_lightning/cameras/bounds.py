@@ -1,6 +1,6 @@
 """Bounds: where the scene's content is, and how world positions map to the unit cube that grids live in."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -36,7 +36,7 @@ class Bounds:
         return (self.aabb[1] - self.aabb[0]) / 2
 
     def to(self, device: torch.device | str) -> "Bounds":
-        return Bounds(self.aabb.to(device), self.unbounded, self.near, self.far)
+        return replace(self, aabb=self.aabb.to(device))
 
     def to_unit(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """World positions -> [0, 1]^3. Bounded: outside the box leaves the unit cube. Unbounded: never leaves it."""
@@ -95,3 +95,18 @@ class Bounds:
 
         y = g(near) + (g(far) - g(near)) * s
         return unit * torch.where(y < 0.5, 2 * y, 1 / (2 - 2 * y).clamp_min(1e-6))
+
+
+class InBounds(torch.nn.Module):
+    """Base of modules that live in a scene's bounds; the box follows the module from device to device."""
+
+    aabb: Tensor
+
+    def __init__(self, bounds: Bounds):
+        super().__init__()
+        self._bounds = bounds
+        self.register_buffer("aabb", bounds.aabb.clone(), persistent=False)
+
+    @property
+    def bounds(self) -> Bounds:
+        return replace(self._bounds, aabb=self.aabb)

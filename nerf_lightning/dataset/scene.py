@@ -53,3 +53,13 @@ class Scene:
             digest.update(repr(tuple(views.images.shape)).encode())
             digest.update(views.images.numpy().tobytes())
         return digest.hexdigest()
+
+    def describe(self) -> dict[str, object]:
+        """Which scene this is, for results.json."""
+        return {
+            "name": self.name,
+            "source": self.source,
+            "sha256": self.sha256(),
+            "views": {"train": len(self.train), "val": len(self.val)},
+            "resolution": list(self.resolution),
+        }

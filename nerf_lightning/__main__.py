@@ -1,0 +1,29 @@
+"""Train: compose -> build -> fit -> test -> results.json. Heavy imports wait until there is something to do."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nerf_lightning import cli
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+
+def train(cfg: "DictConfig") -> float:
+    """One run. Returns the held-out PSNR in dB, which is what a sweep optimises."""
+    from nerf_lightning.training import train
+
+    return train(cfg)
+
+
+def main() -> None:
+    """The command line. A resumed run goes on in its own folder instead of a new one."""
+    resumed = [argument.removeprefix("resume=") for argument in sys.argv[1:] if argument.startswith("resume=")]
+    if resumed and resumed[-1] not in ("", "null"):
+        sys.argv += [f"hydra.run.dir='{Path(resumed[-1]).absolute()}'", "hydra.output_subdir=null"]
+    cli.run("config", train)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,12 @@
+"""What happens around the training steps: budget, measurement, pictures, checkpoints, progress, results."""
+
+from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.callbacks.checkpoints import Checkpoints
+from nerf_lightning.callbacks.heldout import HeldOut
+from nerf_lightning.callbacks.orbit import Orbit
+from nerf_lightning.callbacks.progress import Progress
+from nerf_lightning.callbacks.results import Results
+from nerf_lightning.callbacks.snapshots import Snapshots
+from nerf_lightning.callbacks.throughput import Throughput
+
+__all__ = ["Budget", "Checkpoints", "HeldOut", "Orbit", "Progress", "Results", "Snapshots", "Throughput"]

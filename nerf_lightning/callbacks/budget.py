@@ -1,0 +1,88 @@
+"""Budget: how long to train, by the steps or by the clock, and the clock itself."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import lightning as L
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.system import System
+
+
+class Budget(L.Callback):
+    """Stops training when the budget is spent and tells the system its progress.
+
+    Training time is the wall clock from the first step on, less what runs inside `paused()` (evaluation, pictures). With
+    both limits, the first one reached ends the run.
+
+    Args:
+        steps: optimiser steps, or None.
+        seconds: seconds of training, or None.
+
+    Raises:
+        InputError: where both are None, or one is not positive.
+    """
+
+    def __init__(self, steps: int | None = None, seconds: float | None = None):
+        if steps is None and seconds is None:
+            raise InputError("budget", "", "neither steps nor seconds", "budget.steps=N or budget.seconds=S")
+        for key, value in (("steps", steps), ("seconds", seconds)):
+            if value is not None and value <= 0:
+                raise InputError(f"budget.{key}", "", str(value), "more than 0")
+        self.steps = steps
+        self.limit_seconds = seconds
+        self._before = 0.0  # spent up to the last pause or restart
+        self._since: float | None = None
+
+    @staticmethod
+    def of(trainer: L.Trainer) -> "Budget":
+        """The trainer's budget; build.py puts one into every trainer."""
+        return next(callback for callback in trainer.callbacks if isinstance(callback, Budget))
+
+    @property
+    def seconds(self) -> float:
+        """Seconds trained so far."""
+        return self._before + (0.0 if self._since is None else time.perf_counter() - self._since)
+
+    def progress(self, step: int) -> float:
+        """Fraction of the budget done after `step` steps, in [0, 1]."""
+        done = [step / self.steps] if self.steps is not None else []
+        if self.limit_seconds is not None:
+            done.append(self.seconds / self.limit_seconds)
+        return min(1.0, max(done))
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Stops the clock for work that is not training."""
+        running = self._since is not None
+        self._before, self._since = self.seconds, None
+        try:
+            yield
+        finally:
+            if running:
+                self._since = time.perf_counter()
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        trainer.should_stop = self.progress(trainer.global_step) >= 1.0  # a finished run resumed has nothing left
+        self._since = time.perf_counter()
+
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
+        pl_module.progress = self.progress(trainer.global_step)
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        pl_module.progress = self.progress(trainer.global_step)
+        if pl_module.progress >= 1.0:
+            trainer.should_stop = True
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        self._before, self._since = self.seconds, None
+
+    def state_dict(self) -> dict[str, float]:
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        self._before = state_dict["seconds"]

@@ -1,0 +1,80 @@
+"""Checkpoints: the last state, to resume from, and the best one measured."""
+
+import shutil
+import time
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import lightning as L
+
+from nerf_lightning.callbacks.heldout import HeldOut, evenly
+from nerf_lightning.errors import InputError
+from nerf_lightning.files import atomic
+from nerf_lightning.system import System
+
+
+class Checkpoints(L.Callback):
+    """Keeps `last.ckpt` and `best.ckpt` in a folder. Each is renamed into place whole, so a kill leaves the one before.
+
+    Args:
+        folder: where they go, below the run folder.
+        every_seconds: wall-clock seconds between saves of `last.ckpt`; it is also saved at the end.
+
+    Raises:
+        InputError: where every_seconds <= 0.
+    """
+
+    def __init__(self, folder: str = "checkpoints", every_seconds: float = 20):
+        if every_seconds <= 0:
+            raise InputError("callbacks.checkpoints.every_seconds", "", str(every_seconds), "more than 0")
+        self.folder = folder
+        self.every_seconds = every_seconds
+        self.best: float | None = None
+        self._saved = 0.0
+        self._tested: list[float] = []
+
+    def save(self, trainer: L.Trainer, name: str) -> None:
+        with atomic(Path(trainer.default_root_dir) / self.folder / name) as temporary:
+            trainer.save_checkpoint(temporary)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        self._saved = time.monotonic()
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if time.monotonic() - self._saved >= self.every_seconds:
+            self.save(trainer, "last.ckpt")
+            self._saved = time.monotonic()
+        for callback in trainer.callbacks:
+            if isinstance(callback, HeldOut) and callback.latest is not None:
+                if self.best is None or callback.latest > self.best:
+                    self.best = callback.latest
+                    self.save(trainer, "best.ckpt")
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        self.save(trainer, "last.ckpt")
+
+    def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        self._tested = []
+
+    def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int) -> None:
+        self._tested.append(outputs["psnr"])
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        """The final state is a candidate too, judged on the views that the earlier ones were judged on."""
+        folder = Path(trainer.default_root_dir) / self.folder
+        last = folder / "last.ckpt"
+        views = next((c.views for c in trainer.callbacks if isinstance(c, HeldOut)), None)
+        final = fmean(self._tested[view] for view in evenly(len(self._tested), views))
+        if last.exists() and (self.best is None or final > self.best):
+            self.best = final
+            with atomic(folder / "best.ckpt") as temporary:
+                shutil.copyfile(last, temporary)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"best": self.best}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.best = state_dict["best"]

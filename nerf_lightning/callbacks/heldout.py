@@ -1,0 +1,82 @@
+"""HeldOut: the quality curve, on views that are never trained on."""
+
+from statistics import fmean
+from typing import Any
+
+import lightning as L
+
+from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.errors import InputError
+from nerf_lightning.system import System, ViewResult
+
+
+def evenly(total: int, count: int | None) -> list[int]:
+    """`count` indices spread over range(total); all of them for None."""
+    if count is None or count >= total:
+        return list(range(total))
+    return [round((i + 0.5) * total / count - 0.5) for i in range(count)]
+
+
+class HeldOut(L.Callback):
+    """Measures held-out PSNR and SSIM at fractions of the budget, with the training clock stopped.
+
+    The last point of the curve, at the end of the budget, comes from the test over all views.
+
+    Args:
+        at: fractions of the budget, ascending, in (0, 1).
+        views: how many held-out views, evenly chosen; None takes all.
+
+    Raises:
+        InputError: for fractions outside (0, 1) or less than one view.
+    """
+
+    def __init__(self, at: list[float], views: int | None = None):
+        if any(not 0 < fraction < 1 for fraction in at) or sorted(at) != list(at):
+            raise InputError("callbacks.heldout.at", "", str(list(at)), "ascending fractions between 0 and 1")
+        if views is not None and views < 1:
+            raise InputError("callbacks.heldout.views", "", str(views), "at least 1, or null for all")
+        self.at = list(at)
+        self.views = views
+        self.curve: list[list[float]] = []
+        """[training seconds, step, PSNR], one row a measurement."""
+        self.view_seconds: float | None = None
+        """Rendering time of a view at the last measurement."""
+
+    @property
+    def latest(self) -> float | None:
+        """The last PSNR, or None before the first."""
+        return self.curve[-1][2] if self.curve else None
+
+    def planned(self, trainer: L.Trainer) -> int:
+        """Views still to be rendered in measurements during training."""
+        total = trainer.datamodule.held_out_views
+        return (len(self.at) - len(self.curve)) * len(evenly(total, self.views))
+
+    def record(self, trainer: L.Trainer, results: list[ViewResult]) -> None:
+        """Adds a point to the curve and to the log."""
+        quality = fmean(result.psnr for result in results)
+        self.view_seconds = fmean(result.seconds for result in results)
+        self.curve.append([round(Budget.of(trainer).seconds, 3), trainer.global_step, round(quality, 4)])
+        structure = fmean(result.ssim for result in results)
+        if trainer.logger is not None:
+            trainer.logger.log_metrics({"heldout/psnr": quality, "heldout/ssim": structure}, trainer.global_step)
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        due = sum(pl_module.progress >= fraction for fraction in self.at)
+        if due <= len(self.curve) or pl_module.progress >= 1.0:
+            return
+        with Budget.of(trainer).paused():
+            data = trainer.datamodule
+            chosen = evenly(data.held_out_views, self.views)
+            results = [pl_module.evaluate(data.held_out(view)) for view in chosen]
+            while len(self.curve) < due:  # a step may pass several marks at once: one measurement serves them all
+                self.record(trainer, results)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"curve": self.curve, "view_seconds": self.view_seconds}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.curve = state_dict["curve"]
+        self.view_seconds = state_dict["view_seconds"]

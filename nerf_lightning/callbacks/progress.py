@@ -1,0 +1,136 @@
+"""Progress: a bar with quality, speed and the time left."""
+
+import time
+from typing import Any
+
+import lightning as L
+from rich.console import Console
+from rich.progress import BarColumn, Progress as RichProgress, TaskID, TextColumn, TimeElapsedColumn
+
+from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.callbacks.heldout import HeldOut
+from nerf_lightning.callbacks.orbit import Orbit
+from nerf_lightning.system import System
+
+
+def clock(seconds: float) -> str:
+    """1:02:03 or 2:03."""
+    minutes, second = divmod(round(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"
+
+
+class Progress(L.Callback):
+    """Shows how far the run is. On a terminal it is a bar; elsewhere a line now and then.
+
+    The time left counts what the budget still allows, and the rendering that is still to come (measurements, test, orbit) at
+    the speed of the last view rendered.
+
+    Args:
+        every_seconds: between lines where there is no terminal.
+    """
+
+    def __init__(self, every_seconds: float = 15):
+        self.every_seconds = every_seconds
+        self.console = Console()
+        self.bar: RichProgress | None = None
+        self.task: TaskID | None = None
+        self._shown = 0.0
+        self._start = (0.0, 0)  # seconds and steps when this process began to train
+        self._recent = (0.0, 0)  # the same at the last display
+        self._rays = 0
+
+    def rendering_left(self, trainer: L.Trainer) -> float:
+        """Seconds of rendering still to come; 0 until a first view has been rendered."""
+        views, seconds = trainer.datamodule.held_out_views, 0.0
+        for callback in trainer.callbacks:
+            if isinstance(callback, HeldOut):
+                views += callback.planned(trainer)
+                seconds = callback.view_seconds or 0.0
+            elif isinstance(callback, Orbit):
+                views += callback.frames
+        return views * seconds
+
+    def training_left(self, trainer: L.Trainer) -> float | None:
+        """Seconds of training still to come; None before the first step."""
+        budget, step = Budget.of(trainer), trainer.global_step
+        seconds, steps = budget.seconds - self._start[0], step - self._start[1]
+        left = []
+        if budget.steps is not None and steps > 0:
+            left.append((budget.steps - step) * seconds / steps)
+        if budget.limit_seconds is not None:
+            left.append(budget.limit_seconds - budget.seconds)
+        return max(0.0, min(left)) if left else None
+
+    def status(self, trainer: L.Trainer, pl_module: System) -> str:
+        """One line: step, loss as dB, held-out dB, rays a second, time left."""
+        budget = Budget.of(trainer)
+        quality = [c.latest for c in trainer.callbacks if isinstance(c, HeldOut) and c.latest is not None]
+        seconds, step = budget.seconds, trainer.global_step
+        speed = self._rays / max(seconds - self._recent[0], 1e-9)
+        self._recent, self._rays = (seconds, step), 0
+        parts = [f"step {step}", f"{speed:,.0f} rays/s"]
+        if quality:
+            parts.insert(1, f"held out {quality[-1]:.2f} dB")
+        training = self.training_left(trainer)
+        if training is not None:
+            parts.append(f"left {clock(training + self.rendering_left(trainer))}")
+        return "  ".join(parts)
+
+    def open(self, name: str) -> None:
+        if self.bar is None and self.console.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[status]}"))
+            self.bar = RichProgress(*columns, console=self.console)
+            self.bar.start()
+        if self.bar is not None:
+            self.task = self.bar.add_task(name, total=1.0, status="")
+
+    def show(self, fraction: float, status: str) -> None:
+        self._shown = time.monotonic()
+        if self.bar is not None and self.task is not None:
+            self.bar.update(self.task, completed=fraction, status=status)
+        else:
+            self.console.print(f"{fraction:4.0%}  {status}", highlight=False, soft_wrap=True)
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+            self.bar = None
+
+    def due(self) -> bool:
+        return time.monotonic() - self._shown >= (0.5 if self.bar is not None else self.every_seconds)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        self.open(f"train {trainer.datamodule.scene.name}")
+        self._start = self._recent = (Budget.of(trainer).seconds, trainer.global_step)
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        self._rays += pl_module.stats.rays
+        if self.due():
+            self.show(pl_module.progress, self.status(trainer, pl_module))
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        self.show(pl_module.progress, self.status(trainer, pl_module))
+
+    def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        self.open("test")
+
+    def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int) -> None:
+        views = trainer.datamodule.held_out_views
+        if self.due() or batch_idx + 1 == views:
+            self.show((batch_idx + 1) / views, f"view {batch_idx + 1} of {views}: {outputs['psnr']:.2f} dB")
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        self.open("orbit")
+
+    def on_orbit_frame(self, done: int, frames: int) -> None:
+        if self.due() or done == frames:
+            self.show(done / frames, f"frame {done} of {frames}")
+
+    def teardown(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
+        self.close()
+
+    def on_exception(self, trainer: L.Trainer, pl_module: System, exception: BaseException) -> None:
+        self.close()

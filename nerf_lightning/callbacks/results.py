@@ -1,0 +1,130 @@
+"""Results: everything a comparison needs to know about a run, in one results.json."""
+
+import math
+import platform
+import sys
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+import lightning as L
+import torch
+
+import nerf_lightning
+from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.callbacks.heldout import HeldOut
+from nerf_lightning.callbacks.throughput import Throughput
+from nerf_lightning.files import write_json
+from nerf_lightning.system import System, psnr
+
+try:
+    import resource
+except ImportError:  # Windows has no such module; peak memory is then not reported
+    resource = None
+
+NO_BETTER = 1.0
+"""dB above a picture of one colour below which a run has learned nothing."""
+
+
+def peak_memory_bytes() -> int | None:
+    """The most memory this process has held so far (on CUDA, the most its tensors held on the device); None if unknown."""
+    if torch.cuda.is_available() and torch.cuda.max_memory_allocated():
+        return torch.cuda.max_memory_allocated()
+    if resource is None:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def plain_colour_psnr(data: L.LightningDataModule, system: System) -> float:
+    """PSNR of the best single colour for each held-out view: what a collapsed field reaches."""
+    scores = []
+    for view in range(data.held_out_views):
+        truth = system.truth(data.held_out(view).to(system.device))
+        scores.append(psnr(truth.mean(0).expand_as(truth), truth))
+    return fmean(scores)
+
+
+class Results(L.Callback):
+    """Writes results.json after the test, and also when the run fails or is interrupted.
+
+    Args:
+        path: the file, below the run folder.
+        method: name of the model, as configured.
+        seed: of the run.
+    """
+
+    def __init__(self, path: str, method: str, seed: int):
+        self.path = path
+        self.method = method
+        self.seed = seed
+        self.views: list[dict[str, float]] = []
+        self.summary: dict[str, Any] = {}
+        """What was written last."""
+
+    def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        self.views = []
+
+    def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int) -> None:
+        self.views.append(outputs)
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        quality = fmean(view["psnr"] for view in self.views)
+        plain = plain_colour_psnr(trainer.datamodule, pl_module)
+        stopped = "stopped_early" if Budget.of(trainer).progress(trainer.global_step) < 1.0 else "finished"
+        if not math.isfinite(pl_module.stats.mse) or quality < plain + NO_BETTER:
+            diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
+            self.write(trainer, pl_module, "collapsed", diagnosis)
+        else:
+            self.write(trainer, pl_module, stopped, "")
+        if trainer.logger is not None:
+            scores = {"test/psnr": quality, "test/ssim": self.summary["ssim"] or 0.0}
+            trainer.logger.log_metrics(scores, trainer.global_step)
+
+    def on_exception(self, trainer: L.Trainer, pl_module: System, exception: BaseException) -> None:
+        if isinstance(exception, KeyboardInterrupt):
+            self.write(trainer, pl_module, "stopped_early", "interrupted")
+        else:
+            self.write(trainer, pl_module, "failed", " ".join(f"{type(exception).__name__}: {exception}".split()))
+
+    def write(self, trainer: L.Trainer, pl_module: System, status: str, diagnosis: str) -> None:
+        """Writes the file with what is known by now; measures not taken are null."""
+        scene, budget = trainer.datamodule.scene, Budget.of(trainer)
+        throughput = next((c for c in trainer.callbacks if isinstance(c, Throughput)), None)
+        curve = next((c.curve for c in trainer.callbacks if isinstance(c, HeldOut)), [])
+
+        def over_views(statistic: Any, key: str) -> float | None:
+            values = [view[key] for view in self.views if math.isfinite(view[key])]
+            return round(statistic(values), 4) if values else None
+
+        quality = over_views(fmean, "psnr")
+        if quality is not None:
+            curve = [*curve, [round(budget.seconds, 3), trainer.global_step, quality]]
+        state = pl_module.state_dict().values()
+        self.summary = {
+            "scene": scene.describe(),
+            "method": self.method,
+            "seed": self.seed,
+            "device": str(pl_module.device),
+            "threads": torch.get_num_threads(),
+            "versions": {
+                "python": platform.python_version(),
+                "torch": torch.__version__,
+                "lightning": L.__version__,
+                "nerf_lightning": nerf_lightning.__version__,
+            },
+            "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
+            "artifact_bytes": sum(tensor.numel() * tensor.element_size() for tensor in state),
+            "train_seconds": round(budget.seconds, 3),
+            "steps": trainer.global_step,
+            "rays_per_second": round(throughput.rays / budget.seconds, 1) if throughput and budget.seconds else None,
+            "psnr": quality,
+            "ssim": over_views(fmean, "ssim"),
+            "psnr_worst_view": over_views(min, "psnr"),
+            "render_seconds_per_view": over_views(median, "seconds"),
+            "peak_memory_bytes": peak_memory_bytes(),
+            "curve": curve,
+            "status": status,
+            "diagnosis": diagnosis,
+        }
+        write_json(Path(trainer.default_root_dir) / self.path, self.summary)

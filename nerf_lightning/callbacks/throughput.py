@@ -1,0 +1,61 @@
+"""Throughput: loss, learning rate and speed to the log."""
+
+import math
+from typing import Any
+
+import lightning as L
+
+from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.errors import InputError
+from nerf_lightning.system import System
+
+
+class Throughput(L.Callback):
+    """Logs loss, PSNR of the batch, learning rate, rays a second and samples a ray, every `every` steps.
+
+    Args:
+        every: steps between log entries; the speeds are averages over them.
+
+    Raises:
+        InputError: where every < 1.
+    """
+
+    def __init__(self, every: int = 20):
+        if every < 1:
+            raise InputError("callbacks.throughput.every", "", str(every), "at least 1")
+        self.every = every
+        self.rays = 0
+        """Rays (or pixels) trained on since the run began, over all resumes."""
+        self._mark = (0.0, 0)  # seconds and rays at the last entry
+        self._samples = 0
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        self._mark = (Budget.of(trainer).seconds, self.rays)
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        stats, step = pl_module.stats, trainer.global_step
+        self.rays += stats.rays
+        self._samples += stats.samples
+        if step % self.every:
+            return
+        seconds = Budget.of(trainer).seconds
+        rays = self.rays - self._mark[1]
+        if trainer.logger is not None:
+            scalars = {
+                "train/loss": stats.mse,
+                "train/psnr": -10 * math.log10(max(stats.mse, 1e-12)),
+                "train/learning_rate": pl_module.optimizers(use_pl_optimizer=False).param_groups[0]["lr"],
+                "speed/rays_per_second": rays / max(seconds - self._mark[0], 1e-9),
+                "speed/samples_per_ray": self._samples / max(rays, 1),
+                "speed/training_seconds": seconds,
+            }
+            trainer.logger.log_metrics(scalars, step)
+        self._mark, self._samples = (seconds, self.rays), 0
+
+    def state_dict(self) -> dict[str, int]:
+        return {"rays": self.rays}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        self.rays = state_dict["rays"]

@@ -1,0 +1,64 @@
+"""What every command line of the package shares: where conf/ is, and errors as one line. Imports nothing heavy."""
+
+import functools
+import os
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from nerf_lightning.errors import InputError
+
+TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
+"""Environment variable: set to 1, errors come with the full traceback."""
+
+
+def conf_dir() -> Path:
+    """The shipped configuration: inside the package in an installed wheel, beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
+
+
+def slug(text: str) -> str:
+    """A config override as part of a folder name."""
+    return "".join(c if c.isalnum() or c in "=.,_-+" else "-" for c in str(text))[:120]
+
+
+def run(config: str, task: Callable[[DictConfig], object]) -> None:
+    """Composes `conf/<config>.yaml` with the command line and calls `task`; exits with 2 on bad input.
+
+    Bad input is anything the user can mend: it gets one line. Everything else is a defect and keeps its traceback.
+    """
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
+    OmegaConf.register_new_resolver("slug", slug, replace=True)
+
+    @functools.wraps(task)
+    def job(cfg: DictConfig) -> object:
+        try:
+            return task(cfg)
+        except InputError as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise  # the sweep decides what becomes of the other jobs
+            give_up(error)
+
+    try:
+        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
+    except (InputError, HydraException, OmegaConfBaseException) as error:
+        give_up(error)
+
+
+def give_up(error: Exception) -> NoReturn:
+    """Prints the error as one line, or whole where the environment asks for it, and exits with 2."""
+    if os.environ.get(TRACEBACK) == "1":
+        traceback.print_exception(error)
+    line = " ".join(str(error).split())
+    print(f"nerf_lightning: {line} ({TRACEBACK}=1 shows the traceback)", file=sys.stderr)
+    sys.exit(2)

@@ -1,0 +1,36 @@
+"""Stage 2, dataset: photos and poses become a Scene, whatever format they come in."""
+
+from nerf_lightning.dataset.blender import load_blender
+from nerf_lightning.dataset.extent import estimate_bounds
+from nerf_lightning.dataset.nerfstudio import load_nerfstudio
+from nerf_lightning.dataset.npz import load_npz, save_npz
+from nerf_lightning.dataset.open import open_scene
+from nerf_lightning.dataset.picture import builtin_picture, load_picture
+from nerf_lightning.dataset.pixels import Picture, PictureBatch, PixelBatch, PixelDataModule
+from nerf_lightning.dataset.rays import RayBatch, RayDataModule, ViewBatch
+from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.sources import from_bricks, from_download, from_photos, from_picture
+
+__all__ = [
+    "Picture",
+    "PictureBatch",
+    "PixelBatch",
+    "PixelDataModule",
+    "RayBatch",
+    "RayDataModule",
+    "ViewBatch",
+    "from_bricks",
+    "from_download",
+    "from_photos",
+    "from_picture",
+    "Scene",
+    "Views",
+    "builtin_picture",
+    "estimate_bounds",
+    "load_blender",
+    "load_nerfstudio",
+    "load_npz",
+    "load_picture",
+    "open_scene",
+    "save_npz",
+]

@@ -1,0 +1,100 @@
+"""Where the content is, told from cameras and silhouettes alone: a box to sample in."""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerf_lightning.cameras import Bounds, Cameras, focus_point
+from nerf_lightning.dataset.scene import Views
+
+GRID = 48
+"""Voxels along each axis of the carving grid."""
+MAX_VIEWS = 32
+ALPHA_FLOOR = 0.02
+COLOUR_FLOOR = 3
+"""In 1/255: JPEG-free renders are exact, resampled ones wobble by one or two."""
+AGREEMENT = 0.95
+"""Share of the views seeing a voxel that must find it in the silhouette; the rest forgives dark-on-dark pixels."""
+
+
+def estimate_bounds(
+    views: Views,
+    background: tuple[float, float, float],
+    near: float | None = None,
+    far: float | None = None,
+) -> Bounds:
+    """A bounded box around the content, in world units.
+
+    First a cube around the point the cameras look at, as wide as they see there. Where silhouettes are known, from alpha
+    or from a flat `background` (sRGB in [0, 1]), the visual hull on a coarse grid shrinks it, twice.
+    """
+    aabb = _visible_cube(views.cameras)
+    chosen = torch.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().long()
+    views = Views(views.images[chosen], views.cameras[chosen])
+    masks = silhouettes(views, background)
+    if masks is not None:
+        # The second pass sees finer voxels, so the box loses the slack of the first.
+        for _ in range(2):
+            kept = _carve(aabb, masks, views.cameras)
+            if kept is None:
+                break
+            aabb = kept
+    return Bounds(torch.from_numpy(aabb).float(), unbounded=False, near=near, far=far)
+
+
+def silhouettes(views: Views, background: tuple[float, float, float]) -> Bool[np.ndarray, "V H W"] | None:
+    """Which pixels show content; None where neither alpha nor a flat background at the borders tells."""
+    images = views.images.numpy()
+    if images.shape[3] == 4:
+        return images[..., 3] > ALPHA_FLOOR * 255
+    colour = np.rint(np.array(background) * 255).astype(np.int16)
+    masks = np.stack([(np.abs(image - colour) > COLOUR_FLOOR).any(-1) for image in images])
+    border = np.concatenate([masks[:, 0], masks[:, -1], masks[:, :, 0], masks[:, :, -1]], axis=1)
+    flat = border.mean(1) < 0.2
+    return masks if flat.mean() > 0.5 else None
+
+
+def viewing_distance(c2w: Float[Tensor, "V 4 4"], centre: Float[Tensor, "3"]) -> float:
+    """Median distance of the cameras to `centre`, in the scene's unit; 1 where all stand on that very spot."""
+    distance = float((c2w[:, :3, 3] - centre).norm(dim=-1).median())
+    return distance if distance > 1e-5 * (1 + float(centre.norm())) else 1.0
+
+
+def _visible_cube(cameras: Cameras) -> Float[np.ndarray, "2 3"]:
+    centre = focus_point(cameras.c2w)
+    distance = viewing_distance(cameras.c2w, centre)
+    tangent = max(cameras.width / float(cameras.K[:, 0, 0].min()), cameras.height / float(cameras.K[:, 1, 1].min())) / 2
+    half = distance * tangent
+    return np.stack([centre.numpy() - half, centre.numpy() + half]).astype(np.float64)
+
+
+def _carve(
+    aabb: Float[np.ndarray, "2 3"], masks: Bool[np.ndarray, "V H W"], cameras: Cameras
+) -> Float[np.ndarray, "2 3"] | None:
+    """The box of the voxels inside (nearly) all silhouettes, one voxel wider; None when there are none."""
+    voxel = (aabb[1] - aabb[0]) / GRID
+    x, y, z = aabb[0][:, None] + (np.arange(GRID) + 0.5) * voxel[:, None]
+    centres = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    seen = np.zeros(len(centres), np.int32)
+    hits = np.zeros(len(centres), np.int32)
+    for mask, K, c2w in zip(masks, cameras.K.double().numpy(), cameras.c2w.double().numpy(), strict=True):
+        # P = K [R t; 0 1]^-1 maps world to pixels. On a grid it is a sum of one term an axis, cheaper than 48^3 products.
+        P = K @ np.linalg.inv(c2w)[:3]
+        u, v, depth = ((p[0] * x[:, None, None] + p[1] * y[:, None] + (p[2] * z + p[3])).reshape(-1) for p in P)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = u / depth, v / depth
+        inside = (depth > 0) & (u >= 0) & (v >= 0) & (u < cameras.width) & (v < cameras.height)
+        if not inside.any():
+            continue
+        # A voxel counts when any part of it may be inside: grow the mask by half its diagonal as this view sees it.
+        reach = 0.5 * np.linalg.norm(voxel) * K[0, 0] / float(np.median(depth[inside]))
+        reach = int(min(np.ceil(reach), max(mask.shape)))
+        grown = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+        seen[inside] += 1
+        hits[inside] += grown[v[inside].astype(np.int32), u[inside].astype(np.int32)]
+    kept = centres[(seen >= 0.5 * len(masks)) & (hits >= AGREEMENT * seen)]
+    if len(kept) == 0:
+        return None
+    return np.stack([kept.min(0) - 1.5 * voxel, kept.max(0) + 1.5 * voxel])

@@ -1,0 +1,111 @@
+"""PixelDataModule: places in a picture and their colours."""
+
+import hashlib
+from dataclasses import dataclass
+
+import lightning as L
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader
+from nerf_lightning.errors import InputError
+from nerf_lightning.seeding import step_generator
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture to fit."""
+
+    name: str
+    source: str
+    image: UInt8[Tensor, "H W 3"]
+    """sRGB."""
+
+    def sha256(self) -> str:
+        """A fingerprint of the pixels."""
+        return hashlib.sha256(repr(tuple(self.image.shape)).encode() + self.image.numpy().tobytes()).hexdigest()
+
+    def describe(self) -> dict[str, object]:
+        """Which picture this is, for results.json."""
+        height, width, _ = self.image.shape
+        return {
+            "name": self.name,
+            "source": self.source,
+            "sha256": self.sha256(),
+            "views": {"train": 1, "val": 1},
+            "resolution": [width, height],
+        }
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """N places and their colours."""
+
+    uv: Float[Tensor, "N 2"]
+    """In [0, 1]^2, x right, y down; the centre of pixel (row, col) is ((col + 0.5) / W, (row + 0.5) / H)."""
+    rgb: Float[Tensor, "N 3"]
+
+    def to(self, device: torch.device | str) -> "PixelBatch":
+        return PixelBatch(self.uv.to(device), self.rgb.to(device))
+
+
+@dataclass(frozen=True)
+class PictureBatch(PixelBatch):
+    """All pixels of a picture, row by row; N = height * width."""
+
+    height: int
+    width: int
+
+    def to(self, device: torch.device | str) -> "PictureBatch":
+        return PictureBatch(self.uv.to(device), self.rgb.to(device), self.height, self.width)
+
+
+def pixels_at(image: UInt8[Tensor, "H W 3"], index: Int[Tensor, "N"]) -> PixelBatch:
+    """The pixels with the given row-major indices."""
+    height, width, _ = image.shape
+    uv = torch.stack([(index % width + 0.5) / width, (index // width + 0.5) / height], dim=-1)
+    return PixelBatch(uv, image.view(-1, 3)[index].float() / 255)
+
+
+class PixelDataModule(L.LightningDataModule):
+    """Feeds NeRF2D. There is nothing to hold out: quality is measured on all pixels.
+
+    Args:
+        scene: the picture.
+        pixels: pixels a step, drawn with replacement.
+        seed: of the draw.
+
+    Raises:
+        InputError: for less than one pixel a step.
+    """
+
+    held_out_views = 1
+
+    def __init__(self, scene: Picture, pixels: int = 10_000, seed: int = 0):
+        super().__init__()
+        if pixels < 1:
+            raise InputError("dataset.pixels", "", str(pixels), "at least 1")
+        self.scene = scene
+        self.pixels = pixels
+        self.seed = seed
+
+    def draw(self, step: int) -> PixelBatch:
+        image = self.scene.image
+        index = torch.randint(image[..., 0].numel(), (self.pixels,), generator=step_generator(self.seed, 0, step))
+        return pixels_at(image, index)
+
+    def train_dataloader(self) -> StepLoader:
+        return StepLoader(self.draw, lambda: self.trainer.global_step if self.trainer else 0)
+
+    def held_out(self, view: int) -> PictureBatch:
+        """The whole picture."""
+        height, width, _ = self.scene.image.shape
+        everything = pixels_at(self.scene.image, torch.arange(height * width))
+        return PictureBatch(everything.uv, everything.rgb, height, width)
+
+    def test_dataloader(self) -> HeldOutLoader:
+        return HeldOutLoader(self.held_out, self.held_out_views)
+
+    def transfer_batch_to_device(self, batch: PixelBatch, device: torch.device, dataloader_idx: int) -> PixelBatch:
+        return batch.to(device)

@@ -1,0 +1,60 @@
+"""Area-average resizing, with alpha where there is one; a smaller picture is what a coarser sensor would have seen."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.errors import InputError
+
+
+def fit_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
+    """Width and height with the longest side at `longest` pixels; never enlarges, None leaves the size alone."""
+    if longest is None:
+        return width, height
+    if longest < 1:
+        raise InputError("resize", "", str(longest), "the longest side in pixels, at least 1")
+    scale = min(1.0, longest / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def premultiplied(
+    image: UInt8[np.ndarray, "H W C"], operation: Callable[[np.ndarray], np.ndarray]
+) -> UInt8[np.ndarray, "h w C"]:
+    """Applies a linear filter to RGB as it is, to RGBA with premultiplied alpha.
+
+    Straight colours under alpha 0 are arbitrary (black, mostly): averaging them in would put a dark rim around objects.
+    """
+    if image.shape[2] == 3:
+        return operation(image)
+    image = image.astype(np.float32)
+    image[..., :3] *= image[..., 3:] / 255
+    image = operation(image)
+    image[..., :3] /= np.maximum(image[..., 3:] / 255, 1e-6)
+    return np.rint(image).clip(0, 255).astype(np.uint8)
+
+
+def area_resize(image: UInt8[np.ndarray, "H W C"], width: int, height: int) -> UInt8[np.ndarray, "h w C"]:
+    if image.shape[:2] == (height, width):
+        return image
+    return premultiplied(image, lambda x: cv2.resize(x, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def resize_views(views: Views, longest: int | None) -> Views:
+    cameras = views.cameras
+    width, height = fit_size(cameras.width, cameras.height, longest)
+    if (width, height) == (cameras.width, cameras.height):
+        return views
+    images = np.stack([area_resize(image, width, height) for image in views.images.numpy()])
+    return Views(torch.from_numpy(images), cameras.resized(width, height))
+
+
+def resize_scene(scene: Scene, longest: int | None) -> Scene:
+    """The scene on a smaller pixel grid; world, bounds and poses stay."""
+    train, val = resize_views(scene.train, longest), resize_views(scene.val, longest)
+    orbit = scene.orbit.resized(*fit_size(scene.orbit.width, scene.orbit.height, longest))
+    return replace(scene, train=train, val=val, orbit=orbit)

@@ -1,0 +1,104 @@
+"""From a dataset's configuration to its data module: one function for each kind of source."""
+
+import os
+import shutil
+import urllib.request
+import warnings
+from pathlib import Path
+
+from nerf_lightning.dataset.bricks import bricks
+from nerf_lightning.dataset.open import open_scene
+from nerf_lightning.dataset.picture import builtin_picture, load_picture
+from nerf_lightning.dataset.pixels import Picture, PixelDataModule
+from nerf_lightning.dataset.rays import RayDataModule
+from nerf_lightning.files import atomic
+
+DOWNLOAD_TIMEOUT = 10.0
+"""Seconds without an answer after which a download is given up."""
+
+
+def from_photos(
+    path: str,
+    name: str | None = None,
+    resize: int | None = None,
+    holdout: int = 10,
+    near: float | None = None,
+    far: float | None = None,
+    rays: int = 4096,
+    samples: int | None = None,
+    seed: int = 0,
+) -> RayDataModule:
+    """Posed photos in any supported format, see `open_scene` and `RayDataModule`."""
+    return RayDataModule(open_scene(path, name, resize, holdout, near, far), rays, samples, seed)
+
+
+def from_bricks(
+    size: int = 200,
+    train_views: int = 100,
+    val_views: int = 10,
+    rays: int = 4096,
+    samples: int | None = None,
+    seed: int = 0,
+) -> RayDataModule:
+    """The built-in scene, see `bricks` and `RayDataModule`."""
+    return RayDataModule(bricks(size, train_views, val_views), rays, samples, seed)
+
+
+def from_download(
+    url: str,
+    folder: str,
+    download: bool = True,
+    path: str | None = None,
+    resize: int | None = None,
+    near: float | None = None,
+    far: float | None = None,
+    rays: int = 4096,
+    samples: int | None = None,
+    seed: int = 0,
+) -> RayDataModule:
+    """A published scene: from `path` if given, else from `folder`, else from `url` into `folder`, else the built-in scene.
+
+    Args:
+        url: public address of the file.
+        folder: where downloads are kept.
+        download: whether the network may be asked.
+        path: a copy at hand; where it is given it must exist.
+        resize, near, far: see `open_scene`.
+        rays, samples, seed: see `RayDataModule`.
+    """
+    if path is None:
+        local = Path(folder) / url.rsplit("/", 1)[-1]
+        problem = f"{local} is not there" if not local.exists() else ""
+        if problem and download:
+            try:
+                _download(url, local)
+                problem = ""
+            except OSError as error:
+                problem += f" and {url} could not be fetched ({error})"
+        if problem:
+            warnings.warn(f"{problem}: training on the built-in scene 'bricks' instead", stacklevel=2)
+            return from_bricks(size=resize or 200, rays=rays, samples=samples, seed=seed)
+        path = str(local)
+    return from_photos(path, resize=resize, near=near, far=far, rays=rays, samples=samples, seed=seed)
+
+
+def _download(url: str, target: Path) -> None:
+    request = urllib.request.Request(url, headers={"User-Agent": "nerf_lightning"})
+    with urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT) as response, atomic(target) as temporary:
+        with temporary.open("wb") as file:
+            shutil.copyfileobj(response, file)
+        expected = response.headers.get("Content-Length")
+        if expected is not None and temporary.stat().st_size != int(expected):
+            raise OSError(f"got {temporary.stat().st_size} of {expected} bytes")
+
+
+def from_picture(
+    path: str | None = None, max_side: int | None = None, pixels: int = 10_000, seed: int = 0
+) -> PixelDataModule:
+    """A picture from a file, or the built-in one, see `load_picture` and `PixelDataModule`."""
+    if path is None:
+        picture = Picture("chart", "built-in", builtin_picture(max_side or 256))
+    else:
+        source = Path(path)
+        picture = Picture(source.stem.lower(), os.fspath(source), load_picture(source, max_side))
+    return PixelDataModule(picture, pixels, seed)

@@ -1,0 +1,46 @@
+"""What every field offers, in three dimensions and in two."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.cameras import Bounds, InBounds
+
+
+class Field(InBounds):
+    """A radiance field in world coordinates. Subclasses define `features` and `colour`.
+
+    Networks work in units of the bounds' half-size; `forward` and `density` convert to 1 / world unit, so that a scene in
+    metres and the same scene in millimetres train alike.
+    """
+
+    def __init__(self, bounds: Bounds):
+        super().__init__(bounds)
+        self.unit_length = float(bounds.half_size.max())
+
+    def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
+        """World positions -> density (1 / half-size, not negative) and what `colour` needs."""
+        raise TypeError(f"{type(self).__name__} must define features(positions)")
+
+    def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Features and unit directions -> rgb in [0, 1]."""
+        raise TypeError(f"{type(self).__name__} must define colour(features, directions)")
+
+    def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        """World positions -> density, 1 / world unit."""
+        return self.features(positions)[0] / self.unit_length
+
+    def forward(
+        self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
+        """World positions and unit directions -> density (1 / world unit) and rgb in [0, 1]."""
+        density, features = self.features(positions)
+        return density / self.unit_length, self.colour(features, directions)
+
+
+class PictureField(torch.nn.Module):
+    """A picture as a function of place: subclasses define `forward`."""
+
+    def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+        """Places in [0, 1]^2 (x right, y down) -> rgb in [0, 1]."""
+        raise TypeError(f"{type(self).__name__} must define forward(uv)")

@@ -1,0 +1,66 @@
+"""The original NeRF network (Mildenhall et al. 2020, figure 7), sized as the course does."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.errors import InputError
+from nerf_lightning.model.activation import density_activation
+from nerf_lightning.model.encoding import sinusoidal
+from nerf_lightning.model.field import Field
+
+
+class MLPField(Field):
+    """A deep network of sinusoidally encoded position, with a view-dependent colour head.
+
+    Args:
+        bounds: positions are scaled to [-1, 1] in them.
+        depth: hidden layers of the trunk.
+        width: neurons of each.
+        skip: the layer that sees the encoded position again.
+        position_frequencies, direction_frequencies: octaves of the two encodings.
+        density: "relu", "softplus" or "exp".
+
+    Raises:
+        InputError: where `skip` is not one of the trunk's layers after the first.
+    """
+
+    def __init__(
+        self,
+        bounds: Bounds,
+        depth: int = 8,
+        width: int = 256,
+        skip: int = 4,
+        position_frequencies: int = 10,
+        direction_frequencies: int = 4,
+        density: str = "relu",
+    ):
+        super().__init__(bounds)
+        if not 0 < skip < depth:
+            raise InputError("model.skip", "", str(skip), f"a layer from 1 to {depth - 1} (model.depth={depth})")
+        self.skip = skip
+        self.position_frequencies = position_frequencies
+        self.direction_frequencies = direction_frequencies
+        self.activation = density_activation(density)
+        encoded = 3 * (1 + 2 * position_frequencies)
+        inputs = [encoded] + [width + encoded if layer == skip else width for layer in range(1, depth)]
+        self.trunk = torch.nn.ModuleList(torch.nn.Linear(n, width) for n in inputs)
+        self.density_head = torch.nn.Linear(width, 1)
+        self.bottleneck = torch.nn.Linear(width, width)
+        self.colour_head = torch.nn.Sequential(
+            torch.nn.Linear(width + 3 * (1 + 2 * direction_frequencies), width // 2),
+            torch.nn.ReLU(),
+            torch.nn.Linear(width // 2, 3),
+        )
+
+    def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
+        x = sinusoidal(self.bounds.to_unit(positions) * 2 - 1, self.position_frequencies)
+        h = x
+        for index, layer in enumerate(self.trunk):
+            h = torch.relu(layer(torch.cat([h, x], dim=1) if index == self.skip else h))
+        return self.activation(self.density_head(h)[:, 0]), h
+
+    def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        seen = torch.cat([self.bottleneck(features), sinusoidal(directions, self.direction_frequencies)], dim=1)
+        return torch.sigmoid(self.colour_head(seen))

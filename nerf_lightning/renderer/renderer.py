@@ -1,0 +1,84 @@
+"""The volume renderer: asks a field along samples and composites the answers onto a background."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from nerf_lightning.cameras import Rays
+from nerf_lightning.errors import InputError
+from nerf_lightning.renderer.volume import accumulate, volume_weights
+from nerf_lightning.sampler import Samples
+
+FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]]
+"""World positions and unit directions -> density (1 / world unit) and rgb in [0, 1]."""
+
+NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a ray sees."""
+
+    rgb: Float[Tensor, "R 3"]
+    """Composited onto the background."""
+    opacity: Float[Tensor, "R"]
+    """In [0, 1]: how much of the background is covered."""
+    depth: Float[Tensor, "R"]
+    """Expected distance along the ray of what covers it, in the scene's unit; 0 where nothing does."""
+
+
+class VolumeRenderer(torch.nn.Module):
+    """Emission-absorption rendering with a stated background.
+
+    Args:
+        background: "scene" (the scene's own), "black", "white", "random" (a new colour for each training ray, the scene's
+            own in evaluation; wants images with alpha), or three numbers in [0, 1].
+        scene_background: the colour "scene" stands for.
+
+    Raises:
+        InputError: on any other background.
+    """
+
+    colour: Tensor
+
+    def __init__(
+        self, background: str | list[float] = "scene", scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ):
+        super().__init__()
+        self.random = background == "random"
+        if background in ("scene", "random"):
+            colour = scene_background
+        elif isinstance(background, str):
+            if background not in NAMED:
+                raise InputError(
+                    "renderer.background", "", repr(background), "scene, black, white, random or three numbers in [0, 1]"
+                )
+            colour = NAMED[background]
+        else:
+            colour = tuple(float(c) for c in background)
+            if len(colour) != 3 or not all(0 <= c <= 1 for c in colour):
+                raise InputError("renderer.background", "", str(list(colour)), "three numbers in [0, 1]")
+        self.register_buffer("colour", torch.tensor(colour), persistent=False)
+
+    def backgrounds(self, rays: int, generator: Generator | None = None) -> Float[Tensor, "R 3"]:
+        """The colour behind each ray; random only in training, when a generator is given."""
+        if self.random and generator is not None:
+            return torch.rand(rays, 3, generator=generator, device=self.colour.device)
+        return self.colour.expand(rays, 3)
+
+    def forward(
+        self, rays: Rays, samples: Samples, field: FieldFn, backgrounds: Float[Tensor, "R 3"] | None = None
+    ) -> Rendered:
+        """Renders one colour a ray; `backgrounds` defaults to the renderer's own."""
+        if backgrounds is None:
+            backgrounds = self.backgrounds(len(rays))
+        density, rgb = field(samples.positions(rays), samples.directions(rays))
+        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
+        values = torch.cat([rgb, torch.ones_like(weights)[:, None], samples.t[:, None]], dim=1)
+        summed = accumulate(weights, values, samples.ray, len(rays))
+        opacity = summed[:, 3]
+        colour = summed[:, :3] + (1 - opacity)[:, None] * backgrounds
+        return Rendered(colour, opacity, summed[:, 4] / opacity.clamp_min(1e-6))

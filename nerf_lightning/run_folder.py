@@ -1,0 +1,174 @@
+"""The run folder: what a run leaves, and how it is read back without trusting it.
+
+    config.yaml            the resolved configuration
+    scene.json             bounds, background and orbit of the scene, so that rendering needs no photos
+    checkpoints/           last.ckpt, best.ckpt: tensors and plain values only
+    results.json           see callbacks/results.py
+    snapshots/ orbit.gif   pictures
+"""
+
+import importlib
+import json
+import os
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.build import build_system
+from nerf_lightning.cameras import Bounds, Cameras
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.errors import InputError
+from nerf_lightning.files import atomic, write_json
+from nerf_lightning.system import System
+
+TRUST = "NERF_LIGHTNING_TRUST"
+"""Environment variable: further packages, comma-separated, whose classes a run folder may name."""
+
+LIBRARY_TARGETS = {
+    "lightning.Trainer",
+    "lightning.pytorch.loggers.TensorBoardLogger",
+    "torch.optim.Adam",
+    "torch.optim.AdamW",
+}
+
+
+def save_config(cfg: DictConfig, folder: Path) -> None:
+    """Writes the resolved configuration; a relative dataset path becomes absolute, so that it holds from anywhere."""
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    path = plain["dataset"].get("path") if isinstance(plain["dataset"], dict) else None
+    if path is not None:
+        plain["dataset"]["path"] = os.path.abspath(path)
+    with atomic(folder / "config.yaml") as temporary:
+        temporary.write_text(yaml.safe_dump(plain, sort_keys=False))
+
+
+def load_config(folder: Path) -> DictConfig:
+    """Reads a run's configuration, refusing anything that would run code from outside the package.
+
+    Raises:
+        InputError: where the file is missing or broken, holds interpolations, or names a target that is not trusted.
+    """
+    path = folder / "config.yaml"
+    try:
+        plain = yaml.safe_load(path.read_text())
+    except FileNotFoundError as error:
+        raise InputError(path, "", "no such file", "the folder of a run", "look below outputs/") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(path, "", str(error), "a run's configuration in YAML") from error
+    if not isinstance(plain, dict):
+        raise InputError(path, "", type(plain).__name__, "a mapping")
+    _check(path, "", plain)
+    return OmegaConf.create(plain)
+
+
+def _check(path: Path, key: str, node: Any) -> None:
+    if isinstance(node, dict):
+        for name, value in node.items():
+            _check(path, f"{key}.{name}" if key else str(name), value)
+            if name == "_target_" and not _trusted(value):
+                raise InputError(
+                    path, f"{key}._target_", repr(value), "a class of this package", f"set {TRUST} to allow its package"
+                )
+    elif isinstance(node, list):
+        for index, value in enumerate(node):
+            _check(path, f"{key}[{index}]", value)
+    elif isinstance(node, str) and "${" in node:
+        raise InputError(path, key, repr(node), "a resolved value")
+
+
+def _trusted(target: Any) -> bool:
+    """Whether a target is one of the library's, or defined (not merely imported) in a trusted package."""
+    if not isinstance(target, str):
+        return False
+    if target in LIBRARY_TARGETS:
+        return True
+    packages = ["nerf_lightning", *filter(None, os.environ.get(TRUST, "").split(","))]
+    package = target.split(".")[0]
+    if package not in packages:
+        return False
+    module, _, name = target.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return False
+    return getattr(found, "__module__", "").split(".")[0] == package
+
+
+def save_scene(data: RayDataModule | PixelDataModule, folder: Path) -> None:
+    """Writes what rendering needs to know about the scene, without its photos."""
+    scene = data.scene
+    content: dict[str, Any] = scene.describe()
+    if isinstance(data, RayDataModule):
+        content |= {
+            "background": list(scene.background),
+            "aabb": scene.bounds.aabb.tolist(),
+            "unbounded": scene.bounds.unbounded,
+            "near": scene.bounds.near,
+            "far": scene.bounds.far,
+            "to_source": scene.to_source.tolist(),
+            "orbit": {
+                "K": scene.orbit.K.tolist(),
+                "c2w": scene.orbit.c2w.tolist(),
+                "width": scene.orbit.width,
+                "height": scene.orbit.height,
+            },
+        }
+    write_json(folder / "scene.json", content)
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run read back, ready to render."""
+
+    cfg: DictConfig
+    system: System
+    orbit: Cameras | None
+    """None for a picture."""
+
+
+def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
+    """Rebuilds a trained system from its folder alone.
+
+    Raises:
+        InputError: where a file is missing, broken, or does not fit the others.
+    """
+    cfg = load_config(folder)
+    path = folder / "scene.json"
+    try:
+        scene = json.loads(path.read_text())
+        frame, orbit = None, None
+        if "aabb" in scene:
+            bounds = Bounds(torch.tensor(scene["aabb"]), scene["unbounded"], scene["near"], scene["far"])
+            frame = (bounds, tuple(scene["background"]))
+            view = scene["orbit"]
+            orbit = Cameras(torch.tensor(view["K"]), torch.tensor(view["c2w"]), view["width"], view["height"])
+    except FileNotFoundError as error:
+        raise InputError(path, "", "no such file", "the scene of a run") from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(path, "", f"{type(error).__name__}: {error}", "the scene of a run, whole") from error
+    system = build_system(cfg, frame)
+    state = read_checkpoint(folder / "checkpoints" / checkpoint)
+    try:
+        system.load_state_dict(state["state_dict"])
+    except (KeyError, RuntimeError) as error:
+        raise InputError(folder / "checkpoints" / checkpoint, "state_dict", str(error), "the weights of this run's model") from error
+    return RunFolder(cfg, system.eval(), orbit)
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Reads tensors and plain values, never code.
+
+    Raises:
+        InputError: where the file is missing, truncated, or holds anything else.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise InputError(path, "", "no such file", "a checkpoint", "the run may have ended before its first one") from error
+    except (OSError, EOFError, RuntimeError, pickle.UnpicklingError) as error:
+        raise InputError(path, "", str(error).split(".")[0], "a whole checkpoint of tensors and plain values") from error

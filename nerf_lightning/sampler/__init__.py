@@ -1,0 +1,8 @@
+"""Stage 3, samplers: Rays -> Samples, where along each ray the field is asked."""
+
+from nerf_lightning.sampler.importance import ImportanceSampler
+from nerf_lightning.sampler.occupancy import OccupancySampler
+from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack
+from nerf_lightning.sampler.uniform import UniformSampler
+
+__all__ = ["DensityFn", "ImportanceSampler", "OccupancySampler", "Sampler", "Samples", "UniformSampler", "pack"]

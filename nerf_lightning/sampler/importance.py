@@ -1,0 +1,55 @@
+"""Coarse to fine: look evenly first, then look again where the weight is."""
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.sampler.samples import DensityFn, Samples, pack
+from nerf_lightning.sampler.uniform import UniformSampler
+
+
+def inverse_cdf(
+    edges: Float[Tensor, "R S_plus_1"], weights: Float[Tensor, "R S"], u: Float[Tensor, "R K"]
+) -> Float[Tensor, "R K"]:
+    """Maps u in [0, 1] to distances distributed as the piecewise-constant density given by `weights` (NeRF, section 5.2)."""
+    pdf = weights + 1e-5  # rays without weight fall back to uniform
+    cdf = torch.cumsum(pdf / pdf.sum(1, keepdim=True), dim=1)
+    cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=1)
+    upper = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, edges.shape[1] - 1)
+    low, high = cdf.gather(1, upper - 1), cdf.gather(1, upper)
+    share = ((u - low) / (high - low).clamp_min(1e-9)).clamp(0, 1)
+    start, end = edges.gather(1, upper - 1), edges.gather(1, upper)
+    return start + share * (end - start)
+
+
+class ImportanceSampler(UniformSampler):
+    """A uniform pass without gradient, then as many samples again drawn where its weights are; both together are returned.
+
+    One field serves both passes.
+
+    Args:
+        bounds: where the content is.
+        samples: intervals of the first pass.
+        fine: further samples a ray.
+        stratified: jitter both passes in training.
+    """
+
+    def __init__(self, bounds: Bounds, samples: int = 64, fine: int = 64, stratified: bool = True):
+        super().__init__(bounds, samples, stratified)
+        self.fine = fine
+
+    def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
+        edges = self.edges(rays, generator)
+        hit = edges[:, -1:] > edges[:, :1]
+        coarse = pack(edges, hit.expand(-1, self.samples))
+        with torch.no_grad():
+            optical = torch.zeros(hit.shape[0], self.samples, device=edges.device)
+            optical[hit[:, 0]] = (density(coarse.positions(rays)) * coarse.dt).view(-1, self.samples)
+            # w_i = T_i (1 - exp(-sigma_i dt_i)), T_i = exp(-sum_{j<i} sigma_j dt_j)  (NeRF, eq. 3)
+            weights = torch.exp(optical - optical.cumsum(1)) * -torch.expm1(-optical)
+        u = (torch.arange(self.fine, device=edges.device) + 0.5).expand(len(rays), -1) / self.fine
+        if self.stratified and generator is not None:
+            u = u + (torch.rand(u.shape, generator=generator, device=u.device) - 0.5) / self.fine
+        merged = torch.cat([edges, inverse_cdf(edges, weights, u)], dim=1).sort(dim=1).values
+        return pack(merged, hit.expand(-1, merged.shape[1] - 1))

@@ -1,0 +1,57 @@
+"""Samples: intervals along rays, packed one ray after the other, and the interface every sampler meets."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Generator, Tensor
+
+from nerf_lightning.cameras import InBounds, Rays
+
+DensityFn = Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N"]]
+"""World positions -> density (1 / world unit); how samplers look at a field without knowing it."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """N intervals over R rays, sorted by ray, then by distance. Rays may hold different counts, or none."""
+
+    t: Float[Tensor, "N"]
+    """Midpoint of each interval: distance along its ray."""
+    dt: Float[Tensor, "N"]
+    """Length of each interval."""
+    ray: Int[Tensor, "N"]
+    """Index of the ray each sample lies on."""
+    offsets: Int[Tensor, "R_plus_1"]
+    """Samples of ray r are offsets[r] : offsets[r + 1]."""
+
+    def __len__(self) -> int:
+        return self.t.shape[0]
+
+    def positions(self, rays: Rays) -> Float[Tensor, "N 3"]:
+        """World positions of the midpoints."""
+        return rays.origins[self.ray] + self.t[:, None] * rays.directions[self.ray]
+
+    def directions(self, rays: Rays) -> Float[Tensor, "N 3"]:
+        """Unit viewing direction of each sample."""
+        return rays.directions[self.ray]
+
+
+def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Samples:
+    """Packs the kept intervals between consecutive edges of each ray."""
+    counts = keep.sum(1)
+    offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    ray, column = keep.nonzero(as_tuple=True)
+    start, end = edges[ray, column], edges[ray, column + 1]
+    return Samples((start + end) / 2, end - start, ray, offsets)
+
+
+class Sampler(InBounds):
+    """Base of samplers. Without a generator (evaluation) the samples do not depend on chance."""
+
+    def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
+        raise TypeError(f"{type(self).__name__} must define forward(rays, density, generator) -> Samples")
+
+    def update(self, step: int, density: DensityFn, generator: Generator) -> None:
+        """Called before each training step; samplers that learn where content is do so here."""

@@ -1,0 +1,20 @@
+"""Stage 6, systems: LightningModules that hold step, loss, metrics and optimiser, and nothing else."""
+
+from nerf_lightning.system.metrics import psnr, ssim
+from nerf_lightning.system.nerf2d import NeRF2D
+from nerf_lightning.system.nerf3d import NeRF3D
+from nerf_lightning.system.schedule import constant, cosine, exponential
+from nerf_lightning.system.system import StepStats, System, ViewResult
+
+__all__ = [
+    "NeRF2D",
+    "NeRF3D",
+    "StepStats",
+    "System",
+    "ViewResult",
+    "constant",
+    "cosine",
+    "exponential",
+    "psnr",
+    "ssim",
+]

@@ -1,0 +1,68 @@
+"""NeRF3D: fit a radiance field to rays."""
+
+import torch
+from torch import Tensor
+
+from nerf_lightning.cameras import Rays
+from nerf_lightning.dataset import RayBatch, ViewBatch
+from nerf_lightning.model import Field
+from nerf_lightning.renderer import Rendered, VolumeRenderer
+from nerf_lightning.sampler import Sampler
+from nerf_lightning.seeding import step_generator
+from nerf_lightning.system.system import MakeOptimizer, Schedule, StepStats, System
+
+RENDER_CHUNK = 4096
+"""Rays rendered together without gradient: bounds the memory of a view, whatever its size."""
+
+
+class NeRF3D(System):
+    """sampler -> field -> renderer -> squared error.
+
+    Args:
+        field: position, direction -> density, rgb.
+        sampler: rays -> samples.
+        renderer: samples -> pixels.
+        optimizer, schedule, seed: see `System`.
+    """
+
+    def __init__(
+        self,
+        field: Field,
+        sampler: Sampler,
+        renderer: VolumeRenderer,
+        optimizer: MakeOptimizer,
+        schedule: Schedule,
+        seed: int = 0,
+    ):
+        super().__init__(optimizer, schedule, seed)
+        self.field = field
+        self.sampler = sampler
+        self.renderer = renderer
+
+    def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
+        generator = step_generator(self.seed, 1, self.global_step, self.device)
+        with torch.no_grad():
+            self.sampler.update(self.global_step, self.field.density, generator)
+            samples = self.sampler(batch.rays, self.field.density, generator)
+        backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
+        rendered = self.renderer(batch.rays, samples, self.field, backgrounds)
+        loss = torch.nn.functional.mse_loss(rendered.rgb, batch.target(backgrounds))
+        self.stats = StepStats(loss.detach().item(), len(batch.rays), len(samples))
+        self.trainer.datamodule.adapt(len(samples))
+        return loss
+
+    @torch.no_grad()
+    def render(self, rays: Rays) -> Rendered:
+        """Renders rays without gradient and without chance, a chunk at a time."""
+        parts = []
+        for start in range(0, len(rays), RENDER_CHUNK):
+            chunk = rays[start : start + RENDER_CHUNK]
+            parts.append(self.renderer(chunk, self.sampler(chunk, self.field.density), self.field))
+        return Rendered(*(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "depth")))
+
+    def truth(self, view: ViewBatch) -> Tensor:
+        return view.target(self.renderer.backgrounds(len(view.rays)))
+
+    def show(self, view: ViewBatch) -> tuple[Tensor, Tensor, Tensor]:
+        rendered = self.render(view.rays)
+        return rendered.rgb, rendered.depth, rendered.opacity

@@ -1,0 +1,98 @@
+"""What NeRF2D and NeRF3D share: the optimiser, its schedule, and how a whole view is judged."""
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import lightning as L
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.system.metrics import psnr, ssim
+
+MakeOptimizer = Callable[[Iterable[torch.nn.Parameter]], torch.optim.Optimizer]
+Schedule = Callable[[float], float]
+"""Progress in [0, 1] -> factor on the learning rate."""
+
+
+@dataclass(frozen=True)
+class StepStats:
+    """What the last training step did."""
+
+    mse: float
+    rays: int
+    """Rays, or pixels in 2D."""
+    samples: int
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """One view rendered, beside its truth. Colours in [0, 1]."""
+
+    rgb: Float[Tensor, "H W 3"]
+    truth: Float[Tensor, "H W 3"]
+    psnr: float
+    ssim: float
+    seconds: float
+    """Rendering time."""
+    depth: Float[Tensor, "H W"] | None = None
+    opacity: Float[Tensor, "H W"] | None = None
+
+
+class System(L.LightningModule):
+    """Base of the two systems.
+
+    Args:
+        optimizer: makes the optimiser from the parameters.
+        schedule: factor on its learning rate by progress.
+        seed: of all chance in training steps.
+    """
+
+    def __init__(self, optimizer: MakeOptimizer, schedule: Schedule, seed: int):
+        super().__init__()
+        self.make_optimizer = optimizer
+        self.schedule = schedule
+        self.seed = seed
+        self.progress = 0.0
+        """Fraction of the budget done; the Budget callback keeps it."""
+        self.stats = StepStats(float("nan"), 0, 0)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        optimizer = self.make_optimizer(self.parameters())
+        for group in optimizer.param_groups:
+            group["initial_lr"] = group["lr"]
+        return optimizer
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        factor = self.schedule(self.progress)
+        for group in self.optimizers(use_pl_optimizer=False).param_groups:
+            group["lr"] = group["initial_lr"] * factor
+
+    def truth(self, view: Any) -> Float[Tensor, "N 3"]:
+        """The colours a whole-view batch should have."""
+        raise TypeError(f"{type(self).__name__} must define truth(view)")
+
+    def show(self, view: Any) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"] | None, Float[Tensor, "N"] | None]:
+        """The colours the field gives a whole-view batch, with depth and opacity where it has them."""
+        raise TypeError(f"{type(self).__name__} must define show(view)")
+
+    @torch.no_grad()
+    def evaluate(self, view: Any) -> ViewResult:
+        """Renders a whole view and judges it."""
+        view = view.to(self.device)
+        start = time.perf_counter()
+        rgb, depth, opacity = self.show(view)
+        seconds = time.perf_counter() - start
+
+        def image(x: Tensor) -> Tensor:
+            return x.view(view.height, view.width, *x.shape[1:]).cpu()
+
+        rgb, truth = image(rgb.clamp(0, 1)), image(self.truth(view))
+        depth, opacity = (None if x is None else image(x) for x in (depth, opacity))
+        return ViewResult(rgb, truth, psnr(rgb, truth), ssim(rgb, truth), seconds, depth, opacity)
+
+    def test_step(self, batch: Any, batch_idx: int) -> dict[str, float]:
+        result = self.evaluate(batch)
+        return {"psnr": result.psnr, "ssim": result.ssim, "seconds": result.seconds}

@@ -1,0 +1,94 @@
+"""One training run, from a composed configuration to the files in its folder."""
+
+import logging
+import warnings
+from pathlib import Path
+
+import lightning as L
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.build import build_data, build_system, build_trainer, check_background, frame_of
+from nerf_lightning.callbacks import Results
+from nerf_lightning.errors import InputError
+from nerf_lightning.run_folder import load_config, read_checkpoint, save_config, save_scene
+
+GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
+
+
+def train(cfg: DictConfig) -> float:
+    """Builds, fits, tests, writes. Returns the held-out PSNR in dB.
+
+    Raises:
+        InputError: on bad input, before anything is written into the run's folder except its log.
+    """
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    checkpoint = None
+    if cfg.resume is not None:
+        cfg, checkpoint = resumed(cfg, folder)
+    quiet()
+    if cfg.threads is not None:
+        torch.set_num_threads(cfg.threads)
+    torch.set_flush_denormal(True)  # dying weights otherwise slow the CPU down many times over
+    L.seed_everything(cfg.seed, verbose=False)
+    data = build_data(cfg)
+    system = build_system(cfg, frame_of(data))
+    check_background(cfg, data, system)
+    trainer = build_trainer(cfg, folder)
+    save_config(cfg, folder)
+    save_scene(data, folder)
+    trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
+    trainer.test(system, data, verbose=False)
+    results = next(callback for callback in trainer.callbacks if isinstance(callback, Results)).summary
+    if trainer.logger is not None:
+        log_hyperparameters(trainer.logger, cfg, results)
+    report(results, folder)
+    return results["psnr"]
+
+
+def resumed(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
+    """The configuration of the run in `folder` with this command line's overrides on top, and its last checkpoint."""
+    saved = load_config(folder)
+    checkpoint = folder / "checkpoints" / "last.ckpt"
+    read_checkpoint(checkpoint)  # a broken one is told in one line, before anything starts
+    for override in HydraConfig.get().overrides.task:
+        key, _, _ = override.partition("=")
+        if key == "resume":
+            continue
+        if OmegaConf.select(saved, key, default=override) is override:
+            raise InputError("resume", key, "an option the run does not have", f"one of those in {folder}/config.yaml")
+        OmegaConf.update(saved, key, OmegaConf.select(cfg, key))
+    return saved, checkpoint
+
+
+def quiet() -> None:
+    """Silences what Lightning says about hardware and habits that this package decides for itself."""
+    for name in ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in (".*does not have many workers.*", ".*GPU available but not used.*", ".*isinstance.treespec.*"):
+        warnings.filterwarnings("ignore", message)
+
+
+def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, results: dict) -> None:
+    """Puts the run's options beside its final figures in TensorBoard's HParams tab."""
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    options = {group: plain[group] for group in GROUPS if plain.get(group) is not None}
+    params = {**options, "method": cfg.method, "scene": results["scene"]["name"], "seed": cfg.seed}
+    metrics = {f"final/{key}": results[key] or 0.0 for key in ("psnr", "ssim", "train_seconds", "artifact_bytes")}
+    if isinstance(logger, L.pytorch.loggers.TensorBoardLogger):
+        logger.log_hyperparams(params, metrics)
+        logger.finalize("success")
+
+
+def report(results: dict, folder: Path) -> None:
+    """The last words on the terminal."""
+    scene, seconds = results["scene"]["name"], results["train_seconds"]
+    print(f"{scene}: {results['psnr']:.2f} dB held out after {seconds:.0f} s of training ({results['status']})")
+    if results["diagnosis"]:
+        print(results["diagnosis"])
+    try:
+        folder = folder.relative_to(Path.cwd())
+    except ValueError:
+        pass  # the run's folder lies elsewhere: its full path it is
+    print(f"everything is in {folder}; curves: tensorboard --logdir {folder.parent}")

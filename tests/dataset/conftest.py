@@ -1,0 +1,68 @@
+"""A scene small enough to write in every format: a coloured ball off the origin, exact silhouettes, oblong pictures."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf_lightning.cameras import Bounds, Cameras, orbit_around
+from nerf_lightning.dataset import Scene, Views
+from nerf_lightning.errors import InputError
+
+CENTRE = torch.tensor([0.3, -0.2, 0.1])
+RADIUS = 0.5
+WIDTH, HEIGHT, FOCAL = 48, 40, 60.0
+
+
+def ball_views(per_ring: int, elevations: tuple[float, ...] = (-0.6, 0.2, 0.9), turn: float = 0.0) -> Views:
+    """RGBA views from rings of cameras, 4 units away from the origin."""
+    up = torch.tensor([0.0, 0.0, 1.0])
+    c, s = math.cos(turn), math.sin(turn)
+    spin = torch.tensor([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    c2w = torch.cat([spin @ orbit_around(torch.zeros(3), up, 4.0, e, per_ring) for e in elevations])
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    cameras = Cameras(K.repeat(len(c2w), 1, 1), c2w, WIDTH, HEIGHT)
+    images = []
+    for view in range(len(c2w)):
+        rays = cameras.view_rays(view)
+        to_ball = CENTRE - rays.origins
+        along = (to_ball * rays.directions).sum(-1)
+        under = RADIUS**2 - (to_ball.square().sum(-1) - along**2)
+        hit = rays.origins + (along - under.clamp_min(0).sqrt())[:, None] * rays.directions
+        rgb = ((hit - CENTRE) / RADIUS * 0.5 + 0.5).clamp(0, 1) * 0.8 + 0.2
+        rgba = torch.cat([rgb, torch.ones_like(along)[:, None]], dim=-1) * (under > 0)[:, None]
+        images.append((rgba * 255).round().to(torch.uint8).view(HEIGHT, WIDTH, 4))
+    return Views(torch.stack(images), cameras)
+
+
+@pytest.fixture(scope="session")
+def ball_views_of() -> Callable[..., Views]:
+    return ball_views
+
+
+@pytest.fixture(scope="session")
+def ball_box() -> torch.Tensor:
+    return torch.stack([CENTRE - RADIUS, CENTRE + RADIUS])
+
+
+@pytest.fixture(scope="session")
+def ball() -> Scene:
+    """9 training and 3 held-out RGBA views, an orbit of 4."""
+    train, val = ball_views(3), ball_views(1, turn=0.4)
+    orbit = ball_views(4, (0.3,)).cameras
+    return Scene("ball", "test", train, val, orbit, Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])))
+
+
+@pytest.fixture(scope="session")
+def says() -> Callable[..., None]:
+    """Asserts that an InputError is one line that holds all the given words."""
+
+    def check(error: InputError, *words: str | Path) -> None:
+        line = str(error)
+        assert "\n" not in line
+        for word in words:
+            assert str(word) in line, line
+
+    return check

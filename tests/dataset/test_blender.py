@@ -1,0 +1,212 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.dataset import Scene, load_blender, load_npz
+from nerf_lightning.dataset.resize import area_resize
+from nerf_lightning.errors import InputError
+
+ANGLE = 2 * float(np.arctan(0.5 * 8 / 10))  # focal 10 at 8 pixels width
+
+
+def write_split(folder: Path, split: str, images: np.ndarray, c2w_opengl: np.ndarray) -> None:
+    (folder / split).mkdir(parents=True, exist_ok=True)
+    frames = []
+    for i, (image, pose) in enumerate(zip(images, c2w_opengl, strict=True)):
+        code = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+        cv2.imwrite(str(folder / split / f"r_{i}.png"), cv2.cvtColor(image, code))
+        frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
+    (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": ANGLE, "frames": frames}))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """RGBA, 8x6; an OpenGL camera with identity rotation stands at (0, 0, 5): right is x, up is y, it looks along -z."""
+    pose = np.eye(4)
+    pose[2, 3] = 5.0
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (3, 6, 8, 4), dtype=np.uint8)
+    write_split(tmp_path / "Toy", "train", images[:2], np.stack([pose, pose]))
+    write_split(tmp_path / "Toy", "val", images[2:], pose[None])
+    return tmp_path / "Toy"
+
+
+def test_plain_folder(folder: Path):
+    scene = load_blender(folder)
+    expected = np.random.default_rng(0).integers(0, 256, (3, 6, 8, 4), dtype=np.uint8)
+    assert (scene.train.images.numpy() == expected[:2]).all() and (scene.val.images.numpy() == expected[2:]).all()
+    assert scene.name == "toy" and scene.resolution == (8, 6) and scene.background == (1.0, 1.0, 1.0)
+    torch.testing.assert_close(scene.val.cameras.K[0], torch.tensor([[10.0, 0, 4], [0, 10, 3], [0, 0, 1]]))
+    assert len(scene.orbit) == 60 and not scene.bounds.unbounded
+
+
+def test_a_known_point_is_seen_at_its_pixel(folder: Path):
+    # (1.25, 0.75, 0) is 1.25 right of, 0.75 above and 5 before the camera: u = 4 + 2.5, v = 3 - 1.5, a pixel's centre.
+    cameras = load_blender(folder).train.cameras
+    ray = cameras.rays(torch.tensor([0]), torch.tensor([1]), torch.tensor([6]))
+    point = torch.tensor([1.25, 0.75, 0.0])
+    torch.testing.assert_close(ray.directions[0], torch.nn.functional.normalize(point - ray.origins[0], dim=0))
+    torch.testing.assert_close(ray.origins[0], torch.tensor([0.0, 0.0, 5.0]))
+
+
+def test_test_split_is_held_out_where_there_is_no_val(folder: Path):
+    (folder / "transforms_val.json").rename(folder / "transforms_test.json")
+    assert len(load_blender(folder).val) == 1
+
+
+def test_rgb_renders(folder: Path):
+    write_split(folder, "train", np.full((1, 6, 8, 3), 7, np.uint8), np.eye(4)[None])
+    write_split(folder, "val", np.full((1, 6, 8, 3), 9, np.uint8), np.eye(4)[None])
+    scene = load_blender(folder, "named")
+    assert scene.name == "named" and scene.train.images.shape == (1, 6, 8, 3)
+    assert scene.background == (1.0, 1.0, 1.0)
+
+
+def test_resize_scales_pictures_and_intrinsics(folder: Path):
+    scene = load_blender(folder, resize=4)
+    assert scene.resolution == (4, 3) and scene.train.images.shape == (2, 3, 4, 4)
+    torch.testing.assert_close(scene.train.cameras.K[0], torch.tensor([[5.0, 0, 2], [0, 5, 1.5], [0, 0, 1]]))
+    assert load_blender(folder, resize=100).resolution == (8, 6)
+
+
+def test_resize_leaves_no_dark_rim():
+    """White under alpha 1, black under alpha 0: every pixel with any alpha must stay white."""
+    x, y = np.meshgrid(np.arange(50), np.arange(50))
+    disc = ((x - 25) ** 2 + (y - 22) ** 2 < 300)[..., None]
+    image = np.where(disc, 255, 0).astype(np.uint8).repeat(4, axis=2)
+    small = area_resize(image, 19, 19)
+    partial = (small[..., 3] > 0) & (small[..., 3] < 255)
+    assert partial.sum() > 20
+    assert (small[partial][:, :3] == 255).all()
+    assert abs(small[..., 3].mean() - image[..., 3].mean()) < 1
+
+
+def test_resize_then_composite_is_composite_then_resize(ball: Scene):
+    rgba = ball.train.images[0].numpy()
+
+    def over_white(image: np.ndarray) -> np.ndarray:
+        alpha = image[..., 3:] / 255
+        return np.rint(image[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
+
+    a, b = over_white(area_resize(rgba, 24, 20)), area_resize(over_white(rgba), 24, 20)
+    assert np.abs(a.astype(int) - b).max() <= 1
+
+
+def _edit(split: str, change: Callable[[dict], object]) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        path = folder / f"transforms_{split}.json"
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+
+    return apply
+
+
+def _frame(key: str, value: object) -> Callable[[Path], None]:
+    return _edit("train", lambda c: c["frames"][1].__setitem__(key, value))
+
+
+def _break_json(folder: Path) -> None:
+    (folder / "transforms_train.json").write_text('{\n"camera_angle_x": 0.7,\n"frames": [}')
+
+
+def _shrink_image(folder: Path) -> None:
+    cv2.imwrite(str(folder / "train/r_1.png"), np.zeros((6, 7, 4), np.uint8))
+
+
+def _cut_image(folder: Path) -> None:
+    path = folder / "train/r_1.png"
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def _val_size(folder: Path) -> None:
+    cv2.imwrite(str(folder / "val/r_0.png"), np.zeros((5, 8, 4), np.uint8))
+
+
+SCALED = np.diag([1.5, 1.5, 1.5, 1.0]).tolist()
+MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
+DAMAGE = {
+    "no train": (lambda f: (f / "transforms_train.json").unlink(), ["transforms_train.json: found nothing there"]),
+    "no held out": (lambda f: (f / "transforms_val.json").unlink(), ["found no transforms_val.json or"]),
+    "broken json": (_break_json, ["transforms_train.json: found broken JSON at line 3"]),
+    "json list": (lambda f: (f / "transforms_val.json").write_text("[]"), ["transforms_val.json: found a JSON list"]),
+    "not utf-8": (
+        lambda f: (f / "transforms_val.json").write_bytes(b'{"\xff"}'),
+        ["found something unreadable (Unicode"],
+    ),
+    "angle missing": (_edit("val", lambda c: c.pop("camera_angle_x")), ["val.json: camera_angle_x", "among [frames]"]),
+    "angle zero": (
+        _edit("val", lambda c: c.update(camera_angle_x=0)),
+        ["camera_angle_x: found 0, expected a positive"],
+    ),
+    "angle huge": (_edit("val", lambda c: c.update(camera_angle_x=3.2)), ["camera_angle_x: found 3.2"]),
+    "angle text": (_edit("val", lambda c: c.update(camera_angle_x="wide")), ["camera_angle_x: found 'wide'"]),
+    "angle endless": (_edit("val", lambda c: c.update(camera_angle_x=10**400)), ["camera_angle_x: found 1000"]),
+    "frames missing": (_edit("train", lambda c: c.pop("frames")), ["frames: found no such key"]),
+    "frames empty": (_edit("train", lambda c: c.update(frames=[])), ["frames: found an empty list"]),
+    "frames object": (_edit("train", lambda c: c.update(frames={})), ["frames: found something else"]),
+    "path missing": (
+        _edit("train", lambda c: c["frames"][1].pop("file_path")),
+        ["frames[1]: file_path: found no such"],
+    ),
+    "path number": (_frame("file_path", 3), ["frames[1].file_path: found 3"]),
+    "matrix missing": (
+        _edit("train", lambda c: c["frames"][1].pop("transform_matrix")),
+        ["frames[1]: transform_matrix: found no such key among [file_path]"],
+    ),
+    "matrix shape": (
+        _frame("transform_matrix", np.eye(3).tolist()),
+        ["frames[1].transform_matrix: found shape (3, 3)"],
+    ),
+    "matrix ragged": (_frame("transform_matrix", [[1, 2], [3]]), ["frames[1].transform_matrix: found no matrix"]),
+    "matrix text": (_frame("transform_matrix", "identity"), ["frames[1].transform_matrix: found no matrix"]),
+    "matrix nan": (_frame("transform_matrix", [[float("nan")] * 4] * 4), ["frames[1].transform_matrix: found nan"]),
+    "matrix scaled": (_frame("transform_matrix", SCALED), ["frames[1].transform_matrix: found R^T R", "scale"]),
+    "matrix mirrored": (
+        _frame("transform_matrix", MIRRORED),
+        ["frames[1].transform_matrix: found a mirror", "handedness"],
+    ),
+    "image missing": (
+        _frame("file_path", "./train/r_9"),
+        ["frames[1].file_path: found './train/r_9', which is not there"],
+    ),
+    "image size": (_shrink_image, ["r_1.png: found 7x6 with 4 channels, expected 8x6 with 4 channels"]),
+    "image truncated": (_cut_image, ["r_1.png: found a truncated image"]),
+    "image text": (lambda f: (f / "train/r_0.png").write_text("no"), ["r_0.png: found 2 bytes that are no image"]),
+    "image empty": (lambda f: (f / "train/r_0.png").write_text(""), ["r_0.png: found 0 bytes that are no image"]),
+    "split sizes": (_val_size, ["transforms_val.json: frames: found 8x5"]),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damage(damage: str, folder: Path, says: Callable):
+    spoil, words = DAMAGE[damage]
+    spoil(folder)
+    with pytest.raises(InputError) as caught:
+        load_blender(folder)
+    says(caught.value, folder, *words, ", expected ")
+
+
+def test_resize_below_one_pixel(folder: Path):
+    with pytest.raises(InputError, match="resize: found 0"):
+        load_blender(folder, resize=0)
+
+
+@pytest.mark.real_data
+def test_lego_is_the_same_scene_in_both_formats(real_data: Path):
+    blender = load_blender(real_data / "nerf_synthetic" / "lego", resize=200)
+    course = load_npz(real_data / "lego_200x200.npz")
+    assert (blender.name, len(blender.train), len(blender.val)) == ("lego", 100, 10)
+    for split in ("train", "val"):
+        ours, theirs = getattr(blender, split), getattr(course, split)
+        for view in (0, len(ours) - 1):
+            a, b = ours.cameras.view_rays(view), theirs.cameras.view_rays(view)
+            torch.testing.assert_close(a.origins, b.origins, atol=1e-4, rtol=0)
+            torch.testing.assert_close(a.directions, b.directions, atol=1e-4, rtol=0)
+        rgba, rgb = ours.images[::10].float(), theirs.images[::10].float()
+        assert (rgba[..., :3] * rgba[..., 3:] / 255 - rgb).abs().mean() < 0.5

@@ -1,0 +1,297 @@
+"""The built-in scene against closed forms, brute force and its own geometry."""
+
+import itertools
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.dataset import bricks as module
+from nerf_lightning.dataset.brickmodel import bulldozer
+from nerf_lightning.dataset.bricks import bricks
+from nerf_lightning.dataset.brickshade import LIGHT
+from nerf_lightning.dataset.bricksolids import Builder, Material
+from nerf_lightning.dataset.bricktrace import nearest, shadow, trace, visible
+from nerf_lightning.errors import InputError
+
+SMALL = {"size": 40, "train_views": 4, "val_views": 2, "orbit_views": 3}
+MATERIAL = Material((1.0, 1.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return bricks(**SMALL, cache="")
+
+
+def enter(builder, origin, direction):
+    return nearest(builder.build(), np.array([origin], float), np.array([direction], float))[1][0]
+
+
+def test_box_distances():
+    b = Builder()
+    b.box((-1, -2, -3), (1, 2, 3), MATERIAL)
+    assert enter(b, (5, 0.5, 0), (-1, 0, 0)) == pytest.approx(4)
+    assert enter(b, (0, 0, 5), (0, 0, -1)) == pytest.approx(2)
+    # 45 degrees down onto the upper face: sqrt(2) longer than the drop of 2.
+    assert enter(b, (0, -2, 5), (0, math.sqrt(0.5), -math.sqrt(0.5))) == pytest.approx(2 * math.sqrt(2))
+    assert enter(b, (5, 2.01, 0), (-1, 0, 0)) == np.inf
+    assert enter(b, (5, 0, 0), (1, 0, 0)) == np.inf  # behind
+    assert enter(b, (0, 0, 0), (1, 0, 0)) == np.inf  # starts inside
+
+
+def test_turned_bar_distances():
+    b = Builder()
+    b.bar((0, -1, -1), (0, 1, 1), width=0.4, thickness=0.2, material=MATERIAL)
+    # Across the bar's 45 degree slope its thickness of 0.2 spans 0.2 * sqrt(2) of a vertical ray, half of it above.
+    assert enter(b, (0.1, 0.3, 5), (0, 0, -1)) == pytest.approx(5 - 0.3 - 0.1 * math.sqrt(2))
+    assert enter(b, (5, 0.3, 0.3), (-1, 0, 0)) == pytest.approx(4.8)
+    assert enter(b, (5, 0.3, -0.3), (-1, 0, 0)) == np.inf
+
+
+def test_cylinder_distances():
+    b = Builder()
+    b.cylinder((0, 0, -1), (0, 0, 1), 0.5, MATERIAL)
+    # 0.3 off the axis the half-chord is 0.4.
+    assert enter(b, (5, 0.3, 0), (-1, 0, 0)) == pytest.approx(4.6)
+    assert enter(b, (0.3, 0.3, 5), (0, 0, -1)) == pytest.approx(4)
+    assert enter(b, (0.4, 0.4, 5), (0, 0, -1)) == np.inf  # within the box around it, past the cap's rim
+    assert enter(b, (5, 0.51, 0), (-1, 0, 0)) == np.inf
+    assert enter(b, (5, 0, 1.01), (-1, 0, 0)) == np.inf
+
+
+def test_aabb_is_exact_for_turned_solids():
+    b = Builder()
+    b.cylinder((0, -1, -1), (0, 1, 1), 0.5, MATERIAL)
+    reach = 1 + 0.5 * math.sqrt(0.5)
+    np.testing.assert_allclose(b.build().aabb, [[-0.5, -reach, -reach], [0.5, reach, reach]])
+
+
+def test_same_bytes_every_time(scene):
+    assert bricks(**SMALL, cache="").sha256() == scene.sha256()
+
+
+def test_shapes_and_alpha(scene):
+    assert scene.train.images.shape == (4, 40, 40, 4)
+    assert scene.val.images.shape == (2, 40, 40, 4)
+    assert len(scene.orbit) == 3
+    alpha = scene.train.images[..., 3]
+    border = torch.cat([alpha[:, 0], alpha[:, -1], alpha[:, :, 0], alpha[:, :, -1]])
+    assert (border == 0).all()
+    assert (alpha == 255).flatten(1).any(1).all()
+    # Edges are smooth: some alphas lie between, and none but multiples of a sample's share.
+    assert set(alpha.unique().tolist()) == {round(255 * k / 9) for k in range(10)}
+    assert (scene.train.images[..., :3][alpha == 0] == 0).all()
+    # Straight alpha: edge pixels are as bright as the model, not darkened by the background.
+    rgb = scene.train.images[..., :3].float().mean(-1)
+    assert rgb[(alpha > 0) & (alpha < 100)].mean() > 0.6 * rgb[alpha == 255].mean()
+
+
+def test_cameras_match_the_paper(scene):
+    for cameras in (scene.train.cameras, scene.val.cameras, scene.orbit):
+        torch.testing.assert_close(cameras.centres.norm(dim=-1), torch.full((len(cameras),), 4.0311))
+        looks = cameras.c2w[:, :3, 2]
+        torch.testing.assert_close(looks, -cameras.centres / 4.0311, atol=1e-5, rtol=0)
+        assert (cameras.centres[:, 2] > 0).all()
+        assert (cameras.c2w[:, 2, 1] < 0).all()  # the image's down goes down
+        torch.testing.assert_close(cameras.c2w[:, 2, 0], torch.zeros(len(cameras)), atol=1e-6, rtol=0)  # no roll
+        # 800 px at 1111.111 px focal length are the paper's; 40 px are a twentieth.
+        torch.testing.assert_close(cameras.K[:, 0, 0], torch.full((len(cameras),), 1111.111 / 20))
+        assert (cameras.K[:, :2, 2] == 20).all()
+
+
+def test_held_out_views_are_not_trained_on(monkeypatch):
+    monkeypatch.setattr(module, "picture", lambda cameras, view: np.zeros((1, 1, 4), np.uint8))
+    scene = bricks(size=1, cache="")
+    train, val = (views.cameras.centres / 4.0311 for views in (scene.train, scene.val))
+    assert (len(train), len(val), len(scene.orbit)) == (100, 10, 60)
+    angles = torch.rad2deg((val @ train.T).clamp(-1, 1).arccos().amin(1))
+    assert angles.min() > 2
+    # Spread: whatever the direction, a training view is near, and all heights occur.
+    assert angles.max() < 15
+    for heights in (train[:, 2], val[:, 2]):
+        assert heights.min() < 0.15 and heights.max() > 0.85
+
+
+def test_model_fills_its_box(scene):
+    aabb = torch.from_numpy(bulldozer().aabb).float()
+    torch.testing.assert_close(scene.bounds.aabb.mean(0), aabb.mean(0))
+    torch.testing.assert_close(scene.bounds.half_size, 1.02 * Bounds(aabb).half_size)
+    rays = scene.train.cameras.view_rays(0)
+    _, hit, t = trace(rays)
+    points = (rays.origins + t[:, None] * rays.directions)[hit]
+    assert (points >= aabb[0] - 1e-4).all() and (points <= aabb[1] + 1e-4).all()
+
+
+def test_retracing_gives_the_remaining_distance(scene):
+    rays = scene.train.cameras.view_rays(1)
+    rgb, hit, t = trace(rays)
+    assert 0.1 < hit.float().mean() < 0.7
+    assert t[~hit].isinf().all() and (rgb[~hit] == 0).all()
+    rays, t, rgb = rays[hit], t[hit], rgb[hit]
+    start = Rays(rays.origins + (t - 0.01)[:, None] * rays.directions, rays.directions)
+    again, hit_again, rest = trace(start)
+    # A gap narrower than 0.01 before the surface puts the start inside another solid: rare.
+    close = hit_again & ((rest - 0.01).abs() < 1e-4)
+    assert close.float().mean() > 0.97
+    # The same point in the same direction has the same colour, except where rounding crosses a pattern or a shadow.
+    assert ((again - rgb)[close].abs().amax(-1) < 0.01).float().mean() > 0.97
+
+
+def test_culling_changes_nothing(scene):
+    cameras = scene.val.cameras.resized(24, 24)
+    for view in range(2):
+        for fast, slow in zip(
+            visible(bulldozer(), cameras, view), visible(bulldozer(), cameras, view, cull=False), strict=True
+        ):
+            np.testing.assert_array_equal(fast, slow)
+    rays = cameras.view_rays(0)
+    origins, directions = rays.origins.double().numpy(), rays.directions.double().numpy()
+    fast, slow = (nearest(bulldozer(), origins, directions, cull=cull) for cull in (True, False))
+    np.testing.assert_array_equal(fast[0], slow[0])
+    np.testing.assert_array_equal(fast[1], slow[1])
+
+
+def test_pictures_agree_with_trace(scene):
+    """The rasterising tracer in single precision against ray-by-ray tracing in double."""
+    cameras = scene.train.cameras
+    solid, depth = visible(bulldozer(), cameras, 2)
+    rays = cameras.view_rays(2)
+    expected, distance = nearest(bulldozer(), rays.origins.double().numpy(), rays.directions.double().numpy())
+    along = distance * (rays.directions @ cameras.c2w[2, :3, 2]).double().numpy()
+    same = solid.reshape(-1) == expected
+    assert same.mean() > 0.998
+    hit = same & (expected >= 0)
+    np.testing.assert_allclose(depth.reshape(-1)[hit], along[hit], atol=1e-4)
+    # The picture is the mean of nine rays a pixel, over those that hit.
+    rgb, hit, _ = trace(cameras.resized(120, 120).view_rays(2))
+    rgb, hit = (x.reshape(40, 3, 40, 3, -1).float().transpose(1, 2).flatten(2, 3).sum(2) for x in (rgb, hit))
+    expected = torch.cat([rgb / hit.clamp_min(1), hit / 9], dim=-1)
+    error = (scene.train.images[2] / 255 - expected).abs().amax(-1)
+    assert (error < 0.01).float().mean() > 0.98
+
+
+def test_shadows_agree_with_rays_to_the_light(scene):
+    rays = scene.train.cameras.view_rays(3)
+    origins, directions = rays.origins.double().numpy(), rays.directions.double().numpy()
+    solid, t = nearest(bulldozer(), origins, directions)
+    hit = solid >= 0
+    points = origins[hit] + t[hit, None] * directions[hit]
+    to_light = LIGHT - points
+    first, way = nearest(bulldozer(), np.broadcast_to(LIGHT, points.shape), -to_light)
+    expected = (first == solid[hit]) | (way > 1 - 1e-3)
+    assert 0.2 < expected.mean() < 0.95
+    assert (shadow()(solid[hit], points) == expected).mean() > 0.96
+
+
+def test_colour_depends_on_the_viewer():
+    orbit = bricks(**SMALL | {"orbit_views": 12}, cache="").orbit
+    changed = []
+    for view in range(0, 12, 3):
+        rays, centre = orbit.view_rays(view), orbit.centres[view + 1]  # the same points from 30 degrees further on
+        rgb, hit, t = trace(rays)
+        way = (rays.origins + t[:, None] * rays.directions)[hit] - centre
+        distance = way.norm(dim=-1)
+        other, _, reached = trace(Rays(centre.expand_as(way), way / distance[:, None]))
+        changed.append((other - rgb[hit]).abs().amax(-1)[(reached - distance).abs() < 1e-4])
+    changed = torch.cat(changed)
+    # Highlights move, so more of the surface changes than rounding at edges and patterns could explain ...
+    assert (changed > 0.02).float().mean() > 0.05
+    # ... and where there is none the surface looks the same from everywhere.
+    assert (changed < 0.004).float().mean() > 0.3
+
+
+def test_no_two_materials_share_a_face():
+    """Two faces in one plane would be a tie, decided by rounding: speckles that change from view to view."""
+    solids = bulldozer()
+    look = np.concatenate([solids.colour, solids.accent, solids.pattern[:, None]], axis=1)
+    reach = np.abs(solids.half[:, :, None] * solids.axes).sum(1)
+    upright = ~solids.cylinder & (np.abs(solids.axes).max(-1) > 1 - 1e-9).all(-1)
+    low, high = solids.centre - reach, solids.centre + reach
+    for i, j in itertools.combinations(np.flatnonzero(upright), 2):
+        overlap = np.minimum(high[i], high[j]) - np.maximum(low[i], low[j]) > 1e-6
+        for axis in range(3):
+            shared = abs(low[i] - low[j])[axis] < 1e-6 or abs(high[i] - high[j])[axis] < 1e-6
+            assert not (shared and np.delete(overlap, axis).all() and (look[i] != look[j]).any()), (i, j, axis)
+
+
+def test_cache_round_trip(scene, tmp_path, monkeypatch):
+    folder = tmp_path / "not" / "yet"
+    assert bricks(**SMALL, cache=str(folder)).sha256() == scene.sha256()
+    (file,) = folder.iterdir()
+    assert file.suffix == ".npz"
+
+    def refuse(*_):
+        raise AssertionError("traced again")
+
+    monkeypatch.setattr(module, "picture", refuse)
+    assert bricks(**SMALL, cache=str(folder)).sha256() == scene.sha256()
+    # Other parameters, other file.
+    with pytest.raises(AssertionError, match="traced again"):
+        bricks(**SMALL | {"size": 41}, cache=str(folder))
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b[:200] + b"\0" * 99 + b[299:]]
+)
+def test_damaged_cache_is_remade(scene, tmp_path, damage):
+    bricks(**SMALL, cache=str(tmp_path))
+    (file,) = tmp_path.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    assert bricks(**SMALL, cache=str(tmp_path)).sha256() == scene.sha256()
+    with np.load(file, allow_pickle=False) as again:
+        np.testing.assert_array_equal(again["images_train"], scene.train.images.numpy())
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_cache_with_other_shapes_is_remade(scene, tmp_path):
+    bricks(**SMALL, cache=str(tmp_path))
+    (file,) = tmp_path.iterdir()
+    np.savez(file, images_train=np.zeros((1, 2, 2, 4), np.uint8), images_val=np.zeros((1, 2, 2, 4), np.uint8))
+    assert bricks(**SMALL, cache=str(tmp_path)).sha256() == scene.sha256()
+
+
+def test_unwritable_cache_warns_once(scene, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    with pytest.warns(UserWarning, match="not cached") as caught:
+        assert bricks(**SMALL, cache=str(blocked / "cache")).sha256() == scene.sha256()
+    assert len(caught) == 1
+
+
+def test_failed_write_leaves_nothing(scene, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module.np, "savez_compressed", full)
+    with pytest.warns(UserWarning, match="No space left"):
+        bricks(**SMALL, cache=str(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cache_folder(tmp_path, monkeypatch):
+    tiny = {"size": 8, "train_views": 1, "val_views": 1, "orbit_views": 1}
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.setenv("NERF_LIGHTNING_CACHE", str(tmp_path / "own"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        bricks(**tiny, cache="")
+        assert list(tmp_path.iterdir()) == []
+        for folder, variable in (
+            ("own", "NERF_LIGHTNING_CACHE"),
+            ("xdg/nerf_lightning", "XDG_CACHE_HOME"),
+            ("home/.cache/nerf_lightning", "HOME"),
+        ):
+            bricks(**tiny)
+            assert len(list((tmp_path / folder).iterdir())) == 1
+            if variable != "HOME":
+                monkeypatch.delenv(variable)
+
+
+def test_zero_views_are_refused():
+    with pytest.raises(InputError, match="train_views: found 0"):
+        bricks(train_views=0)

@@ -1,0 +1,93 @@
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.dataset import Views, estimate_bounds, load_blender, load_npz
+from nerf_lightning.dataset.extent import silhouettes
+
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def views(ball_views_of: Callable[..., Views]) -> Views:
+    return ball_views_of(10)
+
+
+def over(views: Views, background: int) -> Views:
+    alpha = views.images[..., 3:].float() / 255
+    rgb = views.images[..., :3] * alpha + background * (1 - alpha)
+    return replace(views, images=rgb.round().to(torch.uint8))
+
+
+def assert_snug(box: torch.Tensor, truth: torch.Tensor, slack: float) -> None:
+    """`box` contains `truth` and is at most `slack` times as long on each axis."""
+    assert (box[0] <= truth[0]).all() and (box[1] >= truth[1]).all(), box
+    assert ((box[1] - box[0]) / (truth[1] - truth[0])).max() < slack, box
+
+
+@pytest.mark.parametrize("kind", ["alpha", "black", "white"])
+def test_silhouettes_carve_a_snug_box(kind: str, views: Views, ball_box: torch.Tensor):
+    if kind != "alpha":
+        views = over(views, 0 if kind == "black" else 255)
+    bounds = estimate_bounds(views, WHITE if kind == "white" else BLACK, near=1.0, far=7.0)
+    # A pixel is 0.07 units wide here; one pass over the coarse grid would leave 1.27.
+    assert_snug(bounds.aabb, ball_box, 1.23)
+    assert not bounds.unbounded and (bounds.near, bounds.far) == (1.0, 7.0)
+
+
+def test_a_few_broken_silhouettes_are_forgiven(ball_views_of: Callable[..., Views], ball_box: torch.Tensor):
+    views = ball_views_of(10)
+    views.images[7] = 0
+    assert_snug(estimate_bounds(views, BLACK).aabb, ball_box, 1.23)
+
+
+def test_silhouettes_that_disagree_carve_nothing(ball_views_of: Callable[..., Views]):
+    views = ball_views_of(10)
+    views.images[::3] = 0  # the ball is missing from a third of the views: no voxel convinces enough of them
+    torch.testing.assert_close(estimate_bounds(views, BLACK).aabb, cube(1.6), atol=1e-4, rtol=0)
+
+
+def cube(half: float) -> torch.Tensor:
+    return torch.tensor([[-half] * 3, [half] * 3])
+
+
+def test_without_silhouettes_the_box_is_what_the_cameras_see(views: Views):
+    noise = torch.randint(0, 256, (*views.images.shape[:3], 3), generator=torch.manual_seed(0)).to(torch.uint8)
+    bounds = estimate_bounds(replace(views, images=noise), BLACK)
+    # Cameras 4 away from the origin, half of 48 pixels wide at a focal length of 60.
+    torch.testing.assert_close(bounds.aabb, cube(4 * 24 / 60), atol=1e-4, rtol=0)
+
+
+def test_another_flat_background_is_no_silhouette(views: Views):
+    assert silhouettes(over(views, 0), WHITE) is None
+    assert silhouettes(over(views, 0), BLACK) is not None
+
+
+def test_nothing_kept_falls_back_to_the_cube(views: Views):
+    empty = replace(views, images=torch.zeros_like(views.images))
+    torch.testing.assert_close(estimate_bounds(empty, BLACK).aabb, cube(1.6), atol=1e-4, rtol=0)
+
+
+def test_one_spot_to_look_from_still_gives_a_box():
+    c2w = torch.eye(4).repeat(2, 1, 1)
+    c2w[:, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    K = torch.tensor([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]).repeat(2, 1, 1)
+    noise = torch.randint(0, 256, (2, 8, 8, 3), generator=torch.manual_seed(0)).to(torch.uint8)
+    box = estimate_bounds(Views(noise, Cameras(K, c2w, 8, 8)), BLACK).aabb
+    torch.testing.assert_close(box, torch.tensor([1.0, 2.0, 3.0]) + cube(0.5))
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("kind", ["course", "blender"])
+def test_lego(kind: str, real_data: Path):
+    scene = (
+        load_npz(real_data / "lego_200x200.npz")
+        if kind == "course"
+        else load_blender(real_data / "nerf_synthetic/lego")
+    )
+    truth = torch.tensor([[-0.64, -1.16, -0.56], [0.64, 1.18, 1.04]])
+    assert_snug(scene.bounds.aabb, truth, 1.25)

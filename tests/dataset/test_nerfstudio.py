@@ -1,0 +1,294 @@
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.cameras import focus_point, transform
+from nerf_lightning.dataset import Scene, load_nerfstudio
+from nerf_lightning.dataset.lens import Lens, rectify
+from nerf_lightning.errors import InputError
+
+W, H = 160, 120
+INTRINSICS = {"fl_x": 140.0, "fl_y": 150.0, "cx": 83.0, "cy": 56.0, "w": W, "h": H}
+LENS = {"k1": -0.25, "k2": 0.06, "p1": 0.004, "p2": -0.006, "k3": -0.01}
+POINT = np.array([0.9, -0.4, 0.7])
+
+
+def opengl_pose(angle: float) -> np.ndarray:
+    """A camera 5 away from the world's y axis, looking at the origin; y is up. OpenGL: it looks along its own -z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s, 5 * s], [0, 1, 0, 0.3], [-s, 0, c, 5 * c], [0, 0, 0, 1]])
+
+
+def seen_at(pose: np.ndarray, intrinsics: dict, point: np.ndarray) -> np.ndarray:
+    """Where a lens sees a world point, in OpenCV's indices (a pixel's centre is an integer)."""
+    local = pose[:3, :3].T @ (point - pose[:3, 3])
+    K = np.array(
+        [[intrinsics["fl_x"], 0, intrinsics["cx"] - 0.5], [0, intrinsics["fl_y"], intrinsics["cy"] - 0.5], [0, 0, 1]]
+    )
+    distortion = np.array([intrinsics.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")])
+    # y and z turn over from OpenGL's camera axes to OpenCV's.
+    pixel, _ = cv2.projectPoints((local * [1, -1, -1]).reshape(1, 1, 3), np.zeros(3), np.zeros(3), K, distortion)
+    return pixel.reshape(2)
+
+
+def dot(at: np.ndarray, channels: int = 3) -> np.ndarray:
+    """A soft bright dot on black, centred on an OpenCV index."""
+    x, y = np.meshgrid(np.arange(W), np.arange(H))
+    value = np.rint(250 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * 2.5**2))).astype(np.uint8)
+    return np.repeat(value[..., None], channels, axis=2)
+
+
+def write(folder: Path, extra: dict, frames: int = 12, per_frame: Callable[[int], dict] = lambda i: {}) -> Path:
+    """A capture whose photos show POINT as a dot; `per_frame` adds intrinsics to one frame."""
+    (folder / "images").mkdir(parents=True)
+    entries = []
+    for i in reversed(range(frames)):  # out of order: loaders sort by file_path
+        pose, own = opengl_pose(0.5 * i), per_frame(i)
+        cv2.imwrite(str(folder / f"images/{i:04d}.png"), dot(seen_at(pose, {**extra, **own}, POINT)))
+        entries.append({"file_path": f"images/{i:04d}.png", "transform_matrix": pose.tolist(), **own})
+    (folder / "transforms.json").write_text(json.dumps({**extra, "frames": entries}))
+    return folder
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    return write(tmp_path / "Garden", INTRINSICS)
+
+
+def dot_error(scene: Scene) -> float:
+    """How far the rays through the dots miss POINT, in pixels, at worst."""
+    point = transform(torch.linalg.inv(scene.to_source), torch.from_numpy(POINT).float())
+    worst = 0.0
+    for views in (scene.train, scene.val):
+        weights = views.images[..., 1].double()
+        u, v = torch.arange(views.cameras.width) + 0.5, torch.arange(views.cameras.height) + 0.5
+        total = weights.sum((1, 2))
+        centroid = torch.stack([(weights.sum(1) * u).sum(-1) / total, (weights.sum(2) * v).sum(-1) / total], dim=-1)
+        local = transform(torch.linalg.inv(views.cameras.c2w), point)
+        pixel = (views.cameras.K @ local[..., None])[..., 0]
+        worst = max(worst, float((pixel[:, :2] / pixel[:, 2:] - centroid).norm(dim=-1).max()))
+    return worst
+
+
+def test_plain_capture(capture: Path):
+    scene = load_nerfstudio(capture)
+    assert scene.name == "garden" and scene.resolution == (W, H)
+    assert (len(scene.train), len(scene.val), len(scene.orbit)) == (10, 2, 60)
+    first = cv2.imread(str(capture / "images/0000.png"))
+    assert (scene.val.images[0].numpy() == first).all()  # sorted; frames 0 and 10 are held out
+    expected = torch.tensor([[140.0, 0, 83], [0, 150, 56], [0, 0, 1]])
+    torch.testing.assert_close(scene.train.cameras.K, expected.repeat(10, 1, 1))
+    assert scene.bounds.unbounded and scene.bounds.aabb.tolist() == [[-1.0] * 3, [1.0] * 3]
+    assert scene.background == (0.0, 0.0, 0.0)
+
+
+def test_file_or_folder_is_the_same(capture: Path):
+    by_file = load_nerfstudio(capture / "transforms.json")
+    assert by_file.name == "garden" and by_file.sha256() == load_nerfstudio(capture).sha256()
+
+
+def test_scene_is_normalised_and_to_source_leads_back(capture: Path):
+    scene = load_nerfstudio(capture)
+    train = scene.train.cameras
+    torch.testing.assert_close(focus_point(train.c2w), torch.zeros(3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(train.centres.norm(dim=-1).median(), torch.tensor(1.0))
+    back = transform(scene.to_source, train.centres)
+    expected = [opengl_pose(0.5 * i)[:3, 3] for i in range(12) if i % 10]
+    np.testing.assert_allclose(back, expected, atol=1e-5)
+
+
+def test_a_known_point_is_seen_at_its_dot(capture: Path):
+    assert dot_error(load_nerfstudio(capture)) < 0.02
+
+
+def test_resize(capture: Path):
+    scene = load_nerfstudio(capture, resize=80)
+    assert scene.resolution == (80, 60)
+    torch.testing.assert_close(scene.val.cameras.K[0], torch.tensor([[70.0, 0, 41.5], [0, 75, 28], [0, 0, 1]]))
+    assert dot_error(scene) < 0.02
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_distortion_is_undone(sign: int, tmp_path: Path):
+    lens = {key: sign * value for key, value in LENS.items()}
+    scene = load_nerfstudio(write(tmp_path / "capture", {**INTRINSICS, **lens}))
+    assert dot_error(scene) < 0.05
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_rectification_maps_agree_with_the_projection(sign: int):
+    lens = Lens(W, H, 140.0, 150.0, 83.0, 56.0, tuple(sign * LENS[k] for k in ("k1", "k2", "p1", "p2", "k3")))
+    pinhole = rectify(lens)
+    x, y = np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(pinhole.K).T
+    K = lens.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    expected, _ = cv2.projectPoints(rays.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, np.array(lens.distortion))
+    expected = expected.reshape(H, W, 2)
+    np.testing.assert_allclose(np.stack([pinhole.col, pinhole.row], axis=-1), expected, atol=1e-3)
+    # No pixel comes from outside the photo, and the crop wastes no more than it must: it touches the border.
+    inside = np.stack([pinhole.col, W - 1 - pinhole.col, pinhole.row, H - 1 - pinhole.row])
+    assert inside.min() > -0.5 and inside.min((1, 2)).max() < 1.5
+
+
+def test_frames_may_have_lenses_of_their_own(tmp_path: Path):
+    def own(i: int) -> dict:
+        return {"fl_x": 130.0 + i, "cx": 80.0 + i, "k1": 0.02 * i}
+
+    scene = load_nerfstudio(write(tmp_path / "capture", INTRINSICS, per_frame=own))
+    assert len(set(scene.train.cameras.K[:, 0, 0].tolist())) == 10
+    assert dot_error(scene) < 0.05
+
+
+def test_field_of_view_instead_of_focal(tmp_path: Path):
+    intrinsics = {"camera_angle_x": 2 * np.arctan(0.5 * W / 140)}
+    (tmp_path / "c").mkdir()
+    write(tmp_path / "c/d", INTRINSICS)
+    content = json.loads((tmp_path / "c/d/transforms.json").read_text())
+    (tmp_path / "c/d/transforms.json").write_text(json.dumps({**intrinsics, "frames": content["frames"]}))
+    K = load_nerfstudio(tmp_path / "c/d").train.cameras.K[0]
+    torch.testing.assert_close(K, torch.tensor([[140.0, 0, W / 2], [0, 140, H / 2], [0, 0, 1]]))
+
+
+def change(capture: Path, edit: Callable[[dict], object]) -> None:
+    path = capture / "transforms.json"
+    content = json.loads(path.read_text())
+    content["frames"].sort(key=lambda frame: frame["file_path"])
+    edit(content)
+    path.write_text(json.dumps(content))
+
+
+def test_split_by_name(capture: Path):
+    names = [f"images/{i:04d}.png" for i in range(12)]
+    change(capture, lambda c: c.update(train_filenames=names[3:], val_filenames=names[1:3]))
+    scene = load_nerfstudio(capture)
+    assert (len(scene.train), len(scene.val)) == (9, 2)
+    assert (scene.val.images[1].numpy() == cv2.imread(str(capture / "images/0002.png"))).all()
+
+
+def test_holdout_counts(capture: Path):
+    scene = load_nerfstudio(capture, holdout=5)
+    assert (len(scene.train), len(scene.val)) == (9, 3)
+    assert len(load_nerfstudio(capture, holdout=100).val) == 1
+
+
+def test_missing_extensions_are_found(capture: Path):
+    change(capture, lambda c: [f.update(file_path=f["file_path"].removesuffix(".png")) for f in c["frames"]])
+    assert len(load_nerfstudio(capture).train) == 10
+
+
+def test_some_missing_photos_are_left_out_with_a_warning(capture: Path, caplog: pytest.LogCaptureFixture):
+    for i in (3, 4, 7):
+        (capture / f"images/{i:04d}.png").unlink()
+    with caplog.at_level(logging.WARNING):
+        scene = load_nerfstudio(capture)
+    assert (len(scene.train), len(scene.val)) == (8, 1)
+    # Poses stay with their photos: the dots still agree.
+    assert dot_error(scene) < 0.02
+    assert "3 of 12 photos are not there" in caplog.text
+
+
+def test_alpha_makes_a_bounded_scene(capture: Path):
+    for i in range(12):
+        at = seen_at(opengl_pose(0.5 * i), INTRINSICS, POINT)
+        cv2.imwrite(str(capture / f"images/{i:04d}.png"), dot(at, 4))
+    scene = load_nerfstudio(capture)
+    assert scene.train.images.shape[3] == 4 and not scene.bounds.unbounded
+    centre = transform(scene.to_source, scene.bounds.centre)
+    np.testing.assert_allclose(centre, POINT, atol=0.15)
+
+
+def _remove_most(capture: Path) -> None:
+    for i in range(2, 10):
+        (capture / f"images/{i:04d}.png").unlink()
+
+
+def _first(**entry: object) -> Callable[[Path], None]:
+    return lambda capture: change(capture, lambda c: c["frames"][0].update(entry))
+
+
+def _top(**entry: object) -> Callable[[Path], None]:
+    return lambda capture: change(capture, lambda c: c.update(entry))
+
+
+def _pop(key: str) -> Callable[[Path], None]:
+    return lambda capture: change(capture, lambda c: c.pop(key))
+
+
+ALL = [f"images/{i:04d}.png" for i in range(12)]
+DAMAGE = {
+    "no json": (lambda c: (c / "transforms.json").unlink(), "transforms.json: found nothing there"),
+    "broken json": (lambda c: (c / "transforms.json").write_text('{"a": 1,}'), "found broken JSON at line 1, column"),
+    "frames missing": (_pop("frames"), "frames: found no such key among [cx, cy"),
+    "most photos missing": (_remove_most, "found 'images/0002.png', which is not there (nor are 7 more)"),
+    "focal missing": (_pop("fl_x"), "fl_x: found no focal length among [cx, cy"),
+    "focal null": (_top(fl_x=None), "fl_x: found no focal length"),
+    "focal negative": (_top(fl_y=-3), "fl_y: found -3, expected a positive"),
+    "focal of a frame": (_first(fl_x=0), "frames[0].fl_x: found 0"),
+    "angle": (lambda c: (_pop("fl_x")(c), _top(camera_angle_x=4.0)(c)), "camera_angle_x: found 4"),
+    "centre text": (_top(cx="middle"), "cx: found 'middle'"),
+    "distortion text": (_first(k1=[1]), "frames[0].k1: found [1]"),
+    "distortion k4": (_top(k4=0.1), "k4: found 0.1"),
+    "fisheye": (_top(camera_model="OPENCV_FISHEYE"), "camera_model: found 'OPENCV_FISHEYE', expected a perspective"),
+    "fisheye frame": (_first(camera_model="EQUIRECTANGULAR"), "frames[0].camera_model: found 'EQUIRECTANGULAR'"),
+    "fisheye flag": (_top(is_fisheye=True), "camera_model: found is_fisheye"),
+    "width": (_top(w=161), "w: found 161, expected 160, the size of 0000.png"),
+    "height of a frame": (_first(h=1), "frames[0].h: found 1, expected 120"),
+    "image size": (
+        lambda c: cv2.imwrite(str(c / "images/0004.png"), np.zeros((H, 100, 3), np.uint8)),
+        "0004.png: found 100x120 with 3 channels, expected 160x120 with 3",
+    ),
+    "image channels": (
+        lambda c: cv2.imwrite(str(c / "images/0004.png"), np.zeros((H, W, 4), np.uint8)),
+        "0004.png: found 160x120 with 4 channels",
+    ),
+    "scaled pose": (
+        _first(transform_matrix=(opengl_pose(0) * [2, 2, 2, 1]).tolist()),
+        "frames[0].transform_matrix: found R^T R that is 3 away from the identity",
+    ),
+    "mirrored pose": (
+        _first(transform_matrix=(opengl_pose(0) * [1, -1, 1, 1]).tolist()),
+        "frames[0].transform_matrix: found a mirror",
+    ),
+    "unknown name": (_top(val_filenames=["images/x.png"]), "val_filenames: found 'images/x.png', which is no frame"),
+    "names no list": (_top(val_filenames="images/0000.png"), "val_filenames: found 'images/0000.png'"),
+    "leaking split": (
+        _top(train_filenames=ALL, val_filenames=ALL[:1]),
+        "val_filenames: found 'images/0000.png', which is in train_filenames too",
+    ),
+    "nothing held out": (_top(val_filenames=[]), "val split: found 0 views"),
+    "nothing to train on": (_top(val_filenames=ALL), "train split: found 0 views"),
+    "one photo": (lambda c: change(c, lambda j: j.update(frames=j["frames"][:1])), "train split: found 0 views"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damage(damage: str, capture: Path, says: Callable):
+    spoil, words = DAMAGE[damage]
+    spoil(capture)
+    with pytest.raises(InputError) as caught:
+        load_nerfstudio(capture)
+    says(caught.value, capture, words, ", expected ")
+
+
+def test_holdout_of_everything(capture: Path):
+    with pytest.raises(InputError, match="holdout: found 1"):
+        load_nerfstudio(capture, holdout=1)
+
+
+@pytest.mark.real_data
+def test_fox(real_data: Path):
+    scene = load_nerfstudio(real_data / "fox", resize=120)
+    assert scene.name == "fox" and (len(scene.train), len(scene.val)) == (45, 5)
+    assert scene.resolution == (68, 120) and scene.bounds.unbounded
+    # The head hangs between the cameras and what they look at is in view of all of them.
+    local = transform(torch.linalg.inv(scene.train.cameras.c2w), torch.zeros(3))
+    pixel = (scene.train.cameras.K @ local[..., None])[..., 0]
+    assert (local[:, 2] > 0).all()
+    uv = pixel[:, :2] / pixel[:, 2:]
+    assert ((uv > 0) & (uv < torch.tensor([68.0, 120.0]))).float().mean() > 0.9

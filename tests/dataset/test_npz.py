@@ -1,0 +1,255 @@
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.cameras import orbit_like
+from nerf_lightning.dataset import Scene, load_npz, save_npz
+from nerf_lightning.errors import InputError
+
+Arrays = dict[str, np.ndarray]
+
+
+@pytest.fixture
+def arrays() -> Arrays:
+    """A valid file: two training views, one held out. The camera stands at (0, 0, 5) and looks along -z, y up."""
+    rng = np.random.default_rng(0)
+    c2w = np.diag([1.0, -1.0, -1.0, 1.0])
+    c2w[2, 3] = 5.0
+    return {
+        "images_train": rng.integers(0, 256, (2, 6, 8, 3), dtype=np.uint8),
+        "c2ws_train": np.stack([c2w, c2w]),
+        "images_val": rng.integers(0, 256, (1, 6, 8, 3), dtype=np.uint8),
+        "c2ws_val": c2w[None],
+        "focal": np.array(10.0),
+    }
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "Toy_8x6.npz"
+
+
+def test_plain_file(arrays: Arrays, path: Path):
+    np.savez(path, **arrays)
+    scene = load_npz(path)
+    assert scene.name == "toy" and scene.source == str(path) and scene.resolution == (8, 6)
+    assert (scene.train.images.numpy() == arrays["images_train"]).all()
+    assert (scene.val.images.numpy() == arrays["images_val"]).all()
+    assert scene.background == (0.0, 0.0, 0.0) and not scene.bounds.unbounded
+    torch.testing.assert_close(scene.train.cameras.K[1], torch.tensor([[10.0, 0, 4], [0, 10, 3], [0, 0, 1]]))
+    torch.testing.assert_close(scene.orbit.c2w, orbit_like(scene.train.cameras).c2w)
+    assert torch.equal(scene.to_source, torch.eye(4))
+
+
+def test_a_known_point_is_seen_at_its_pixel(arrays: Arrays, path: Path):
+    np.savez(path, **arrays)
+    # (1, 0.5, 0) is 1 right of, 0.5 above and 5 before the camera: u = 4 + 10 / 5, v = 3 - 10 * 0.5 / 5.
+    scene = load_npz(path)
+    ray = scene.train.cameras.rays(torch.tensor([0]), torch.tensor([1]), torch.tensor([5]))
+    corner = scene.train.cameras.rays(torch.tensor([0]), torch.tensor([2]), torch.tensor([6]))
+    # The point lies on the corner shared by pixels (1, 5) and (2, 6): halfway between their centres.
+    direction = ray.directions / -ray.directions[:, 2:] + corner.directions / -corner.directions[:, 2:]
+    torch.testing.assert_close(ray.origins[0] + 5 * direction[0] / 2, torch.tensor([1.0, 0.5, 0.0]))
+
+
+def test_K_near_far_and_box_come_from_the_file(arrays: Arrays, path: Path):
+    K = np.array([[11.0, 0, 3], [0, 12, 2], [0, 0, 1]])
+    box = np.array([[-1.0, -2, -3], [1, 2, 3]])
+    np.savez(path, **arrays, K=K, near=2.0, far=np.array([6.0]), aabb=box)
+    scene = load_npz(path, "other")
+    assert scene.name == "other"
+    np.testing.assert_allclose(scene.val.cameras.K[0], K)
+    np.testing.assert_allclose(scene.bounds.aabb, box)
+    assert (scene.bounds.near, scene.bounds.far) == (2.0, 6.0)
+
+
+def test_K_alone_will_do(arrays: Arrays, path: Path):
+    del arrays["focal"]
+    np.savez(path, **arrays, K=np.array([[11.0, 0, 3], [0, 12, 2], [0, 0, 1]]))
+    assert float(load_npz(path).train.cameras.K[0, 1, 1]) == 12.0
+
+
+def test_float_images_become_bytes(arrays: Arrays, path: Path):
+    exact = arrays["images_train"]
+    np.savez(path, **{**arrays, "images_train": exact.astype(np.float32) / 255})
+    assert (load_npz(path).train.images.numpy() == exact).all()
+
+
+def test_round_trip(ball: Scene, path: Path):
+    bounds = replace(ball.bounds, unbounded=True, near=0.5, far=9.0)
+    to_source = torch.tensor([[2.0, 0, 0, 1], [0, 2, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    scene = replace(ball, bounds=bounds, background=(1.0, 1.0, 1.0), to_source=to_source)
+    save_npz(scene, path)
+    back = load_npz(path)
+    assert back.sha256() == scene.sha256()
+    for name in ("train", "val"):
+        assert torch.equal(getattr(back, name).cameras.c2w, getattr(scene, name).cameras.c2w)
+        assert torch.equal(getattr(back, name).cameras.K, getattr(scene, name).cameras.K)
+    assert torch.equal(back.orbit.c2w, scene.orbit.c2w)
+    assert torch.equal(back.bounds.aabb, bounds.aabb)
+    assert (back.bounds.unbounded, back.bounds.near, back.bounds.far) == (True, 0.5, 9.0)
+    assert back.background == (1.0, 1.0, 1.0) and torch.equal(back.to_source, to_source)
+
+
+def test_a_plain_scene_is_saved_in_the_plain_course_format(ball: Scene, path: Path):
+    save_npz(ball, path)
+    with np.load(path, allow_pickle=False) as file:
+        course = {"images_train", "c2ws_train", "images_val", "c2ws_val", "c2ws_test", "focal", "K", "aabb"}
+        assert set(file.files) == course
+        assert file["focal"].shape == () and file["images_train"].dtype == np.uint8
+
+
+def test_a_failed_save_leaves_the_old_file(ball: Scene, path: Path, monkeypatch: pytest.MonkeyPatch):
+    path.write_bytes(b"old")
+
+    def fail(file: object, **arrays: np.ndarray) -> None:
+        file.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(InputError, match="disk full"):
+        save_npz(ball, path)
+    assert path.read_bytes() == b"old" and os.listdir(path.parent) == [path.name]
+
+
+def test_views_of_different_K_cannot_be_saved(ball: Scene, path: Path):
+    K = ball.train.cameras.K.clone()
+    K[1, 0, 0] += 1
+    train = replace(ball.train, cameras=replace(ball.train.cameras, K=K))
+    with pytest.raises(InputError, match="K: found views with different intrinsics"):
+        save_npz(replace(ball, train=train), path)
+    assert not path.exists()
+
+
+def _pose(arrays: Arrays, edit: Callable[[np.ndarray], object]) -> Arrays:
+    poses = arrays["c2ws_train"].copy()
+    edit(poses[1])
+    return {"c2ws_train": poses}
+
+
+DAMAGE = {
+    "images missing": (lambda a: {"images_val": None}, "images_val: found no such key among [c2ws_train, c2ws_val"),
+    "focal missing": (lambda a: {"focal": None}, "focal: found no such key"),
+    "images rank": (lambda a: {"images_train": a["images_train"][0]}, "images_train: found shape (6, 8, 3)"),
+    "images channels": (
+        lambda a: {"images_train": a["images_train"][..., :2]},
+        "images_train: found shape (2, 6, 8, 2)",
+    ),
+    "images dtype": (lambda a: {"images_train": a["images_train"].astype(int)}, "images_train: found dtype int64"),
+    "floats to 255": (lambda a: {"images_val": a["images_val"] * 1.0}, "images_val: found floats from"),
+    "nan in images": (lambda a: {"images_val": a["images_val"] * np.nan}, "images_val: found floats from nan"),
+    "unequal sizes": (lambda a: {"images_val": a["images_val"][:, :4]}, "images_val: found 8x4 with 3 channels"),
+    "no training views": (
+        lambda a: {"images_train": a["images_train"][:0], "c2ws_train": a["c2ws_train"][:0]},
+        "images_train: found 0 views",
+    ),
+    "no held-out views": (
+        lambda a: {"images_val": a["images_val"][:0], "c2ws_val": a["c2ws_val"][:0]},
+        "images_val: found 0 views",
+    ),
+    "no orbit views": (lambda a: {"c2ws_test": a["c2ws_val"][:0]}, "c2ws_test: found 0 views"),
+    "too few poses": (lambda a: {"c2ws_train": a["c2ws_train"][:1]}, "images_train: found 2 images for 1 poses"),
+    "pose shape": (lambda a: {"c2ws_train": a["c2ws_train"][:, :3]}, "c2ws_train: found shape (2, 3, 4)"),
+    "pose dtype": (lambda a: {"c2ws_train": a["c2ws_train"].astype(str)}, "c2ws_train: found shape (2, 4, 4), <U"),
+    "nan pose": (lambda a: _pose(a, lambda p: p.__setitem__((0, 3), np.nan)), "c2ws_train[1]: found nan"),
+    "scaled pose": (lambda a: _pose(a, lambda p: p.__imul__([2, 2, 2, 1])), "c2ws_train[1]: found R^T R"),
+    "mirrored pose": (lambda a: _pose(a, lambda p: p.__imul__([-1, 1, 1, 1])), "c2ws_train[1]: found a mirror"),
+    "transposed pose": (
+        lambda a: _pose(a, lambda p: p.__setitem__(..., p.T.copy())),
+        "c2ws_train[1]: found bottom row",
+    ),
+    "object array": (
+        lambda a: {"focal": np.array([{}])},
+        "focal: found something unreadable (ValueError: Object arrays",
+    ),
+    "focal sign": (lambda a: {"focal": np.array(-3.0)}, "focal: found -3, expected a positive number of pixels"),
+    "focal nan": (lambda a: {"focal": np.array(np.nan)}, "focal: found nan"),
+    "focal per view": (lambda a: {"focal": np.ones(2)}, "focal: found shape (2,)"),
+    "focal text": (lambda a: {"focal": np.array("10")}, "focal: found shape (), <U2"),
+    "K shape": (lambda a: {"K": np.eye(4)}, "K: found shape (4, 4)"),
+    "K transposed": (lambda a: {"K": np.array([[9.0, 0, 0], [0, 9, 0], [4, 3, 1]])}, "K: found [[9.0"),
+    "near beyond far": (
+        lambda a: {"near": np.array(3.0), "far": np.array(2.0)},
+        "far: found 2, expected more than near, 3",
+    ),
+    "near negative": (lambda a: {"near": np.array(-1.0)}, "near: found -1"),
+    "box flipped": (lambda a: {"aabb": np.array([[1.0, 1, 1], [0, 2, 2]])}, "aabb: found [[1.0"),
+    "box shape": (lambda a: {"aabb": np.zeros(6)}, "aabb: found shape (6,)"),
+    "unbounded": (lambda a: {"aabb": np.array([[0] * 3, [1] * 3]), "unbounded": np.array(1)}, "unbounded: found int64"),
+    "background": (lambda a: {"background": np.zeros(4)}, "background: found shape (4,)"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_entries(damage: str, arrays: Arrays, path: Path, says: Callable):
+    edit, words = DAMAGE[damage]
+    np.savez(path, **{key: value for key, value in {**arrays, **edit(arrays)}.items() if value is not None})
+    with pytest.raises(InputError) as caught:
+        load_npz(path)
+    says(caught.value, f"{path}: {words}", ", expected ")
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def _corrupt(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[300:340] = bytes(40)  # inside the first entry, images_train
+    path.write_bytes(data)
+
+
+def _single_array(path: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+BROKEN = {
+    "missing": (Path.unlink, "nothing there"),
+    "folder": (lambda path: (path.unlink(), path.mkdir()), "a folder"),
+    "empty": (lambda path: path.write_bytes(b""), "no zip archive"),
+    "text": (lambda path: path.write_text("hello"), "no zip archive"),
+    "single array": (_single_array, "no zip archive"),
+    "truncated": (_cut, "something unreadable (BadZipFile"),
+    "corrupt": (_corrupt, "images_train: found something unreadable (BadZipFile: Bad CRC"),
+}
+
+
+@pytest.mark.parametrize("damage", BROKEN)
+def test_broken_files(damage: str, arrays: Arrays, path: Path, says: Callable):
+    np.savez(path, **arrays)
+    spoil, words = BROKEN[damage]
+    spoil(path)
+    with pytest.raises(InputError) as caught:
+        load_npz(path)
+    says(caught.value, path, words)
+
+
+class Payload:
+    """Writes a file when unpickled."""
+
+    def __init__(self, target: Path):
+        self.target = target
+
+    def __reduce__(self):
+        return (open, (str(self.target), "w"))
+
+
+def test_nothing_in_a_file_is_executed(arrays: Arrays, path: Path, tmp_path: Path):
+    target = tmp_path / "executed"
+    np.savez(path, **{**arrays, "focal": np.array([Payload(target)], dtype=object)})
+    with pytest.raises(InputError, match="Object arrays cannot be loaded"):
+        load_npz(path)
+    assert not target.exists()
+
+
+@pytest.mark.real_data
+def test_lego(real_data: Path):
+    scene = load_npz(real_data / "lego_200x200.npz")
+    assert scene.name == "lego" and (len(scene.train), len(scene.val), len(scene.orbit)) == (100, 10, 60)
+    assert scene.resolution == (200, 200)
