@@ -15,8 +15,8 @@ The tree is the data flow, seven stages in order:
     __main__.py the command line: compose -> build -> fit -> test -> results.json
 
 Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples
-(or points), L levels or frequencies, F features. Cameras follow OpenCV: x right, y down, z forward; `c2w` maps camera to world;
-pixel centres lie at +0.5. Lengths are in the scene's own unit, colours are sRGB in [0, 1].
+(or points), L levels or frequencies, F features. Cameras follow OpenCV: x right, y down, z forward; `c2w` maps camera
+to world; pixel centres lie at +0.5. Lengths are in the scene's own unit, colours are sRGB in [0, 1].
 """
 
 __version__ = "0.1.0"

@@ -8,7 +8,7 @@ import hydra
 import lightning as L
 from hydra.errors import InstantiationException
 from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nerf_lightning.callbacks import Budget, Results
 from nerf_lightning.cameras import Bounds
@@ -78,6 +78,7 @@ def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, sys
     """Photos without alpha stand on one colour; asking for another would teach the field a wall of the first."""
     if isinstance(data, PixelDataModule) or data.scene.train.images.shape[-1] == 4:
         return
+    assert isinstance(system, NeRF3D)  # what build_system makes for rays
     wanted = "random" if system.renderer.random else [round(c, 3) for c in system.renderer.colour.tolist()]
     if wanted != [round(c, 3) for c in data.scene.background]:
         raise InputError(
@@ -100,5 +101,7 @@ def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
     chosen = {name: node for name, node in (cfg.get("callbacks") or {}).items() if node is not None}
     callbacks = [make(DictConfig({name: node}, parent=cfg), name) for name, node in chosen.items()]
     results = Results("results.json", cfg.method, cfg.seed)
-    # The budget goes first: the others read its clock. Results go before orbit: a GIF takes time, a figure should not wait.
-    return make(cfg, "trainer", callbacks=[build_budget(cfg), results, *callbacks], logger=logger, default_root_dir=folder)
+    # The budget goes first: the others read its clock. Results go before the orbit: figures should not wait for a GIF.
+    return make(
+        cfg, "trainer", callbacks=[build_budget(cfg), results, *callbacks], logger=logger, default_root_dir=folder
+    )

@@ -1,10 +1,10 @@
 """The run folder: what a run leaves, and how it is read back without trusting it.
 
-    config.yaml            the resolved configuration
-    scene.json             bounds, background and orbit of the scene, so that rendering needs no photos
-    checkpoints/           last.ckpt, best.ckpt: tensors and plain values only
-    results.json           see callbacks/results.py
-    snapshots/ orbit.gif   pictures
+config.yaml            the resolved configuration
+scene.json             bounds, background and orbit of the scene, so that rendering needs no photos
+checkpoints/           last.ckpt, best.ckpt: tensors and plain values only
+results.json           see callbacks/results.py
+snapshots/ orbit.gif   pictures
 """
 
 import importlib
@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.build import build_system
 from nerf_lightning.cameras import Bounds, Cameras
-from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic, write_json
 from nerf_lightning.system import System
@@ -37,10 +37,17 @@ LIBRARY_TARGETS = {
 }
 
 
+def resolved(cfg: DictConfig) -> dict[str, Any]:
+    """The configuration as plain containers, interpolations filled in."""
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(plain, dict)  # a DictConfig gives nothing else
+    return {str(key): value for key, value in plain.items()}
+
+
 def save_config(cfg: DictConfig, folder: Path) -> None:
     """Writes the resolved configuration; a relative dataset path becomes absolute, so that it holds from anywhere."""
-    plain = OmegaConf.to_container(cfg, resolve=True)
-    path = plain["dataset"].get("path") if isinstance(plain["dataset"], dict) else None
+    plain = resolved(cfg)
+    path = plain["dataset"].get("path")
     if path is not None:
         plain["dataset"]["path"] = os.path.abspath(path)
     with atomic(folder / "config.yaml") as temporary:
@@ -103,7 +110,7 @@ def save_scene(data: RayDataModule | PixelDataModule, folder: Path) -> None:
     """Writes what rendering needs to know about the scene, without its photos."""
     scene = data.scene
     content: dict[str, Any] = scene.describe()
-    if isinstance(data, RayDataModule):
+    if isinstance(scene, Scene):
         content |= {
             "background": list(scene.background),
             "aabb": scene.bounds.aabb.tolist(),
@@ -156,7 +163,9 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
     try:
         system.load_state_dict(state["state_dict"])
     except (KeyError, RuntimeError) as error:
-        raise InputError(folder / "checkpoints" / checkpoint, "state_dict", str(error), "the weights of this run's model") from error
+        raise InputError(
+            folder / "checkpoints" / checkpoint, "state_dict", str(error), "the weights of this run's model"
+        ) from error
     return RunFolder(cfg, system.eval(), orbit)
 
 
@@ -169,6 +178,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
-        raise InputError(path, "", "no such file", "a checkpoint", "the run may have ended before its first one") from error
+        raise InputError(
+            path, "", "no such file", "a checkpoint", "the run may have ended before its first one"
+        ) from error
     except (OSError, EOFError, RuntimeError, pickle.UnpicklingError) as error:
-        raise InputError(path, "", str(error).split(".")[0], "a whole checkpoint of tensors and plain values") from error
+        raise InputError(
+            path, "", str(error).split(".")[0], "a whole checkpoint of tensors and plain values"
+        ) from error

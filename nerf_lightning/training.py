@@ -2,17 +2,21 @@
 
 import logging
 import warnings
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from nerf_lightning.allocator import keep_freed_memory
 from nerf_lightning.build import build_data, build_system, build_trainer, check_background, frame_of
 from nerf_lightning.callbacks import Results
+from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.errors import InputError
-from nerf_lightning.run_folder import load_config, read_checkpoint, save_config, save_scene
+from nerf_lightning.run_folder import load_config, read_checkpoint, resolved, save_config, save_scene
 
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
@@ -26,10 +30,11 @@ def train(cfg: DictConfig) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
     checkpoint = None
     if cfg.resume is not None:
-        cfg, checkpoint = resumed(cfg, folder)
+        cfg, checkpoint = resume(cfg, folder)
     quiet()
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
+    keep_freed_memory()
     torch.set_flush_denormal(True)  # dying weights otherwise slow the CPU down many times over
     L.seed_everything(cfg.seed, verbose=False)
     data = build_data(cfg)
@@ -40,14 +45,14 @@ def train(cfg: DictConfig) -> float:
     save_scene(data, folder)
     trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(system, data, verbose=False)
-    results = next(callback for callback in trainer.callbacks if isinstance(callback, Results)).summary
+    results = written(trainer)
     if trainer.logger is not None:
         log_hyperparameters(trainer.logger, cfg, results)
     report(results, folder)
     return results["psnr"]
 
 
-def resumed(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
+def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     """The configuration of the run in `folder` with this command line's overrides on top, and its last checkpoint."""
     saved = load_config(folder)
     checkpoint = folder / "checkpoints" / "last.ckpt"
@@ -62,6 +67,13 @@ def resumed(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     return saved, checkpoint
 
 
+def written(trainer: L.Trainer) -> dict[str, Any]:
+    """What stands in results.json."""
+    results = attached(trainer, Results)
+    assert results is not None  # build_trainer puts one into every trainer
+    return results.summary
+
+
 def quiet() -> None:
     """Silences what Lightning says about hardware and habits that this package decides for itself."""
     for name in ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero"):
@@ -72,7 +84,7 @@ def quiet() -> None:
 
 def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, results: dict) -> None:
     """Puts the run's options beside its final figures in TensorBoard's HParams tab."""
-    plain = OmegaConf.to_container(cfg, resolve=True)
+    plain = resolved(cfg)
     options = {group: plain[group] for group in GROUPS if plain.get(group) is not None}
     params = {**options, "method": cfg.method, "scene": results["scene"]["name"], "seed": cfg.seed}
     metrics = {f"final/{key}": results[key] or 0.0 for key in ("psnr", "ssim", "train_seconds", "artifact_bytes")}
@@ -87,8 +99,6 @@ def report(results: dict, folder: Path) -> None:
     print(f"{scene}: {results['psnr']:.2f} dB held out after {seconds:.0f} s of training ({results['status']})")
     if results["diagnosis"]:
         print(results["diagnosis"])
-    try:
+    with suppress(ValueError):  # where the run's folder lies elsewhere, its full path it is
         folder = folder.relative_to(Path.cwd())
-    except ValueError:
-        pass  # the run's folder lies elsewhere: its full path it is
     print(f"everything is in {folder}; curves: tensorboard --logdir {folder.parent}")

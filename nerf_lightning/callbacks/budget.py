@@ -7,6 +7,7 @@ from typing import Any
 
 import lightning as L
 
+from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 
@@ -38,8 +39,11 @@ class Budget(L.Callback):
 
     @staticmethod
     def of(trainer: L.Trainer) -> "Budget":
-        """The trainer's budget; build.py puts one into every trainer."""
-        return next(callback for callback in trainer.callbacks if isinstance(callback, Budget))
+        """The trainer's budget."""
+        budget = attached(trainer, Budget)
+        if budget is None:
+            raise RuntimeError("a trainer needs a Budget among its callbacks; build_trainer puts one there")
+        return budget
 
     @property
     def seconds(self) -> float:

@@ -8,6 +8,7 @@ from typing import Any
 
 import lightning as L
 
+from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.callbacks.heldout import HeldOut, evenly
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic
@@ -47,11 +48,11 @@ class Checkpoints(L.Callback):
         if time.monotonic() - self._saved >= self.every_seconds:
             self.save(trainer, "last.ckpt")
             self._saved = time.monotonic()
-        for callback in trainer.callbacks:
-            if isinstance(callback, HeldOut) and callback.latest is not None:
-                if self.best is None or callback.latest > self.best:
-                    self.best = callback.latest
-                    self.save(trainer, "best.ckpt")
+        held_out = attached(trainer, HeldOut)
+        quality = held_out.latest if held_out is not None else None
+        if quality is not None and (self.best is None or quality > self.best):
+            self.best = quality
+            self.save(trainer, "best.ckpt")
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
         self.save(trainer, "last.ckpt")
@@ -59,15 +60,18 @@ class Checkpoints(L.Callback):
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._tested = []
 
-    def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_test_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         self._tested.append(outputs["psnr"])
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         """The final state is a candidate too, judged on the views that the earlier ones were judged on."""
         folder = Path(trainer.default_root_dir) / self.folder
         last = folder / "last.ckpt"
-        views = next((c.views for c in trainer.callbacks if isinstance(c, HeldOut)), None)
-        final = fmean(self._tested[view] for view in evenly(len(self._tested), views))
+        held_out = attached(trainer, HeldOut)
+        views = evenly(len(self._tested), held_out.views if held_out is not None else None)
+        final = fmean(self._tested[view] for view in views)
         if last.exists() and (self.best is None or final > self.best):
             self.best = final
             with atomic(folder / "best.ckpt") as temporary:

@@ -5,6 +5,7 @@ from typing import Any
 
 import lightning as L
 
+from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System, ViewResult
@@ -49,7 +50,7 @@ class HeldOut(L.Callback):
 
     def planned(self, trainer: L.Trainer) -> int:
         """Views still to be rendered in measurements during training."""
-        total = trainer.datamodule.held_out_views
+        total = data_of(trainer).held_out_views
         return (len(self.at) - len(self.curve)) * len(evenly(total, self.views))
 
     def record(self, trainer: L.Trainer, results: list[ViewResult]) -> None:
@@ -68,7 +69,7 @@ class HeldOut(L.Callback):
         if due <= len(self.curve) or pl_module.progress >= 1.0:
             return
         with Budget.of(trainer).paused():
-            data = trainer.datamodule
+            data = data_of(trainer)
             chosen = evenly(data.held_out_views, self.views)
             results = [pl_module.evaluate(data.held_out(view)) for view in chosen]
             while len(self.curve) < due:  # a step may pass several marks at once: one measurement serves them all

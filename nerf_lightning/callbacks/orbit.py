@@ -5,10 +5,12 @@ from pathlib import Path
 import imageio.v3 as imageio
 import lightning as L
 import numpy as np
-import torch
 
+from nerf_lightning.callbacks.attached import attached, data_of
 from nerf_lightning.callbacks.heldout import evenly
 from nerf_lightning.callbacks.panels import panel, to_bytes
+from nerf_lightning.callbacks.progress import Progress
+from nerf_lightning.dataset import Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic
 from nerf_lightning.system import NeRF3D
@@ -35,22 +37,24 @@ class Orbit(L.Callback):
         self.frames = frames
         self.fps = fps
 
+    def setup(self, trainer: L.Trainer, pl_module: NeRF3D, stage: str) -> None:
+        progress = attached(trainer, Progress)
+        if progress is not None and stage == "fit":
+            progress.later_views += self.frames
+
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF3D) -> None:
         if self.frames == 0:
             return
-        scene = trainer.datamodule.scene
+        scene = data_of(trainer).scene
+        assert isinstance(scene, Scene)  # NeRF3D trains on nothing else
         cameras = scene.orbit.to(pl_module.device)
+        progress = attached(trainer, Progress)
         pictures = []
         for view in evenly(len(cameras), self.frames):
             rgb = pl_module.render(cameras.view_rays(view)).rgb
             image = to_bytes(rgb.view(cameras.height, cameras.width, 3).cpu())
             pictures.append(panel([image], f"{scene.name}, step {trainer.global_step}"))
-            self.on_frame(trainer, len(pictures))
+            if progress is not None:
+                progress.frame(len(pictures), self.frames)
         with atomic(Path(trainer.default_root_dir) / self.path) as temporary:
             imageio.imwrite(temporary, np.stack(pictures), duration=1000 / self.fps, loop=0)
-
-    def on_frame(self, trainer: L.Trainer, done: int) -> None:
-        """Tells the progress display, if there is one."""
-        for callback in trainer.callbacks:
-            if hasattr(callback, "on_orbit_frame"):
-                callback.on_orbit_frame(done, self.frames)

@@ -5,11 +5,12 @@ from typing import Any
 
 import lightning as L
 from rich.console import Console
-from rich.progress import BarColumn, Progress as RichProgress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as RichProgress
 
+from nerf_lightning.callbacks.attached import attached, data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
-from nerf_lightning.callbacks.orbit import Orbit
 from nerf_lightning.system import System
 
 
@@ -35,6 +36,8 @@ class Progress(L.Callback):
         self.console = Console()
         self.bar: RichProgress | None = None
         self.task: TaskID | None = None
+        self.later_views = 0
+        """Views that will be rendered after the test; who renders them adds them in its `setup`."""
         self._shown = 0.0
         self._start = (0.0, 0)  # seconds and steps when this process began to train
         self._recent = (0.0, 0)  # the same at the last display
@@ -42,14 +45,11 @@ class Progress(L.Callback):
 
     def rendering_left(self, trainer: L.Trainer) -> float:
         """Seconds of rendering still to come; 0 until a first view has been rendered."""
-        views, seconds = trainer.datamodule.held_out_views, 0.0
-        for callback in trainer.callbacks:
-            if isinstance(callback, HeldOut):
-                views += callback.planned(trainer)
-                seconds = callback.view_seconds or 0.0
-            elif isinstance(callback, Orbit):
-                views += callback.frames
-        return views * seconds
+        held_out = attached(trainer, HeldOut)
+        if held_out is None or held_out.view_seconds is None:
+            return 0.0
+        views = data_of(trainer).held_out_views + held_out.planned(trainer) + self.later_views
+        return views * held_out.view_seconds
 
     def training_left(self, trainer: L.Trainer) -> float | None:
         """Seconds of training still to come; None before the first step."""
@@ -65,13 +65,13 @@ class Progress(L.Callback):
     def status(self, trainer: L.Trainer, pl_module: System) -> str:
         """One line: step, loss as dB, held-out dB, rays a second, time left."""
         budget = Budget.of(trainer)
-        quality = [c.latest for c in trainer.callbacks if isinstance(c, HeldOut) and c.latest is not None]
+        held_out = attached(trainer, HeldOut)
         seconds, step = budget.seconds, trainer.global_step
         speed = self._rays / max(seconds - self._recent[0], 1e-9)
         self._recent, self._rays = (seconds, step), 0
         parts = [f"step {step}", f"{speed:,.0f} rays/s"]
-        if quality:
-            parts.insert(1, f"held out {quality[-1]:.2f} dB")
+        if held_out is not None and held_out.latest is not None:
+            parts.insert(1, f"held out {held_out.latest:.2f} dB")
         training = self.training_left(trainer)
         if training is not None:
             parts.append(f"left {clock(training + self.rendering_left(trainer))}")
@@ -79,7 +79,12 @@ class Progress(L.Callback):
 
     def open(self, name: str) -> None:
         if self.bar is None and self.console.is_terminal:
-            columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[status]}"))
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TimeElapsedColumn(),
+                TextColumn("{task.fields[status]}"),
+            )
             self.bar = RichProgress(*columns, console=self.console)
             self.bar.start()
         if self.bar is not None:
@@ -101,7 +106,7 @@ class Progress(L.Callback):
         return time.monotonic() - self._shown >= (0.5 if self.bar is not None else self.every_seconds)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        self.open(f"train {trainer.datamodule.scene.name}")
+        self.open(f"train {data_of(trainer).scene.name}")
         self._start = self._recent = (Budget.of(trainer).seconds, trainer.global_step)
 
     def on_train_batch_end(
@@ -117,15 +122,15 @@ class Progress(L.Callback):
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self.open("test")
 
-    def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int) -> None:
-        views = trainer.datamodule.held_out_views
+    def on_test_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        views = data_of(trainer).held_out_views
         if self.due() or batch_idx + 1 == views:
             self.show((batch_idx + 1) / views, f"view {batch_idx + 1} of {views}: {outputs['psnr']:.2f} dB")
 
-    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        self.open("orbit")
-
-    def on_orbit_frame(self, done: int, frames: int) -> None:
+    def frame(self, done: int, frames: int) -> None:
+        """Called by the orbit after each of its frames."""
         if self.due() or done == frames:
             self.show(done / frames, f"frame {done} of {frames}")
 

@@ -11,16 +11,18 @@ import lightning as L
 import torch
 
 import nerf_lightning
+from nerf_lightning.callbacks.attached import attached, data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.files import write_json
 from nerf_lightning.system import System, psnr
 
 try:
     import resource
 except ImportError:  # Windows has no such module; peak memory is then not reported
-    resource = None
+    resource = None  # type: ignore[assignment]
 
 NO_BETTER = 1.0
 """dB above a picture of one colour below which a run has learned nothing."""
@@ -36,7 +38,7 @@ def peak_memory_bytes() -> int | None:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-def plain_colour_psnr(data: L.LightningDataModule, system: System) -> float:
+def plain_colour_psnr(data: RayDataModule | PixelDataModule, system: System) -> float:
     """PSNR of the best single colour for each held-out view: what a collapsed field reaches."""
     scores = []
     for view in range(data.held_out_views):
@@ -65,12 +67,14 @@ class Results(L.Callback):
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self.views = []
 
-    def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_test_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         self.views.append(outputs)
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         quality = fmean(view["psnr"] for view in self.views)
-        plain = plain_colour_psnr(trainer.datamodule, pl_module)
+        plain = plain_colour_psnr(data_of(trainer), pl_module)
         stopped = "stopped_early" if Budget.of(trainer).progress(trainer.global_step) < 1.0 else "finished"
         if not math.isfinite(pl_module.stats.mse) or quality < plain + NO_BETTER:
             diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
@@ -89,9 +93,9 @@ class Results(L.Callback):
 
     def write(self, trainer: L.Trainer, pl_module: System, status: str, diagnosis: str) -> None:
         """Writes the file with what is known by now; measures not taken are null."""
-        scene, budget = trainer.datamodule.scene, Budget.of(trainer)
-        throughput = next((c for c in trainer.callbacks if isinstance(c, Throughput)), None)
-        curve = next((c.curve for c in trainer.callbacks if isinstance(c, HeldOut)), [])
+        scene, budget = data_of(trainer).scene, Budget.of(trainer)
+        throughput, held_out = attached(trainer, Throughput), attached(trainer, HeldOut)
+        curve = held_out.curve if held_out is not None else []
 
         def over_views(statistic: Any, key: str) -> float | None:
             values = [view[key] for view in self.views if math.isfinite(view[key])]

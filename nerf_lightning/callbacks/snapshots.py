@@ -5,6 +5,7 @@ from typing import Any
 
 import lightning as L
 
+from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.panels import result_panel, write_png
 from nerf_lightning.errors import InputError
@@ -38,13 +39,13 @@ class Snapshots(L.Callback):
         return step in self.steps if self.steps is not None else step >= 10 and log_spaced(step)
 
     def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
-        views = trainer.datamodule.held_out_views
+        views = data_of(trainer).held_out_views
         if not 0 <= self.view < views:
             raise InputError("callbacks.snapshots.view", "", str(self.view), f"a held-out view from 0 to {views - 1}")
 
     def take(self, trainer: L.Trainer, pl_module: System) -> None:
         with Budget.of(trainer).paused():
-            data, step = trainer.datamodule, trainer.global_step
+            data, step = data_of(trainer), trainer.global_step
             result = pl_module.evaluate(data.held_out(self.view))
             caption = f"{data.scene.name}, step {step}, {Budget.of(trainer).seconds:.0f} s, {result.psnr:.2f} dB"
             picture = result_panel(result, caption)

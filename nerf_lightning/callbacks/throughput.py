@@ -46,7 +46,7 @@ class Throughput(L.Callback):
             scalars = {
                 "train/loss": stats.mse,
                 "train/psnr": -10 * math.log10(max(stats.mse, 1e-12)),
-                "train/learning_rate": pl_module.optimizers(use_pl_optimizer=False).param_groups[0]["lr"],
+                "train/learning_rate": pl_module.parameter_groups[0]["lr"],
                 "speed/rays_per_second": rays / max(seconds - self._mark[0], 1e-9),
                 "speed/samples_per_ray": self._samples / max(rays, 1),
                 "speed/training_seconds": seconds,

@@ -9,7 +9,9 @@ from torch import Tensor
 from nerf_lightning.cameras.cameras import Cameras
 
 
-def look_at(eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "*batch 4 4"]:
+def look_at(
+    eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "*batch 4 4"]:
     """Poses at `eye` whose z axis points at `target` and whose y axis points away from `up` (OpenCV, camera to world)."""
     forward = torch.nn.functional.normalize(target - eye, dim=-1)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.expand_as(forward)), dim=-1)

@@ -2,10 +2,12 @@
 
 import math
 import os
-import tempfile
 import warnings
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from tokenize import TokenError
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -17,6 +19,7 @@ from nerf_lightning.dataset.brickmodel import bulldozer
 from nerf_lightning.dataset.bricktrace import picture, shadow
 from nerf_lightning.dataset.scene import Scene, Views
 from nerf_lightning.errors import InputError
+from nerf_lightning.files import atomic
 
 VERSION = 1
 """Part of the cache file's name: raise it whenever model, shading or cameras change."""
@@ -106,9 +109,8 @@ def _load(path: Path, train: Cameras, val: Cameras) -> tuple[np.ndarray, np.ndar
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             images = arrays["images_train"], arrays["images_val"]
-    except Exception:  # noqa: BLE001
-        # A damaged archive fails in any of a dozen ways, from zlib.error to TokenError in a header. The file is only a
-        # copy of what can be made again, so all of them mean the same.
+    except (OSError, EOFError, ValueError, KeyError, SyntaxError, RuntimeError, BadZipFile, zlib.error, TokenError):
+        # All the ways a damaged archive fails, the last in an array's header. It is a copy of what can be made again.
         return None
     for array, cameras in zip(images, (train, val), strict=True):
         if array.dtype != np.uint8 or array.shape != (len(cameras), cameras.height, cameras.width, 4):
@@ -118,14 +120,8 @@ def _load(path: Path, train: Cameras, val: Cameras) -> tuple[np.ndarray, np.ndar
 
 def _save(path: Path, train: np.ndarray, val: np.ndarray) -> None:
     """Writes a whole file or none; where the folder cannot be written, says so and goes on."""
-    partial = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".partial", delete=False) as file:
-            partial = file.name
+        with atomic(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, images_train=train, images_val=val)
-        os.replace(partial, path)
     except OSError as error:
-        if partial:
-            Path(partial).unlink(missing_ok=True)
         warnings.warn(f"the built-in scene is not cached, the next run traces it again: {error}", stacklevel=3)

@@ -78,27 +78,27 @@ class Builder:
 
     def box(self, low: tuple, high: tuple, material: Material) -> None:
         """An axis-aligned box from its lower to its upper corner."""
-        low, high = np.array(low, float), np.array(high, float)
-        self.parts.append((False, (low + high) / 2, np.eye(3), (high - low) / 2, material))
+        a, b = np.array(low, float), np.array(high, float)
+        self.parts.append((False, (a + b) / 2, np.eye(3), (b - a) / 2, material))
 
     def bar(self, start: tuple, end: tuple, width: float, thickness: float, material: Material) -> None:
         """A straight bar between two points in a plane of constant x; `width` is its size along x."""
-        start, end = np.array(start, float), np.array(end, float)
-        length = np.linalg.norm(end - start)
-        along = (end - start) / length
+        a, b = np.array(start, float), np.array(end, float)
+        length = np.linalg.norm(b - a)
+        along = (b - a) / length
         across = np.array([1.0, 0.0, 0.0])
         axes = np.stack([across, along, np.cross(across, along)])
-        self.parts.append((False, (start + end) / 2, axes, np.array([width, length, thickness]) / 2, material))
+        self.parts.append((False, (a + b) / 2, axes, np.array([width, length, thickness]) / 2, material))
 
     def cylinder(self, start: tuple, end: tuple, radius: float, material: Material) -> None:
         """A cylinder between the centres of its two caps."""
-        start, end = np.array(start, float), np.array(end, float)
-        length = np.linalg.norm(end - start)
-        along = (end - start) / length
+        a, b = np.array(start, float), np.array(end, float)
+        length = np.linalg.norm(b - a)
+        along = (b - a) / length
         side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
         side /= np.linalg.norm(side)
         axes = np.stack([side, np.cross(along, side), along])
-        self.parts.append((True, (start + end) / 2, axes, np.array([radius, radius, length / 2]), material))
+        self.parts.append((True, (a + b) / 2, axes, np.array([radius, radius, length / 2]), material))
 
     def studs(self, low: tuple[float, float], high: tuple[float, float], z: float, material: Material) -> None:
         """As many rows of studs as fit on the rectangle at height `z`, centred on it."""

@@ -185,7 +185,7 @@ def uint8_images(where: object, key: str, images: Shaped[np.ndarray, "..."]) -> 
     return np.rint(images * 255).astype(np.uint8)
 
 
-def image_size(where: object, key: str, image: UInt8[np.ndarray, "*V H W C"], size: tuple[int, int, int]) -> None:
+def image_size(where: object, key: str, image: UInt8[np.ndarray, "*V H W C"], size: tuple[int, ...]) -> None:
     """All images of a scene share one (H, W, C)."""
     if image.shape[-3:] != size:
         found = "{1}x{0} with {2} channels".format(*image.shape[-3:])

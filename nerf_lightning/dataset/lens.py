@@ -38,12 +38,11 @@ class Rectification:
     row: Float[np.ndarray, "H W"] | None = None
 
     def apply(self, image: UInt8[np.ndarray, "H W C"]) -> UInt8[np.ndarray, "H W C"]:
-        if self.col is None:
+        if self.col is None or self.row is None:
             return image
         # The border is cropped away already; replicating keeps rounding at the very edge from painting it black.
-        return premultiplied(
-            image, lambda x: cv2.remap(x, self.col, self.row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        )
+        col, row = self.col, self.row
+        return premultiplied(image, lambda x: cv2.remap(x, col, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 # OpenCV puts pixel centres at integers, we put them at +0.5.

@@ -183,8 +183,10 @@ def _lens(file: Path, content: dict, frame: Frame, width: int, height: int) -> L
         found = f"no focal length among [{', '.join(sorted(content))}]"
         raise InputError(file, key_of("fl_x"), found, "fl_x in pixels or camera_angle_x in radians")
     fy = focal("fl_y", "camera_angle_y", height) or fx
+    # `number` gives None only where the default is None.
+    distortion = tuple(number(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
     centre = number("cx", width / 2), number("cy", height / 2)
-    return Lens(width, height, fx, fy, *centre, tuple(number(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")))
+    return Lens(width, height, fx, fy, *centre, distortion)  # type: ignore[arg-type]
 
 
 def _normalised(

@@ -1,8 +1,8 @@
 """The course format: one .npz file with images, OpenCV camera-to-world poses and a focal length."""
 
-import os
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from nerf_lightning.dataset import checks
 from nerf_lightning.dataset.extent import estimate_bounds
 from nerf_lightning.dataset.scene import Scene, Views
 from nerf_lightning.errors import InputError
+from nerf_lightning.files import atomic
 
 NEEDED = ("images_train", "c2ws_train", "images_val", "c2ws_val")
 OPTIONAL = ("c2ws_test", "focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
@@ -124,13 +125,9 @@ def save_npz(scene: Scene, path: Path) -> None:
         arrays["background"] = torch.tensor(scene.background, dtype=torch.float64)
     if not torch.equal(scene.to_source, torch.eye(4)):
         arrays["to_source"] = scene.to_source
-    # Beside the target, so that the rename stays on one file system and readers see the old file or the new one.
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    content: dict[str, Any] = {key: array.numpy() for key, array in arrays.items()}
     try:
-        with partial.open("wb") as file:
-            np.savez_compressed(file, **{key: array.numpy() for key, array in arrays.items()})
-        os.replace(partial, path)
+        with atomic(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **content)
     except OSError as error:
         raise InputError(path, "", f"no way to write ({error})", "a folder that exists, with space") from error
-    finally:
-        partial.unlink(missing_ok=True)

@@ -21,7 +21,9 @@ class PictureMLP(PictureField):
         super().__init__()
         self.frequencies = frequencies
         sizes = [2 * (1 + 2 * frequencies)] + [width] * depth
-        hidden = [m for a, b in zip(sizes[:-1], sizes[1:], strict=True) for m in (torch.nn.Linear(a, b), torch.nn.ReLU())]
+        hidden = [
+            m for a, b in zip(sizes[:-1], sizes[1:], strict=True) for m in (torch.nn.Linear(a, b), torch.nn.ReLU())
+        ]
         self.net = torch.nn.Sequential(*hidden, torch.nn.Linear(sizes[-1], 3))
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:

@@ -1,6 +1,6 @@
 """The volume renderer: asks a field along samples and composites the answers onto a background."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -49,12 +49,16 @@ class VolumeRenderer(torch.nn.Module):
     ):
         super().__init__()
         self.random = background == "random"
+        colour: Sequence[float]
         if background in ("scene", "random"):
             colour = scene_background
         elif isinstance(background, str):
             if background not in NAMED:
                 raise InputError(
-                    "renderer.background", "", repr(background), "scene, black, white, random or three numbers in [0, 1]"
+                    "renderer.background",
+                    "",
+                    repr(background),
+                    "scene, black, white, random or three numbers in [0, 1]",
                 )
             colour = NAMED[background]
         else:

@@ -8,9 +8,7 @@ from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack
 
 
-def stratified_edges(
-    edges: Float[Tensor, "R S_plus_1"], generator: Generator
-) -> Float[Tensor, "R S_plus_1"]:
+def stratified_edges(edges: Float[Tensor, "R S_plus_1"], generator: Generator) -> Float[Tensor, "R S_plus_1"]:
     """Moves each inner edge to a random place between its neighbours' midpoints (NeRF, eq. 2); the ends stay."""
     middle = (edges[:, :-1] + edges[:, 1:]) / 2
     noise = torch.rand(middle[:, 1:].shape, generator=generator, device=edges.device)

@@ -19,4 +19,6 @@ def ssim(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
     if min(image.shape[:2]) < 11:
         return math.nan
     first, second = (x.permute(2, 0, 1)[None] for x in (image, truth))
-    return float(structural_similarity_index_measure(first, second, data_range=1.0))
+    score = structural_similarity_index_measure(first, second, data_range=1.0)
+    assert isinstance(score, Tensor)  # a pair only where its options ask for one
+    return score.item()

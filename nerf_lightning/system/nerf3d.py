@@ -11,7 +11,7 @@ from nerf_lightning.sampler import Sampler
 from nerf_lightning.seeding import step_generator
 from nerf_lightning.system.system import MakeOptimizer, Schedule, StepStats, System
 
-RENDER_CHUNK = 4096
+RENDER_CHUNK = 1024
 """Rays rendered together without gradient: bounds the memory of a view, whatever its size."""
 
 
@@ -48,7 +48,7 @@ class NeRF3D(System):
         rendered = self.renderer(batch.rays, samples, self.field, backgrounds)
         loss = torch.nn.functional.mse_loss(rendered.rgb, batch.target(backgrounds))
         self.stats = StepStats(loss.detach().item(), len(batch.rays), len(samples))
-        self.trainer.datamodule.adapt(len(samples))
+        self.trainer.datamodule.adapt(len(samples))  # type: ignore[attr-defined]
         return loss
 
     @torch.no_grad()

@@ -67,8 +67,15 @@ class System(L.LightningModule):
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         factor = self.schedule(self.progress)
-        for group in self.optimizers(use_pl_optimizer=False).param_groups:
+        for group in self.parameter_groups:
             group["lr"] = group["initial_lr"] * factor
+
+    @property
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """The optimiser's groups, each with its present learning rate `lr`."""
+        optimizer = self.optimizers(use_pl_optimizer=False)
+        assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one
+        return optimizer.param_groups
 
     def truth(self, view: Any) -> Float[Tensor, "N 3"]:
         """The colours a whole-view batch should have."""

@@ -1,0 +1,19 @@
+"""What a callback finds on its trainer. Lightning sets these at run time, so type checkers do not know them."""
+
+from typing import TypeVar
+
+import lightning as L
+
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
+
+Kind = TypeVar("Kind", bound=L.Callback)
+
+
+def attached(trainer: L.Trainer, kind: type[Kind]) -> Kind | None:
+    """The trainer's callback of a kind, or None."""
+    return next((callback for callback in trainer.callbacks if isinstance(callback, kind)), None)  # type: ignore[attr-defined]
+
+
+def data_of(trainer: L.Trainer) -> RayDataModule | PixelDataModule:
+    """The data module of the run."""
+    return trainer.datamodule  # type: ignore[attr-defined]
