@@ -21,7 +21,7 @@ def main() -> None:
     """The command line. A resumed run goes on in its own folder instead of a new one."""
     resumed = [argument.removeprefix("resume=") for argument in sys.argv[1:] if argument.startswith("resume=")]
     if resumed and resumed[-1] not in ("", "null"):
-        sys.argv += [f"hydra.run.dir='{Path(resumed[-1]).absolute()}'", "hydra.output_subdir=null"]
+        sys.argv.append(f"hydra.run.dir='{Path(resumed[-1]).absolute()}'")
     cli.run("config", train)
 
 

@@ -6,36 +6,57 @@ from typing import Any
 
 import hydra
 import lightning as L
-from hydra.errors import InstantiationException
+import torch
 from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError
 
 from nerf_lightning.callbacks import Budget, Results
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
+from nerf_lightning.options import check_options
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 
 
-def make(cfg: DictConfig, key: str, **extra: Any) -> Any:
-    """Instantiates `cfg[key]`, passing `extra`; the reasons it cannot be are told in terms of the config.
+def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
+    """Instantiates what stands at `path`, passing `extra`; the reasons it cannot be are told in terms of the config.
 
     Raises:
         InputError: where the key is missing, or its target refuses or does not know an option.
     """
-    if cfg.get(key) is None:
-        raise InputError("config", key, "nothing", f"one of the options of the group {key}", f"give {key}=NAME")
+    node = OmegaConf.select(cfg, path)
+    if node is None:
+        raise InputError("config", path, "nothing", f"one of the options of the group {path}", f"give {path}=NAME")
+    missing = sorted(OmegaConf.missing_keys(node))
+    if missing:
+        raise InputError("config", missing[0], "nothing", "a value", f"give {missing[0]}=...")
     try:
-        # Hydra would turn dataclasses among `extra` into configs: it only binds the options, the call is ours.
-        bound = hydra.utils.instantiate(cfg[key], _partial_=True)
-        return partial(bound, **extra) if cfg[key].get("_partial_") else bound(**extra)
-    except InstantiationException as error:
-        raise InputError("config", key, str(error), "options that can be built") from error
-    except TypeError as error:
-        if "argument" not in str(error):  # a defect inside the target, not a call that does not fit it
-            raise
-        raise InputError("config", key, str(error), f"the options of {cfg[key]._target_}") from error
+        target = hydra.utils.get_object(node["_target_"])
+    except (ImportError, AttributeError, ValueError, ConfigKeyError) as error:
+        raise InputError("config", f"{path}._target_", str(error), "an importable class or function") from error
+    late = bool(node.get("_partial_"))
+    options = {key: value for key, value in resolved(node).items() if key not in ("_target_", "_partial_")}
+    check_options(path, target, options, extra, complete=not late)
+    # Hydra would turn dataclasses among `extra` into configs: it only binds the options, the call is ours.
+    bound = hydra.utils.instantiate(node, _partial_=True, _convert_="all")
+    if late:
+        return partial(bound, **extra)
+    try:
+        return bound(**extra)
+    except (ValueError, TypeError, MisconfigurationException) as error:
+        if isinstance(error, InputError) or target.__module__.split(".")[0] == "nerf_lightning":
+            raise  # our own targets tell bad options apart from defects; libraries do not
+        raise InputError("config", path, str(error), f"options that {target.__name__} takes") from error
+
+
+def resolved(cfg: DictConfig) -> dict[str, Any]:
+    """A configuration as plain containers, interpolations filled in."""
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(plain, dict)  # a DictConfig gives nothing else
+    return {str(key): value for key, value in plain.items()}
 
 
 def build_data(cfg: DictConfig) -> RayDataModule | PixelDataModule:
@@ -56,7 +77,12 @@ def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> A
 
 def build_system(cfg: DictConfig, scene_frame: "SceneFrame | None") -> System:
     """The LightningModule: NeRF3D for a scene's frame, NeRF2D for a picture (None)."""
-    common = {"optimizer": make(cfg, "optimizer"), "schedule": make(cfg, "schedule"), "seed": cfg.seed}
+    optimizer = make(cfg, "optimizer")
+    try:
+        optimizer([torch.zeros(1)])  # a rate below zero is told now, not after the scene is loaded
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
+    common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed}
     if scene_frame is None:
         return NeRF2D(build_field(cfg, PictureField, "two coordinates"), **common)
     bounds, background = scene_frame
@@ -91,15 +117,18 @@ def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, sys
 
 def build_budget(cfg: DictConfig) -> Budget:
     """The user's limits, or the experiment's own where the user gives none."""
-    given = {key: cfg.budget[key] for key in ("steps", "seconds")}
-    return Budget(**(given if any(v is not None for v in given.values()) else dict(cfg.budget.default)))
+    budget = resolved(cfg.budget)
+    default = budget.pop("default")
+    limits = budget if any(value is not None for value in budget.values()) else default
+    check_options("budget", Budget, limits)
+    return Budget(**limits)
 
 
 def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
     """The Trainer with its callbacks, writing into `folder`."""
     logger: Logger | bool = make(cfg, "logger", save_dir=folder) if cfg.get("logger") is not None else False
-    chosen = {name: node for name, node in (cfg.get("callbacks") or {}).items() if node is not None}
-    callbacks = [make(DictConfig({name: node}, parent=cfg), name) for name, node in chosen.items()]
+    chosen = [name for name, node in (cfg.get("callbacks") or {}).items() if node is not None]
+    callbacks = [make(cfg, f"callbacks.{name}") for name in chosen]
     results = Results("results.json", cfg.method, cfg.seed)
     # The budget goes first: the others read its clock. Results go before the orbit: figures should not wait for a GIF.
     return make(

@@ -2,9 +2,11 @@
 
 import functools
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -40,18 +42,27 @@ def run(config: str, task: Callable[[DictConfig], object]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
     OmegaConf.register_new_resolver("slug", slug, replace=True)
 
+    started = False
+
     @functools.wraps(task)
     def job(cfg: DictConfig) -> object:
+        nonlocal started
+        started = True
         try:
             return task(cfg)
         except InputError as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # the sweep decides what becomes of the other jobs
+            with suppress(OSError):  # a folder in which something stands stays
+                Path(HydraConfig.get().runtime.output_dir).rmdir()
             give_up(error)
 
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
-    except (InputError, HydraException, OmegaConfBaseException) as error:
+    except Exception as error:
+        # Before the task starts there is only Hydra at work on the command line: whatever it stumbles over is input.
+        if started and not isinstance(error, InputError | HydraException | OmegaConfBaseException):
+            raise
         give_up(error)
 
 
@@ -59,6 +70,9 @@ def give_up(error: Exception) -> NoReturn:
     """Prints the error as one line, or whole where the environment asks for it, and exits with 2."""
     if os.environ.get(TRACEBACK) == "1":
         traceback.print_exception(error)
-    line = " ".join(str(error).split())
+    line = " ".join(str(error).split("Config search path")[0].split())
+    unknown = re.match(r"Could not override '([^']+)'", line)
+    if unknown:
+        line = f"command line: found {unknown[1]}, expected a key or group that --cfg job or --help lists"
     print(f"nerf_lightning: {line} ({TRACEBACK}=1 shows the traceback)", file=sys.stderr)
     sys.exit(2)

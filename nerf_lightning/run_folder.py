@@ -19,7 +19,7 @@ import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.build import build_system
+from nerf_lightning.build import build_system, resolved
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
@@ -35,13 +35,6 @@ LIBRARY_TARGETS = {
     "torch.optim.Adam",
     "torch.optim.AdamW",
 }
-
-
-def resolved(cfg: DictConfig) -> dict[str, Any]:
-    """The configuration as plain containers, interpolations filled in."""
-    plain = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(plain, dict)  # a DictConfig gives nothing else
-    return {str(key): value for key, value in plain.items()}
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:

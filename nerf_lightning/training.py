@@ -4,7 +4,7 @@ import logging
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import lightning as L
 import torch
@@ -12,11 +12,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.allocator import keep_freed_memory
-from nerf_lightning.build import build_data, build_system, build_trainer, check_background, frame_of
+from nerf_lightning.build import build_data, build_system, build_trainer, check_background, frame_of, resolved
 from nerf_lightning.callbacks import Results
 from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.errors import InputError
-from nerf_lightning.run_folder import load_config, read_checkpoint, resolved, save_config, save_scene
+from nerf_lightning.options import AtLeast, Count, check_options
+from nerf_lightning.run_folder import load_config, read_checkpoint, save_config, save_scene
 
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
@@ -32,11 +33,9 @@ def train(cfg: DictConfig) -> float:
     if cfg.resume is not None:
         cfg, checkpoint = resume(cfg, folder)
     quiet()
-    if cfg.threads is not None:
-        torch.set_num_threads(cfg.threads)
-    keep_freed_memory()
-    torch.set_flush_denormal(True)  # dying weights otherwise slow the CPU down many times over
-    L.seed_everything(cfg.seed, verbose=False)
+    settings = {"seed": cfg.seed, "threads": cfg.threads}
+    check_options("", prepare_process, settings)
+    prepare_process(**settings)
     data = build_data(cfg)
     system = build_system(cfg, frame_of(data))
     check_background(cfg, data, system)
@@ -65,6 +64,15 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
             raise InputError("resume", key, "an option the run does not have", f"one of those in {folder}/config.yaml")
         OmegaConf.update(saved, key, OmegaConf.select(cfg, key))
     return saved, checkpoint
+
+
+def prepare_process(seed: Annotated[int, AtLeast(0)], threads: Count | None) -> None:
+    """What a run sets for its whole process."""
+    if threads is not None:
+        torch.set_num_threads(threads)
+    keep_freed_memory()
+    torch.set_flush_denormal(True)  # dying weights otherwise slow the CPU down many times over
+    L.seed_everything(seed, verbose=False)
 
 
 def written(trainer: L.Trainer) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PixelDataModule
 from nerf_lightning.dataset.rays import RayDataModule
 from nerf_lightning.files import atomic
+from nerf_lightning.options import Count
 
 DOWNLOAD_TIMEOUT = 10.0
 """Seconds without an answer after which a download is given up."""
@@ -20,12 +21,12 @@ DOWNLOAD_TIMEOUT = 10.0
 def from_photos(
     path: str,
     name: str | None = None,
-    resize: int | None = None,
-    holdout: int = 10,
+    resize: Count | None = None,
+    holdout: Count = 10,
     near: float | None = None,
     far: float | None = None,
-    rays: int = 4096,
-    samples: int | None = None,
+    rays: Count = 4096,
+    samples: Count | None = None,
     seed: int = 0,
 ) -> RayDataModule:
     """Posed photos in any supported format, see `open_scene` and `RayDataModule`."""
@@ -33,11 +34,11 @@ def from_photos(
 
 
 def from_bricks(
-    size: int = 200,
-    train_views: int = 100,
-    val_views: int = 10,
-    rays: int = 4096,
-    samples: int | None = None,
+    size: Count = 200,
+    train_views: Count = 100,
+    val_views: Count = 10,
+    rays: Count = 4096,
+    samples: Count | None = None,
     seed: int = 0,
 ) -> RayDataModule:
     """The built-in scene, see `bricks` and `RayDataModule`."""
@@ -49,11 +50,11 @@ def from_download(
     folder: str,
     download: bool = True,
     path: str | None = None,
-    resize: int | None = None,
+    resize: Count | None = None,
     near: float | None = None,
     far: float | None = None,
-    rays: int = 4096,
-    samples: int | None = None,
+    rays: Count = 4096,
+    samples: Count | None = None,
     seed: int = 0,
 ) -> RayDataModule:
     """A published scene: from `path` if given, else from `folder`, else from `url` into `folder`, else the built-in scene.
@@ -93,7 +94,7 @@ def _download(url: str, target: Path) -> None:
 
 
 def from_picture(
-    path: str | None = None, max_side: int | None = None, pixels: int = 10_000, seed: int = 0
+    path: str | None = None, max_side: Count | None = None, pixels: Count = 10_000, seed: int = 0
 ) -> PixelDataModule:
     """A picture from a file, or the built-in one, see `load_picture` and `PixelDataModule`."""
     if path is None:

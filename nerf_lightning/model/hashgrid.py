@@ -9,6 +9,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.encoding import spherical_harmonics
 from nerf_lightning.model.field import Field
+from nerf_lightning.options import Count
 
 # Instant-NGP, eq. 4: pi_1 = 1, pi_2 = 2654435761, pi_3 = 805459861; the second as the int32 it wraps to.
 PRIMES = (1, 2654435761 - 2**32, 805459861)
@@ -89,7 +90,12 @@ class HashGrid(torch.nn.Module):
     """
 
     def __init__(
-        self, levels: int = 8, log2_entries: int = 16, features: int = 2, coarsest: int = 16, finest: int = 256
+        self,
+        levels: Count = 8,
+        log2_entries: Count = 16,
+        features: Count = 2,
+        coarsest: Count = 16,
+        finest: Count = 256,
     ):
         super().__init__()
         if not 0 < coarsest <= finest:
@@ -120,12 +126,12 @@ class HashGridField(Field):
     def __init__(
         self,
         bounds: Bounds,
-        levels: int = 8,
-        log2_entries: int = 16,
-        features: int = 2,
-        coarsest: int = 16,
-        finest: int = 256,
-        width: int = 32,
+        levels: Count = 8,
+        log2_entries: Count = 16,
+        features: Count = 2,
+        coarsest: Count = 16,
+        finest: Count = 256,
+        width: Count = 32,
         density: str = "exp",
     ):
         super().__init__(bounds)

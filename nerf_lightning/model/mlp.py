@@ -9,6 +9,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import Field
+from nerf_lightning.options import Count
 
 
 class MLPField(Field):
@@ -29,8 +30,8 @@ class MLPField(Field):
     def __init__(
         self,
         bounds: Bounds,
-        depth: int = 8,
-        width: int = 256,
+        depth: Count = 8,
+        width: Count = 256,
         skip: int = 4,
         position_frequencies: int = 10,
         direction_frequencies: int = 4,

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import PictureField
+from nerf_lightning.options import Count
 
 
 class PictureMLP(PictureField):
@@ -17,7 +18,7 @@ class PictureMLP(PictureField):
         depth: hidden layers.
     """
 
-    def __init__(self, frequencies: int = 10, width: int = 256, depth: int = 3):
+    def __init__(self, frequencies: int = 10, width: Count = 256, depth: Count = 3):
         super().__init__()
         self.frequencies = frequencies
         sizes = [2 * (1 + 2 * frequencies)] + [width] * depth

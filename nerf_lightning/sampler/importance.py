@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.options import Count
 from nerf_lightning.sampler.samples import DensityFn, Samples, pack
 from nerf_lightning.sampler.uniform import UniformSampler
 
@@ -35,7 +36,7 @@ class ImportanceSampler(UniformSampler):
         stratified: jitter both passes in training.
     """
 
-    def __init__(self, bounds: Bounds, samples: int = 64, fine: int = 64, stratified: bool = True):
+    def __init__(self, bounds: Bounds, samples: Count = 64, fine: Count = 64, stratified: bool = True):
         super().__init__(bounds, samples, stratified)
         self.fine = fine
 

@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.options import Count
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack
 
 MAX_CANDIDATES = 1 << 20
@@ -39,11 +40,11 @@ class OccupancySampler(Sampler):
     def __init__(
         self,
         bounds: Bounds,
-        samples: int = 256,
-        resolution: int = 64,
+        samples: Count = 256,
+        resolution: Count = 64,
         threshold: float = 0.01,
         decay: float = 0.95,
-        update_every: int = 16,
+        update_every: Count = 16,
         warmup: int = 256,
     ):
         super().__init__(bounds)

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.options import Count
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack
 
 
@@ -25,7 +26,7 @@ class UniformSampler(Sampler):
         stratified: jitter the intervals in training, so that over time the field is asked everywhere.
     """
 
-    def __init__(self, bounds: Bounds, samples: int = 64, stratified: bool = False):
+    def __init__(self, bounds: Bounds, samples: Count = 64, stratified: bool = False):
         super().__init__(bounds)
         self.samples = samples
         self.stratified = stratified
