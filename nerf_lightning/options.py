@@ -4,7 +4,7 @@ import difflib
 import inspect
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -23,7 +23,7 @@ Count = Annotated[int, AtLeast(1)]
 
 
 def check_options(
-    where: str, target: Callable, options: Mapping[str, Any], given: typing.Container[str] = (), complete: bool = True
+    where: str, target: Callable, options: Mapping[str, Any], given: Container[str] = (), complete: bool = True
 ) -> None:
     """Raises InputError where an option is unknown, missing, of the wrong type or below its bound.
 

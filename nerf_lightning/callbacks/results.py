@@ -76,7 +76,10 @@ class Results(L.Callback):
         quality = fmean(view["psnr"] for view in self.views)
         plain = plain_colour_psnr(data_of(trainer), pl_module)
         stopped = "stopped_early" if Budget.of(trainer).progress(trainer.global_step) < 1.0 else "finished"
-        if not math.isfinite(pl_module.stats.mse) or quality < plain + NO_BETTER:
+        broken = [name for name, value in pl_module.named_parameters() if not value.isfinite().all()]
+        if broken:
+            self.write(trainer, pl_module, "collapsed", f"{broken[0]} is no longer finite")
+        elif quality < plain + NO_BETTER:
             diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
             self.write(trainer, pl_module, "collapsed", diagnosis)
         else:

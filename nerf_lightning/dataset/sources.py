@@ -98,7 +98,7 @@ def from_picture(
 ) -> PixelDataModule:
     """A picture from a file, or the built-in one, see `load_picture` and `PixelDataModule`."""
     if path is None:
-        picture = Picture("chart", "built-in", builtin_picture(max_side or 256))
+        picture = Picture("sunset", "built-in", builtin_picture(max_side or 256))
     else:
         source = Path(path)
         picture = Picture(source.stem.lower(), os.fspath(source), load_picture(source, max_side))

@@ -1,0 +1,157 @@
+"""Every shipped experiment runs, and the options it can be given do."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from nerf_lightning import cli
+from nerf_lightning.dataset import Scene, save_npz
+from nerf_lightning.dataset.bricks import bricks
+from nerf_lightning.training import train
+
+EXPERIMENTS = sorted(path.stem for path in (cli.conf_dir() / "experiment").glob("*.yaml"))
+GROUPS = ("model", "sampler", "optimizer", "schedule")
+
+
+def composed(overrides: list[str], folder: Path) -> DictConfig:
+    """The configuration a command line would give, with `folder` as the run's."""
+    with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
+        cfg = compose("config", overrides, return_hydra_config=True)
+    with open_dict(cfg):
+        cfg.hydra.runtime.output_dir = str(folder)
+    HydraConfig.instance().set_config(cfg)
+    return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+
+
+@pytest.fixture(scope="session")
+def small_scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene]:
+    """The built-in scene at 24 px, as a file."""
+    path = tmp_path_factory.mktemp("scene") / "small.npz"
+    scene = bricks(size=24, train_views=8, val_views=2)
+    save_npz(scene, path)
+    return path, scene
+
+
+@pytest.fixture(scope="session")
+def a_scene_for(small_scene: tuple[Path, Scene], tmp_path_factory: pytest.TempPathFactory):
+    """Overrides that give an experiment data small enough for a test."""
+    path, _ = small_scene
+
+    def overrides(experiment: str) -> list[str]:
+        if experiment in ("picture", "smoke_2d"):
+            return ["dataset.max_side=24"]
+        if experiment == "smoke_3d":
+            return ["dataset.size=24"]
+        return [f"dataset.path={path}", "dataset.resize=null", "callbacks.orbit.frames=2"]
+
+    return overrides
+
+
+def test_the_experiments_shipped():
+    assert {"lego", "lego_mlp", "fox_capture", "picture", "smoke_2d", "smoke_3d"} <= set(EXPERIMENTS)
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_experiment(experiment: str, a_scene_for, tmp_path: Path):
+    cfg = composed([f"+experiment={experiment}", "trainer.fast_dev_run=true", *a_scene_for(experiment)], tmp_path)
+    train(cfg)
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["steps"] == 1
+    assert results["psnr"] > 0
+
+
+@pytest.mark.parametrize(
+    ("group", "option"),
+    [(group, path.stem) for group in GROUPS for path in sorted((cli.conf_dir() / group).glob("*.yaml"))],
+)
+def test_every_option_of_every_group_runs(group: str, option: str, tmp_path: Path):
+    experiment = "smoke_2d" if option == "picture_mlp" else "smoke_3d"
+    chosen = f"{group}={option}"
+    small = ["dataset.max_side=24"] if experiment == "smoke_2d" else ["dataset.size=24"]
+    if group == "model" and option not in ("hashgrid", "picture_mlp"):
+        # The experiment's own deltas speak of the hash grid.
+        cfg = composed([chosen, "dataset.size=24", "dataset.train_views=4", "dataset.val_views=1"], tmp_path)
+    elif group == "sampler" and option != "occupancy":
+        cfg = composed([chosen, "dataset.size=24", "dataset.train_views=4", "dataset.val_views=1"], tmp_path)
+    else:
+        cfg = composed([f"+experiment={experiment}", chosen, *small], tmp_path)
+    cfg.trainer.fast_dev_run = True
+    train(cfg)
+    assert json.loads((tmp_path / "results.json").read_text())["status"] in ("stopped_early", "collapsed")
+
+
+def test_what_a_run_leaves(tmp_path: Path):
+    """Contract: results.json, pictures, checkpoints, curves and hyperparameters, in the run's own folder."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    cfg = composed(["+experiment=smoke_3d", "budget.steps=60", "seed=3"], tmp_path)
+    quality = train(cfg)
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert set(results) == {
+        "scene", "method", "seed", "device", "threads", "versions", "parameters", "artifact_bytes", "train_seconds",
+        "steps", "rays_per_second", "psnr", "ssim", "psnr_worst_view", "render_seconds_per_view", "peak_memory_bytes",
+        "curve", "status", "diagnosis",
+    }  # fmt: skip
+    assert set(results["scene"]) == {"name", "source", "sha256", "views", "resolution"}
+    assert results["scene"]["name"] == "bricks"
+    assert (results["method"], results["seed"], results["steps"], results["status"]) == ("hashgrid", 3, 60, "finished")
+    assert results["psnr"] == pytest.approx(quality)
+    assert results["psnr"] > 17
+    assert results["curve"][-1][1:] == [60, results["psnr"]]
+    seconds = [point[0] for point in results["curve"]]
+    assert seconds == sorted(seconds)
+    assert sorted(path.name for path in (tmp_path / "snapshots").iterdir()) == [
+        f"step_{step:07d}.png" for step in (10, 20, 50, 60)
+    ]
+    assert (tmp_path / "orbit.gif").stat().st_size > 0
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"best.ckpt", "last.ckpt"}
+    events = EventAccumulator(str(tmp_path)).Reload().Tags()
+    assert {"heldout/psnr", "test/psnr", "train/loss", "speed/rays_per_second", "final/psnr"} <= set(events["scalars"])
+    assert "snapshot" in events["images"]
+    assert not list(tmp_path.glob("**/.*")), "no temporary file stays behind"
+
+
+def test_a_run_folder_alone_is_enough_to_render(tmp_path: Path):
+    import torch
+
+    from nerf_lightning.run_folder import load_run
+
+    train(composed(["+experiment=smoke_3d", "budget.steps=20", "callbacks.orbit.frames=0"], tmp_path / "a"))
+    (tmp_path / "a").rename(tmp_path / "moved")
+    run = load_run(tmp_path / "moved")
+    assert run.orbit is not None
+    rgb = run.system.render(run.orbit.view_rays(0)).rgb
+    saved = torch.load(tmp_path / "moved" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert torch.equal(run.system.field.grid.tables, saved["state_dict"]["field.grid.tables"])
+    assert rgb.shape == (32 * 32, 3)
+    assert rgb.std() > 0.01
+
+
+def test_same_seed_same_weights(tmp_path: Path):
+    import torch
+
+    states = []
+    for name in ("a", "b"):
+        cfg = composed(["+experiment=smoke_3d", "budget.steps=40", "callbacks.orbit.frames=0"], tmp_path / name)
+        train(cfg)
+        states.append(torch.load(tmp_path / name / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"])
+    assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
+
+
+def test_budget_in_seconds_ends_a_run(tmp_path: Path):
+    train(composed(["+experiment=smoke_3d", "budget.seconds=0.5", "callbacks.orbit.frames=0"], tmp_path))
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["status"] == "finished"
+    assert results["train_seconds"] >= 0.5
+    assert results["steps"] > 1
+
+
+@pytest.mark.parametrize("background", ["white", "random", "[0.2,0.4,0.6]"])
+def test_backgrounds_train(background: str, tmp_path: Path):
+    overrides = ["+experiment=smoke_3d", "budget.steps=60", f"renderer.background={background}"]
+    train(composed([*overrides, "callbacks.orbit.frames=0"], tmp_path))
+    assert json.loads((tmp_path / "results.json").read_text())["status"] == "finished"  # better than one plain colour
