@@ -9,6 +9,10 @@ from torch import Tensor
 from nerf_lightning.cameras.cameras import Cameras
 
 
+ONE_SIDED = 0.35
+"""Length of the mean viewing direction, less its vertical part, beyond which cameras stand on one side of the subject."""
+
+
 def look_at(
     eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*batch 4 4"]:
@@ -56,12 +60,46 @@ def orbit_around(
     return look_at(centre + radius * ring, centre, up)
 
 
+def loop_before(
+    centre: Float[Tensor, "3"],
+    axis: Float[Tensor, "3"],
+    up: Float[Tensor, "3"],
+    radius: float,
+    angle: float,
+    frames: int,
+) -> Float[Tensor, "frames 4 4"]:
+    """A small circle of poses in front of a subject, all looking at it.
+
+    Args:
+        centre: the subject, world frame.
+        axis: unit vector from the subject to the middle of the circle.
+        up: unit vector, what is up in the pictures.
+        radius: distance to the subject, scene's unit.
+        angle: between the axis and each line of sight, radians.
+        frames: how many poses; the last stops one step short of the first.
+    """
+    circle = orbit_around(centre, axis, radius, math.pi / 2 - angle, frames)
+    return look_at(circle[:, :3, 3], centre, up)
+
+
 def orbit_like(cameras: Cameras, frames: int = 60) -> Cameras:
-    """An orbit around what `cameras` look at, at their mean distance and height, with their size and first intrinsics."""
+    """A closed path around what `cameras` look at, where they have seen it, with their size and first intrinsics.
+
+    Cameras all around give a full turn at their mean distance and height; cameras on one side give a loop on that side, as
+    wide as they are spread.
+    """
     centre = focus_point(cameras.c2w)
     up = torch.nn.functional.normalize(-cameras.c2w[:, :3, 1].mean(0), dim=-1)
     offset = cameras.centres - centre
     radius = float(offset.norm(dim=-1).mean())
-    elevation = math.asin(max(-0.95, min(0.95, float((offset @ up).mean()) / max(radius, 1e-9))))
-    c2w = orbit_around(centre, up, radius, elevation, frames)
+    direction = torch.nn.functional.normalize(offset, dim=-1)
+    mean = direction.mean(0)
+    aside = mean - (mean @ up) * up  # near zero for cameras all around, whatever their height
+    if float(aside.norm()) > ONE_SIDED:
+        axis = torch.nn.functional.normalize(mean, dim=-1)
+        spread = torch.acos((direction @ axis).clamp(-1, 1)).mean()
+        c2w = loop_before(centre, axis, up, radius, float(spread), frames)
+    else:
+        elevation = math.asin(max(-0.95, min(0.95, float((offset @ up).mean()) / max(radius, 1e-9))))
+        c2w = orbit_around(centre, up, radius, elevation, frames)
     return Cameras(cameras.K[:1].repeat(frames, 1, 1), c2w, cameras.width, cameras.height)

@@ -51,7 +51,7 @@ class Scene:
         digest = hashlib.sha256()
         for views in (self.train, self.val):
             digest.update(repr(tuple(views.images.shape)).encode())
-            digest.update(views.images.numpy().tobytes())
+            digest.update(memoryview(views.images.contiguous().numpy()))
         return digest.hexdigest()
 
     def describe(self) -> dict[str, object]:

@@ -2,7 +2,16 @@
 
 from nerf_lightning.sampler.importance import ImportanceSampler
 from nerf_lightning.sampler.occupancy import OccupancySampler
-from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack
+from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack, split
 from nerf_lightning.sampler.uniform import UniformSampler
 
-__all__ = ["DensityFn", "ImportanceSampler", "OccupancySampler", "Sampler", "Samples", "UniformSampler", "pack"]
+__all__ = [
+    "DensityFn",
+    "ImportanceSampler",
+    "OccupancySampler",
+    "Sampler",
+    "Samples",
+    "UniformSampler",
+    "pack",
+    "split",
+]

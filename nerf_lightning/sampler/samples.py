@@ -1,6 +1,7 @@
 """Samples: intervals along rays, packed one ray after the other, and the interface every sampler meets."""
 
-from collections.abc import Callable
+import bisect
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -45,6 +46,22 @@ def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Sampl
     ray, column = keep.nonzero(as_tuple=True)
     start, end = edges[ray, column], edges[ray, column + 1]
     return Samples((start + end) / 2, end - start, ray, offsets)
+
+
+def split(samples: Samples, most: int) -> Iterator[tuple[slice, Samples]]:
+    """Cuts samples into runs of whole rays with at most `most` samples each (a ray with more makes a run of its own).
+
+    Yields:
+        The rays of a run, as a slice, and their samples with `ray` and `offsets` counted from the run's start.
+    """
+    offsets = samples.offsets.tolist()
+    first, rays = 0, len(offsets) - 1
+    while first < rays:
+        last = max(first + 1, bisect.bisect_right(offsets, offsets[first] + most, lo=first) - 1)
+        part = slice(offsets[first], offsets[last])
+        local = samples.offsets[first : last + 1] - offsets[first]
+        yield slice(first, last), Samples(samples.t[part], samples.dt[part], samples.ray[part] - first, local)
+        first = last
 
 
 class Sampler(InBounds):

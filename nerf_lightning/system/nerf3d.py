@@ -7,12 +7,12 @@ from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import RayBatch, ViewBatch
 from nerf_lightning.model import Field
 from nerf_lightning.renderer import Rendered, VolumeRenderer
-from nerf_lightning.sampler import Sampler
+from nerf_lightning.sampler import Sampler, split
 from nerf_lightning.seeding import step_generator
 from nerf_lightning.system.system import MakeOptimizer, Schedule, StepStats, System
 
-RENDER_CHUNK = 1024
-"""Rays rendered together without gradient: bounds the memory of a view, whatever its size."""
+RENDER_RAYS, RENDER_SAMPLES = 4096, 1 << 15
+"""Rays sampled, and samples rendered, together without gradient: bounds the memory of a view, whatever its size."""
 
 
 class NeRF3D(System):
@@ -55,9 +55,10 @@ class NeRF3D(System):
     def render(self, rays: Rays) -> Rendered:
         """Renders rays without gradient and without chance, a chunk at a time."""
         parts = []
-        for start in range(0, len(rays), RENDER_CHUNK):
-            chunk = rays[start : start + RENDER_CHUNK]
-            parts.append(self.renderer(chunk, self.sampler(chunk, self.field.density), self.field))
+        for start in range(0, len(rays), RENDER_RAYS):
+            chunk = rays[start : start + RENDER_RAYS]
+            for run, samples in split(self.sampler(chunk, self.field.density), RENDER_SAMPLES):
+                parts.append(self.renderer(chunk[run], samples, self.field))
         return Rendered(*(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "depth")))
 
     def truth(self, view: ViewBatch) -> Tensor:

@@ -1,0 +1,35 @@
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+
+def poses(*batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Random rotations (det = 1) and translations."""
+    q = torch.linalg.qr(torch.randn(*batch, 3, 3, dtype=torch.float64)).Q
+    q = q * torch.linalg.det(q)[..., None, None].sign()
+    c2w = torch.eye(4, dtype=torch.float64).repeat(*batch, 1, 1)
+    c2w[..., :3, :3], c2w[..., :3, 3] = q, torch.randn(*batch, 3, dtype=torch.float64) * 3
+    return c2w.to(dtype)
+
+
+def intrinsics(*batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Random upper triangular K, with skew."""
+    K = torch.zeros(*batch, 3, 3, dtype=torch.float64)
+    K[..., 0, 0] = 200 + 300 * torch.rand(batch)
+    K[..., 1, 1] = 200 + 300 * torch.rand(batch)
+    K[..., 0, 1] = 20 * torch.randn(batch)
+    K[..., :2, 2] = 100 + 50 * torch.rand(*batch, 2, dtype=torch.float64)
+    K[..., 2, 2] = 1
+    return K.to(dtype)
+
+
+@pytest.fixture
+def random_poses() -> Callable[..., Tensor]:
+    return poses
+
+
+@pytest.fixture
+def random_K() -> Callable[..., Tensor]:
+    return intrinsics

@@ -1,0 +1,138 @@
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.cameras import Bounds, InBounds, Rays
+
+BOX = torch.tensor([[-1.0, -0.5, 0.2], [1.5, 2.0, 1.0]])
+
+
+def some_rays(count: int) -> Rays:
+    origins = torch.randn(count, 3) * 3
+    toward = BOX.mean(0) + torch.randn(count, 3)
+    return Rays(origins, torch.nn.functional.normalize(toward - origins, dim=-1))
+
+
+AXES = torch.cat([torch.eye(3), -torch.eye(3)])
+RAYS = {
+    "random": lambda: some_rays(200),
+    "parallel to an axis, through": lambda: Rays(BOX.mean(0) - 4 * AXES, AXES),
+    "parallel to an axis, beside": lambda: Rays(BOX[1] + 0.1 - 4 * AXES, AXES),
+    "parallel to an axis, inside": lambda: Rays(BOX.mean(0).expand(6, 3), AXES),
+    "in a plane": lambda: Rays(
+        BOX.mean(0).expand(4, 3), torch.tensor([[0.6, 0.8, 0], [0, -0.6, 0.8], [-0.8, 0, 0.6], [-0.6, -0.8, 0]])
+    ),
+    "inside": lambda: Rays(BOX[0] + torch.rand(100, 3) * (BOX[1] - BOX[0]), some_rays(100).directions),
+    "leaving": lambda: Rays(BOX[1] + 0.1 + torch.rand(50, 3), some_rays(50).directions.abs()),
+}
+
+
+@pytest.mark.parametrize("kind", RAYS)
+def test_near_and_far_agree_with_marching(kind):
+    rays = RAYS[kind]()
+    near, far = Bounds(BOX).near_far(rays)
+    assert near.isfinite().all() and far.isfinite().all()
+    step = 0.005
+    t = np.arange(0, 20, step)
+    x = rays.origins.numpy()[:, None] + t[:, None] * rays.directions.numpy()[:, None]
+    inside = ((x >= BOX[0].numpy()) & (x <= BOX[1].numpy())).all(-1)
+    for ray in range(len(rays)):
+        if inside[ray].any():
+            first, last = t[inside[ray]][[0, -1]]
+            assert first - step - 1e-4 <= near[ray] <= first + 1e-4
+            assert last - 1e-4 <= far[ray] <= last + step + 1e-4
+        else:
+            assert far[ray] - near[ray] < step
+    if kind in ("parallel to an axis, beside", "leaving"):
+        assert (near >= far).all()
+    if "inside" in kind or kind == "in a plane":
+        assert (near == 0).all() and (far > 0).all()
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("reach", [0.9, 1.1, 20.0])
+def test_to_world_inverts_to_unit(unbounded, reach):
+    bounds = Bounds(BOX.double(), unbounded)
+    world = bounds.centre + reach * bounds.half_size * torch.rand(500, 3).double().mul(2).sub(1)
+    torch.testing.assert_close(bounds.to_world(bounds.to_unit(world)), world)
+    unit = torch.rand(500, 3).double()
+    torch.testing.assert_close(bounds.to_unit(bounds.to_world(unit)), unit)
+
+
+def test_a_bounded_box_fills_the_unit_cube():
+    bounds = Bounds(BOX)
+    torch.testing.assert_close(bounds.to_unit(BOX), torch.tensor([[0.0, 0, 0], [1, 1, 1]]))
+    assert (bounds.to_unit(BOX[1] + 0.1) > 1).all() and (bounds.to_unit(BOX[0] - 0.1) < 0).all()
+
+
+def test_contraction_keeps_the_box_whole_and_everything_else_around_it():
+    bounds = Bounds(BOX, unbounded=True)
+    torch.testing.assert_close(bounds.to_unit(BOX), torch.tensor([[0.25] * 3, [0.75] * 3]))
+    far = bounds.to_unit(torch.randn(1000, 3) * torch.logspace(-2, 8, 1000)[:, None])
+    assert far.min() >= 0 and far.max() <= 1
+    # Twice and ten times the half-size along x: |x| = 2 - 1/r, a quarter of the cube for each unit.
+    away = bounds.centre + torch.tensor([[2.0, 0, 0], [-10.0, 0, 0]]) * bounds.half_size
+    torch.testing.assert_close(bounds.to_unit(away)[:, 0], torch.tensor([0.5 + 0.25 * 1.5, 0.5 - 0.25 * 1.9]))
+    assert bounds.to_world(torch.tensor([[0.0, 1.0, 0.5], [1.0, 1.0, 1.0]])).isfinite().all()
+
+
+def test_contraction_is_continuous_and_moves_outward_along_a_ray():
+    bounds = Bounds(BOX.double(), unbounded=True)
+    t = torch.linspace(0, 30, 30_001).double()[:, None]
+    for direction in some_rays(20).directions.double():
+        outward = (bounds.to_unit(bounds.centre + t * direction) - 0.5).abs().amax(-1)
+        assert (outward.diff() > 0).all()
+        passing = bounds.to_unit(BOX[1] * 1.3 + (t - 15) * direction)
+        # In the box a step of t moves t / (4 half-sizes); the contraction moves nothing by more than twice that.
+        assert passing.diff(dim=0).abs().max() <= 2 * 0.001 / (4 * bounds.half_size.min())
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.5, None), (None, 2.0), (0.5, 2.0), (9.0, None)])
+def test_near_and_far_can_be_narrowed(near, far):
+    rays = RAYS["inside"]()
+    _, exit = Bounds(BOX).near_far(rays)
+    start, end = Bounds(BOX, near=near, far=far).near_far(rays)
+    torch.testing.assert_close(start, torch.full_like(start, near or 0.0))
+    torch.testing.assert_close(end, exit.clamp(max=far or 1e9))
+
+
+def test_without_bounds_rays_reach_from_a_small_clearance_to_far_away():
+    near, far = Bounds(BOX, unbounded=True).near_far(some_rays(4))
+    torch.testing.assert_close(near, torch.full((4,), 0.02 * 1.25))
+    torch.testing.assert_close(far, torch.full((4,), 50 * 1.25))
+
+
+@pytest.mark.parametrize(("near", "far"), [(1.0, 10.0), (0.001, 10.0), (1.0, 500.0)])
+def test_without_bounds_near_and_far_override(near, far):
+    start, end = Bounds(BOX, unbounded=True, near=near, far=far).near_far(some_rays(4))
+    torch.testing.assert_close((start, end), (torch.full((4,), near), torch.full((4,), far)))
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_distances_rise_from_near_to_far(unbounded):
+    near, far = torch.tensor([0.0, 0.02, 0.5, 3.0]), torch.tensor([1.0, 50.0, 0.9, 80.0])
+    s = torch.linspace(0, 1, 65).expand(1, -1)
+    t = Bounds(BOX, unbounded).distances(near, far, s)
+    torch.testing.assert_close(t[:, 0], near, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(t[:, -1], far, rtol=1e-4, atol=1e-5)
+    assert (t.diff(dim=1) > 0).all()
+    if unbounded:  # even in g: t/2 up to the longest half-size, then 1 - 1/(2t)
+        g = np.vectorize(lambda x: x / 2 if x < 1 else 1 - 0.5 / x)(t.double().numpy() / 1.25)
+        np.testing.assert_allclose(
+            np.diff(g, axis=1), (np.diff(g, axis=1).mean(1, keepdims=True)).repeat(64, 1), atol=1e-5
+        )
+    else:
+        torch.testing.assert_close(t, near[:, None] + (far - near)[:, None] * s)
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_a_ray_that_misses_has_no_length(unbounded):
+    t = Bounds(BOX, unbounded).distances(torch.tensor([2.0]), torch.tensor([1.0]), torch.linspace(0, 1, 5)[None])
+    torch.testing.assert_close(t, torch.full((1, 5), 2.0))
+
+
+def test_the_box_follows_its_module_but_stays_out_of_checkpoints():
+    module = InBounds(Bounds(BOX, unbounded=True, near=0.1))
+    assert module.state_dict() == {}
+    assert module.double().bounds.aabb.dtype == torch.float64
+    assert module.bounds.unbounded and module.bounds.near == 0.1

@@ -1,0 +1,109 @@
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.errors import InputError
+from nerf_lightning.model import Field, HashGridField, MLPField, PictureMLP
+
+BOX = torch.tensor([[-1.0, -0.5, 0.2], [1.5, 2.0, 1.0]])
+
+
+def mlp(bounds: Bounds) -> Field:
+    return MLPField(
+        bounds, depth=3, width=16, skip=2, position_frequencies=3, direction_frequencies=2, density="softplus"
+    )
+
+
+def hashgrid(bounds: Bounds) -> Field:
+    field = HashGridField(bounds, levels=3, log2_entries=8, coarsest=3, finest=12, width=8)
+    torch.nn.init.normal_(field.grid.tables)
+    return field
+
+
+FIELDS = pytest.mark.parametrize("make", [mlp, hashgrid])
+Make = Callable[[Bounds], Field]
+
+
+def places(count: int) -> torch.Tensor:
+    return BOX[0] + torch.rand(count, 3) * (BOX[1] - BOX[0])
+
+
+def ways(count: int) -> torch.Tensor:
+    return normalize(torch.randn(count, 3), dim=-1)
+
+
+@FIELDS
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 50])
+def test_a_field_gives_density_and_colour(make: Make, unbounded: bool, count: int):
+    field, positions = make(Bounds(BOX, unbounded)), places(count) * 3
+    density, rgb = field(positions, ways(count))
+    assert density.shape == (count,) and rgb.shape == (count, 3)
+    assert (density >= 0).all() and density.isfinite().all()
+    assert (rgb >= 0).all() and (rgb <= 1).all()
+    assert torch.equal(density, field.density(positions))
+    if count > 1:
+        assert density.std() > 0 and rgb.std(0).min() > 0
+
+
+@FIELDS
+def test_the_unit_of_length_does_not_matter(make: Make):
+    small, large = make(Bounds(BOX)), make(Bounds(BOX * 10))
+    large.load_state_dict(small.state_dict())
+    positions, directions = places(40), ways(40)
+    (density, rgb), (density10, rgb10) = small(positions, directions), large(positions * 10, directions)
+    torch.testing.assert_close(density10 * 10, density, rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(rgb10, rgb, rtol=1e-3, atol=1e-4)
+
+
+def test_density_is_per_longest_half_size():
+    field = hashgrid(Bounds(BOX))
+    positions = places(9)
+    torch.testing.assert_close(field.density(positions) * 1.25, field.features(positions)[0])
+
+
+@FIELDS
+def test_colour_depends_on_the_direction_and_density_does_not(make: Make):
+    field, positions = make(Bounds(BOX)), places(20)
+    (density, rgb), (density2, rgb2) = field(positions, ways(20)), field(positions, ways(20))
+    assert torch.equal(density, density2) and (rgb - rgb2).abs().max() > 1e-4
+
+
+@FIELDS
+def test_every_parameter_learns(make: Make):
+    field = make(Bounds(BOX))
+    density, rgb = field(places(500), ways(500))
+    (density.sum() + rgb.square().sum()).backward()
+    for name, parameter in field.named_parameters():
+        assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
+
+
+@pytest.mark.parametrize("depth", [2, 4])
+def test_the_skip_layer_sees_the_position_again(depth: int):
+    field = MLPField(Bounds(BOX), depth=depth, width=16, skip=depth - 1, position_frequencies=2)
+    inputs = [layer.in_features for layer in field.trunk]
+    assert inputs == [15] + [16] * (depth - 2) + [16 + 15]
+
+
+@pytest.mark.parametrize("skip", [-1, 0, 3, 4])
+def test_a_skip_beyond_the_trunk_is_refused(skip: int):
+    with pytest.raises(InputError, match="model.skip"):
+        MLPField(Bounds(BOX), depth=3, width=16, skip=skip)
+
+
+@pytest.mark.parametrize("make", [MLPField, HashGridField])
+def test_an_unknown_density_is_refused(make):
+    with pytest.raises(InputError, match="model.density"):
+        make(Bounds(BOX), density="square")
+
+
+@pytest.mark.parametrize(("frequencies", "depth"), [(0, 1), (4, 3)])
+def test_a_picture_field_gives_colours(frequencies: int, depth: int):
+    field = PictureMLP(frequencies, width=16, depth=depth)
+    rgb = field(torch.rand(30, 2))
+    assert rgb.shape == (30, 3) and (rgb > 0).all() and (rgb < 1).all() and rgb.std(0).min() > 0
+    layers = [m for m in field.net if isinstance(m, torch.nn.Linear)]
+    assert [m.in_features for m in layers] == [2 * (1 + 2 * frequencies)] + [16] * depth

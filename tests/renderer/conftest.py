@@ -1,0 +1,20 @@
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from nerf_lightning.sampler import Samples
+
+
+def ragged(counts: list[int], dtype: torch.dtype = torch.float32) -> Samples:
+    """Touching intervals of random lengths, the given number on each ray, from t = 1 on."""
+    dt = 0.05 + 0.2 * torch.rand(sum(counts), dtype=dtype)
+    ray = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts, dtype=torch.int64))
+    offsets = torch.tensor([0, *counts]).cumsum(0)
+    end = torch.cat([1 + part.cumsum(0) for part in dt.split(counts)]) if counts else dt
+    return Samples(end - dt / 2, dt, ray, offsets)
+
+
+@pytest.fixture
+def ragged_samples() -> Callable[..., Samples]:
+    return ragged

@@ -1,0 +1,111 @@
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.errors import InputError
+from nerf_lightning.renderer import VolumeRenderer
+from nerf_lightning.sampler import UniformSampler
+
+SCENE = (0.2, 0.4, 0.6)
+
+
+def along_z(count: int, dtype: torch.dtype = torch.float32) -> Rays:
+    return Rays(torch.zeros(count, 3, dtype=dtype), torch.tensor([0, 0, 1], dtype=dtype).repeat(count, 1))
+
+
+def fixed(density: Tensor, rgb: Tensor):
+    """A field that gives the samples these answers, one after the other."""
+    return lambda positions, directions: (density, rgb)
+
+
+def test_colour_opacity_and_depth_agree_with_a_loop(ragged_samples):
+    counts = [4, 0, 6]
+    samples, rays = ragged_samples(counts), along_z(3)
+    density, rgb = 5 * torch.rand(10), torch.rand(10, 3)
+    behind = torch.rand(3, 3)
+    seen = VolumeRenderer()(rays, samples, fixed(density, rgb), behind)
+    i = 0
+    for ray, count in enumerate(counts):
+        left, colour, depth = 1.0, torch.zeros(3), 0.0
+        for _ in range(count):
+            weight = left * float(-torch.expm1(-density[i] * samples.dt[i]))
+            colour, depth, left = colour + weight * rgb[i], depth + weight * float(samples.t[i]), left - weight
+            i += 1
+        torch.testing.assert_close(seen.rgb[ray], colour + left * behind[ray], rtol=1e-4, atol=1e-5)
+        assert float(seen.opacity[ray]) == pytest.approx(1 - left, abs=1e-5)
+        assert float(seen.depth[ray]) == pytest.approx(depth / (1 - left) if count else 0, rel=1e-4)
+
+
+def test_the_field_is_asked_at_the_samples_in_their_directions(ragged_samples):
+    samples = ragged_samples([2, 3])
+    rays = Rays(torch.randn(2, 3), torch.eye(3)[:2])
+    asked = []
+
+    def field(positions: Tensor, directions: Tensor):
+        asked.append((positions, directions))
+        return torch.ones(5), torch.ones(5, 3)
+
+    VolumeRenderer()(rays, samples, field)
+    ((positions, directions),) = asked
+    for i, ray in enumerate([0, 0, 1, 1, 1]):
+        torch.testing.assert_close(positions[i], rays.origins[ray] + samples.t[i] * rays.directions[ray])
+        assert torch.equal(directions[i], rays.directions[ray])
+
+
+@pytest.mark.parametrize("distance", [0.3, 1.0, 2.5])
+def test_the_depth_of_a_thin_wall_is_its_distance(distance: float):
+    box, rays = Bounds(torch.tensor([[-1.0, -1, 0], [1, 1, 3]])), along_z(2)
+
+    def wall(positions: Tensor, directions: Tensor):
+        return 1e6 * ((positions[:, 2] - distance).abs() < 0.02).float(), torch.ones(len(positions), 3)
+
+    seen = VolumeRenderer("black")(rays, UniformSampler(box, 300)(rays, lambda x: x[:, 0]), wall)
+    torch.testing.assert_close(seen.depth, torch.full((2,), distance), atol=0.03, rtol=0)
+    torch.testing.assert_close(seen.opacity, torch.ones(2))
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.3, 1e6])
+@pytest.mark.parametrize(
+    ("background", "colour"),
+    [("black", (0, 0, 0)), ("white", (1, 1, 1)), ([0.1, 0.5, 1], (0.1, 0.5, 1)), ("scene", SCENE), ("random", SCENE)],
+)
+def test_what_is_not_covered_shows_the_background(background, colour, sigma, ragged_samples):
+    samples = ragged_samples([5])
+    red = torch.tensor([1.0, 0, 0]).repeat(5, 1)
+    seen = VolumeRenderer(background, SCENE)(along_z(1), samples, fixed(torch.full((5,), sigma), red))
+    opacity = -torch.expm1(-sigma * samples.dt.sum())
+    torch.testing.assert_close(seen.opacity[0], opacity)
+    torch.testing.assert_close(seen.rgb[0], opacity * red[0] + (1 - opacity) * torch.tensor(colour).float())
+    assert (float(seen.depth) == 0) == (sigma == 0)
+
+
+def test_random_backgrounds_need_a_generator():
+    renderer = VolumeRenderer("random", SCENE)
+    first, again, other = (renderer.backgrounds(1000, Generator().manual_seed(seed)) for seed in (1, 1, 2))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    assert first.std(0).min() > 0.2 and first.min() >= 0 and first.max() <= 1
+    assert torch.equal(renderer.backgrounds(2), torch.tensor(SCENE).expand(2, 3))
+    plain = VolumeRenderer("white").backgrounds(2, Generator())
+    assert torch.equal(plain, torch.ones(2, 3))
+
+
+@pytest.mark.parametrize(
+    "background", ["green", "", [0.5], [0.1, 0.2, 0.3, 0.4], [0, 0, 1.5], [-0.1, 0, 0], [float("nan")] * 3]
+)
+def test_other_backgrounds_are_refused(background):
+    with pytest.raises(InputError, match="renderer.background"):
+        VolumeRenderer(background)
+
+
+def test_gradients_of_everything_seen(ragged_samples):
+    samples, rays = ragged_samples([3, 0, 4], torch.float64), along_z(3, torch.float64)
+    renderer = VolumeRenderer("white").double()
+    density = (0.2 + 2 * torch.rand(7, dtype=torch.float64)).requires_grad_()
+    rgb = torch.rand(7, 3, dtype=torch.float64, requires_grad=True)
+
+    def look(density: Tensor, rgb: Tensor):
+        seen = renderer(rays, samples, fixed(density, rgb))
+        return seen.rgb, seen.opacity, seen.depth
+
+    assert torch.autograd.gradcheck(look, (density, rgb))

@@ -1,0 +1,114 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.sampler import ImportanceSampler, UniformSampler
+from nerf_lightning.sampler.importance import inverse_cdf
+
+
+@pytest.mark.parametrize("kind", ["random", "one", "none", "sparse"])
+def test_inverse_cdf_inverts_the_cumulated_weights(kind: str):
+    edges = torch.rand(20, 11).cumsum(1)
+    weights = {
+        "random": torch.rand(20, 10),
+        "one": torch.eye(10).repeat(2, 1),
+        "none": torch.zeros(20, 10),
+        "sparse": torch.rand(20, 10) * (torch.rand(20, 10) < 0.3),
+    }[kind]
+    u = torch.rand(20, 40)
+    u[:, :2] = torch.tensor([0.0, 1.0])
+    actual = inverse_cdf(edges, weights, u).numpy()
+    for r in range(20):
+        # The floor lets an empty ray fall back to uniform in the interval's number.
+        cdf = np.concatenate([[0], np.cumsum(weights[r].double().numpy() + 1e-5)])
+        expected = np.interp(u[r].double().numpy(), cdf / cdf[-1], edges[r].double().numpy())
+        # What counts is the probability mass between the two answers: distances jump where there is no weight.
+        mass = np.interp(actual[r], edges[r].double().numpy(), cdf / cdf[-1]) - u[r].double().numpy()
+        assert np.abs(mass).max() < 1e-4
+        if kind in ("random", "none"):
+            np.testing.assert_allclose(actual[r], expected, atol=2e-3)
+        assert actual[r].min() >= edges[r, 0] and actual[r].max() <= edges[r, -1]
+
+
+def ball(radius: float, density: float):
+    return lambda x: density * (x.norm(dim=-1) < radius).float()
+
+
+def along_x(count: int) -> Rays:
+    origins = torch.tensor([-3.0, 0.0, 0.0]).repeat(count, 1)
+    return Rays(origins, torch.tensor([1.0, 0.0, 0.0]).repeat(count, 1))
+
+
+@pytest.mark.parametrize("generator", [None, 5])
+def test_samples_crowd_where_the_density_is(generator: int | None):
+    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    chance = None if generator is None else Generator().manual_seed(generator)
+    samples = ImportanceSampler(box, 32, 64)(along_x(4), ball(0.15, 3.0), chance)
+    x = samples.t - 3
+    assert ((x.abs() < 0.25).float().mean() > 0.65) and ((x.abs() < 0.25).sum() > 4 * 64)
+
+
+def test_nothing_is_looked_for_behind_a_wall():
+    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+
+    def walls(x: Tensor) -> Tensor:
+        return 500.0 * ((x[:, 0] + 0.5).abs() < 0.1) + 500.0 * ((x[:, 0] - 0.5).abs() < 0.1)
+
+    x = ImportanceSampler(box, 40, 80)(along_x(1), walls).t - 3
+    assert ((x + 0.5).abs() < 0.15).sum() > 75
+    assert ((x - 0.5).abs() < 0.15).sum() < 12
+
+
+DENSITIES = {
+    "nothing": lambda x: torch.zeros(len(x)),
+    "ball": ball(0.4, 5.0),
+    "wall": lambda x: 1e6 * (x[:, 0] > 0).float(),
+    "everywhere": lambda x: torch.ones(len(x)),
+}
+
+
+@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("training", [False, True])
+def test_coarse_and_fine_together_tile_each_ray(density, unbounded, training, box: Bounds, rays: Rays):
+    bounds = replace(box, unbounded=unbounded)
+    chance = Generator().manual_seed(1) if training else None
+    samples = ImportanceSampler(bounds, 12, 20)(rays, DENSITIES[density], chance)
+    start, end = (samples.t - samples.dt / 2), (samples.t + samples.dt / 2)
+    near, far = bounds.near_far(rays)
+    assert (samples.dt >= 0).all()
+    for r in range(len(rays)):
+        part = slice(int(samples.offsets[r]), int(samples.offsets[r + 1]))
+        if near[r] >= far[r]:
+            assert part.start == part.stop
+            continue
+        assert part.stop - part.start == 12 + 20
+        torch.testing.assert_close(start[part][1:], end[part][:-1], rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(start[part][0], near[r], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(end[part][-1], far[r], rtol=1e-4, atol=1e-4)
+
+
+def test_the_first_pass_is_a_uniform_one_without_gradient(box: Bounds, rays: Rays):
+    asked = []
+    level = torch.tensor(2.0, requires_grad=True)
+
+    def density(x: Tensor) -> Tensor:
+        asked.append(x)
+        return level.expand(len(x))
+
+    samples = ImportanceSampler(box, 12, 20)(rays, density)
+    assert len(asked) == 1 and not samples.t.requires_grad
+    torch.testing.assert_close(asked[0], UniformSampler(box, 12)(rays, density).positions(rays))
+
+
+def test_chance_comes_from_the_generator_alone(box: Bounds, rays: Rays):
+    sampler = ImportanceSampler(box, 12, 20)
+    draws = [
+        sampler(rays, DENSITIES["ball"], g).t for g in (None, None, *(Generator().manual_seed(i) for i in (1, 1, 2)))
+    ]
+    assert torch.equal(draws[0], draws[1]) and torch.equal(draws[2], draws[3])
+    assert not torch.equal(draws[0], draws[2]) and not torch.equal(draws[2], draws[4])
