@@ -105,6 +105,6 @@ class OccupancySampler(Sampler):
         n = self.resolution
         corner = torch.stack([cells // (n * n), cells // n % n, cells % n], dim=-1)
         unit = (corner + torch.rand(corner.shape, generator=generator, device=device)) / n
-        seen = torch.cat([density(part) for part in self.bounds.to_world(unit).split(1 << 16)]) * self.step_length
+        seen = torch.cat([density(part) for part in self.bounds.to_world(unit).split(1 << 15)]) * self.step_length
         self.thickness[cells] = torch.maximum(self.thickness[cells] * self.decay, seen)
         self.occupied = self.thickness > min(self.threshold, float(self.thickness.mean()))

@@ -1,0 +1,148 @@
+from itertools import islice
+
+import pytest
+import torch
+
+from nerf_lightning.cameras import Bounds, Cameras, Rays, orbit_around
+from nerf_lightning.dataset import RayBatch, RayDataModule, Scene, Views
+from nerf_lightning.dataset.loader import StepLoader
+from nerf_lightning.dataset.rays import draw_rays
+from nerf_lightning.errors import InputError
+from nerf_lightning.seeding import step_generator
+
+VIEWS, HEIGHT, WIDTH = 3, 4, 6
+
+
+def labelled(count: int) -> Views:
+    """Every pixel's colour says which one it is: (view, row, column, 255)."""
+    view, row, col = torch.meshgrid(*(torch.arange(n) for n in (count, HEIGHT, WIDTH)), indexing="ij")
+    images = torch.stack([view, row, col, torch.full_like(view, 255)], dim=-1).to(torch.uint8)
+    c2w = orbit_around(torch.zeros(3), torch.tensor([0.0, 0, 1]), 4.0, 0.3, count)
+    K = torch.tensor([[7.0, 0, 3.2], [0, 8, 1.7], [0, 0, 1]]) * (1 + 0.1 * torch.arange(count)[:, None, None])
+    K[:, 2, 2] = 1
+    return Views(images, Cameras(K, c2w, WIDTH, HEIGHT))
+
+
+@pytest.fixture
+def scene() -> Scene:
+    train, val = labelled(VIEWS), labelled(2)
+    return Scene("labels", "test", train, val, val.cameras, Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])))
+
+
+def test_drawn_colours_belong_to_drawn_rays(scene: Scene):
+    batch = draw_rays(scene.train, 200, torch.Generator().manual_seed(0))
+    assert len(batch.rays) == len(batch.pixels) == 200
+    for i, (view, row, col, _) in enumerate(batch.pixels.tolist()):
+        K, c2w = scene.train.cameras.K[view].double(), scene.train.cameras.c2w[view].double()
+        inside = torch.linalg.inv(K) @ torch.tensor([col + 0.5, row + 0.5, 1]).double()
+        direction = c2w[:3, :3] @ inside
+        torch.testing.assert_close(batch.rays.origins[i].double(), c2w[:3, 3], atol=1e-6, rtol=0)
+        torch.testing.assert_close(batch.rays.directions[i].double(), direction / direction.norm(), atol=1e-6, rtol=0)
+
+
+def test_all_pixels_of_all_views_are_equally_likely(scene: Scene):
+    pixels = draw_rays(scene.train, 36_000, torch.Generator().manual_seed(0)).pixels.long()
+    counts = torch.bincount((pixels[:, 0] * HEIGHT + pixels[:, 1]) * WIDTH + pixels[:, 2])
+    assert len(counts) == VIEWS * HEIGHT * WIDTH
+    expected = 36_000 / len(counts)
+    chi_square = float(((counts - expected) ** 2 / expected).sum())
+    assert abs(chi_square - 71) < 5 * (2 * 71) ** 0.5  # 71 degrees of freedom
+
+
+def test_a_batch_depends_on_seed_and_step_alone(scene: Scene):
+    def pixels(seed: int, step: int) -> list:
+        return RayDataModule(scene, rays=50, seed=seed).draw(step).pixels.tolist()
+
+    assert pixels(0, 7) == pixels(0, 7)
+    assert len({str(pixels(seed, step)) for seed in (0, 1) for step in range(20)}) == 40
+
+
+def test_data_and_model_draw_apart(scene: Scene):
+    drawn = RayDataModule(scene, rays=50, seed=2).draw(5).pixels
+    assert torch.equal(drawn, draw_rays(scene.train, 50, step_generator(2, 0, 5)).pixels)
+    assert not torch.equal(drawn, draw_rays(scene.train, 50, step_generator(2, 1, 5)).pixels)
+
+
+def test_held_out_views_come_whole_and_in_order(scene: Scene):
+    data = RayDataModule(scene)
+    batches = list(data.test_dataloader())
+    assert len(batches) == len(data.test_dataloader()) == data.held_out_views == 2
+    for view, batch in enumerate(batches):
+        assert (batch.height, batch.width) == (HEIGHT, WIDTH)
+        assert torch.equal(batch.pixels.view(HEIGHT, WIDTH, 4), scene.val.images[view])
+        assert torch.equal(batch.rays.directions, scene.val.cameras.view_rays(view).directions)
+
+
+@pytest.mark.parametrize(("alpha", "expected"), [(255, 0.2), (0, 0.5), (51, 0.2 * 0.2 + 0.8 * 0.5)])
+def test_the_target_is_the_pixel_over_the_background(alpha: int, expected: float):
+    rays = Rays(torch.zeros(2, 3), torch.eye(3)[:2])
+    batch = RayBatch(rays, torch.tensor([[51, 51, 51, alpha], [255, 0, 0, 255]], dtype=torch.uint8))
+    target = batch.target(torch.full((2, 3), 0.5))
+    torch.testing.assert_close(target, torch.tensor([[expected] * 3, [1.0, 0, 0]]))
+
+
+def test_the_target_without_alpha_is_the_pixel():
+    batch = RayBatch(Rays(torch.zeros(1, 3), torch.eye(3)[:1]), torch.tensor([[0, 51, 255]], dtype=torch.uint8))
+    torch.testing.assert_close(batch.target(torch.ones(1, 3)), torch.tensor([[0, 0.2, 1.0]]))
+
+
+@pytest.mark.parametrize("samples_per_ray", [0.5, 3.0, 40.0])
+@pytest.mark.parametrize("first", [100, 1000])
+def test_the_number_of_rays_settles_where_their_samples_meet_the_aim(first: int, samples_per_ray: float, scene: Scene):
+    data = RayDataModule(scene, rays=first, samples=6000)
+    most = 0
+    for _ in range(60):
+        data.adapt(round(data.rays * samples_per_ray))
+        most = max(most, data.rays)
+    aim = max(64, min(6000 / samples_per_ray, first * 32))
+    assert abs(data.rays - aim) <= 0.01 * aim + 2
+    assert most <= max(first, 1.02 * aim), "without overshoot"
+    assert len(data.draw(0).pixels) == data.rays
+
+
+@pytest.mark.parametrize(("drawn", "end"), [(0, 3200), (10**9, 64)])
+def test_the_number_of_rays_stays_in_bounds(drawn: int, end: int, scene: Scene):
+    data = RayDataModule(scene, rays=100, samples=6000)
+    for _ in range(60):
+        data.adapt(drawn)
+        assert 64 <= data.rays <= 3200
+    assert abs(data.rays - end) <= 2
+
+
+def test_without_an_aim_the_number_of_rays_stays(scene: Scene):
+    data = RayDataModule(scene, rays=100)
+    data.adapt(10)
+    assert data.rays == 100
+
+
+def test_the_number_of_rays_is_kept_in_checkpoints(scene: Scene):
+    data, other = (RayDataModule(scene, rays=100, samples=6000) for _ in range(2))
+    data.adapt(500)
+    other.load_state_dict(data.state_dict())
+    assert other.rays == data.rays != 100
+    assert torch.equal(other.draw(3).pixels, data.draw(3).pixels)
+    other.adapt(0), data.adapt(0)
+    assert other.rays == data.rays
+
+
+@pytest.mark.parametrize(("rays", "samples", "key"), [(0, None, "dataset.rays"), (5, 0, "dataset.samples")])
+def test_less_than_one_is_refused(rays, samples, key, scene: Scene):
+    with pytest.raises(InputError, match=key):
+        RayDataModule(scene, rays, samples)
+
+
+def test_the_loader_asks_for_the_step_at_each_batch(scene: Scene):
+    steps = iter([0, 1, 5, 5])
+    loader = StepLoader(lambda step: step * 10, lambda: next(steps))
+    assert list(islice(loader, 4)) == [0, 10, 50, 50]
+    assert len(loader) > 10**9
+    first = next(iter(RayDataModule(scene, rays=5, seed=1).train_dataloader()))
+    assert torch.equal(first.pixels, RayDataModule(scene, rays=5, seed=1).draw(0).pixels)
+
+
+def test_photos_may_lie_in_memory_in_any_order(scene: Scene):
+    """numpy files in Fortran order are read without a copy."""
+    images = scene.train.images
+    turned = Views(images.permute(3, 2, 1, 0).contiguous().permute(3, 2, 1, 0), scene.train.cameras)
+    expected = draw_rays(scene.train, 50, torch.Generator().manual_seed(0))
+    assert torch.equal(draw_rays(turned, 50, torch.Generator().manual_seed(0)).pixels, expected.pixels)

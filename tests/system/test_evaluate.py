@@ -1,0 +1,112 @@
+import functools
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerf_lightning.cameras import Bounds, Cameras, Rays
+from nerf_lightning.dataset import Picture, PictureBatch, PixelDataModule, ViewBatch
+from nerf_lightning.model import Field, PictureField
+from nerf_lightning.renderer import VolumeRenderer
+from nerf_lightning.sampler import UniformSampler
+from nerf_lightning.system import NeRF2D, NeRF3D, constant, nerf2d, nerf3d
+
+ADAM = functools.partial(torch.optim.Adam, lr=0.01)
+
+
+class Ramp(PictureField):
+    """Red grows to the right, green downward; blue is more than a picture can show."""
+
+    def forward(self, uv: Tensor) -> Tensor:
+        return torch.cat([uv, torch.full_like(uv[:, :1], 1.5)], dim=1)
+
+
+def picture_view(height: int, width: int, error: float) -> PictureBatch:
+    image = torch.zeros(height, width, 3, dtype=torch.uint8)
+    view = PixelDataModule(Picture("p", "test", image)).held_out(0)
+    truth = torch.cat([view.uv, torch.ones_like(view.uv[:, :1])], dim=1) + error
+    return PictureBatch(view.uv, truth, height, width)
+
+
+@pytest.mark.parametrize(("error", "expected"), [(0.1, 20), (0.01, 40)])
+@pytest.mark.parametrize("chunk", [7, 10_000])
+def test_a_picture_is_judged_as_it_is_shown(error, expected, chunk, monkeypatch):
+    monkeypatch.setattr(nerf2d, "RENDER_CHUNK", chunk)
+    result = NeRF2D(Ramp(), ADAM, constant).evaluate(picture_view(12, 15, error))
+    assert result.psnr == pytest.approx(expected, abs=1e-3)
+    assert result.rgb.shape == result.truth.shape == (12, 15, 3)
+    assert result.rgb.max() <= 1 and (result.rgb[..., 2] == 1).all()
+    torch.testing.assert_close(result.rgb[0, :, 0], (torch.arange(15) + 0.5) / 15)
+    torch.testing.assert_close(result.rgb[:, 0, 1], (torch.arange(12) + 0.5) / 12)
+    assert 0 < result.ssim <= 1 and result.seconds > 0
+    assert result.depth is None and result.opacity is None
+
+
+def test_the_test_step_reports_what_evaluate_finds():
+    outcome = NeRF2D(Ramp(), ADAM, constant).test_step(picture_view(4, 5, 0.1), 0)
+    assert outcome["psnr"] == pytest.approx(20, abs=1e-3) and math.isnan(outcome["ssim"])
+
+
+class Slab(Field):
+    """An opaque red slab at z > 0.5, where x > 0."""
+
+    def features(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        return 1e6 * ((positions[:, 2] > 0.5) & (positions[:, 0] > 0)).float(), positions
+
+    def colour(self, features: Tensor, directions: Tensor) -> Tensor:
+        return torch.tensor([1.0, 0, 0]).expand(len(features), 3)
+
+
+@pytest.fixture
+def slab() -> NeRF3D:
+    bounds = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    return NeRF3D(Slab(bounds), UniformSampler(bounds, 200), VolumeRenderer("white"), ADAM, constant)
+
+
+def slab_view(alpha: int) -> ViewBatch:
+    """Blue where there is nothing, seen from z = -3; truth red at the right."""
+    K = torch.tensor([[[40.0, 0, 8], [0, 40, 6], [0, 0, 1]]])
+    c2w = torch.eye(4)[None].clone()
+    c2w[0, 2, 3] = -3
+    cameras = Cameras(K, c2w, 16, 12)
+    image = torch.tensor([0, 0, 255, alpha]).repeat(12, 16, 1)
+    image[:, 8:] = torch.tensor([255, 0, 0, 255])
+    return ViewBatch(cameras.view_rays(0), image.to(torch.uint8).flatten(0, 1), 12, 16)
+
+
+@pytest.mark.parametrize(("rays", "samples"), [(50, 10**6), (10**6, 1000), (7, 1), (10**6, 10**6)])
+def test_a_view_is_rendered_in_parts_of_any_size(rays, samples, slab: NeRF3D, monkeypatch):
+    monkeypatch.setattr(nerf3d, "RENDER_RAYS", rays)
+    monkeypatch.setattr(nerf3d, "RENDER_SAMPLES", samples)
+    result = slab.evaluate(slab_view(alpha=0))
+    assert result.psnr > 60, "blue under alpha 0 is not seen: the background is"
+    assert result.ssim == pytest.approx(1, abs=1e-4)
+    assert (result.opacity[:, 8:] > 0.999).all() and (result.opacity[:, :8] == 0).all()
+    z = slab_view(0).rays.directions[:, 2].view(12, 16)[:, 8:]
+    torch.testing.assert_close(result.depth[:, 8:] * z, torch.full_like(z, 3.5), atol=0.02, rtol=0)
+
+
+def test_a_wrong_half_costs_what_it_should(slab: NeRF3D):
+    result = slab.evaluate(
+        slab_view(alpha=255)
+    )  # truth blue, rendered white: two of three channels off on half the view
+    assert result.psnr == pytest.approx(-10 * math.log10(1 / 3), abs=1e-3)
+
+
+def test_no_rays_meet_the_bounds(slab: NeRF3D):
+    away = Rays(torch.full((3, 3), 5.0), torch.eye(3))
+    seen = slab.render(away)
+    assert torch.equal(seen.rgb, torch.ones(3, 3)) and (seen.depth == 0).all()
+
+
+def test_rendering_leaves_no_gradient(slab: NeRF3D):
+    slab.field.weight = torch.nn.Parameter(torch.ones(()))
+    assert not slab.render(slab_view(0).rays[:5]).rgb.requires_grad
+
+
+def test_the_learning_rate_starts_from_the_optimisers_own():
+    system = NeRF2D(Ramp(), functools.partial(torch.optim.SGD, lr=0.25), constant)
+    system.field.weight = torch.nn.Parameter(torch.ones(2))
+    (group,) = system.configure_optimizers().param_groups
+    assert group["initial_lr"] == group["lr"] == 0.25
