@@ -62,19 +62,14 @@ class Bounds:
         """
         if self.unbounded:
             size = float(self.half_size.max())
-            near = torch.full_like(rays.origins[:, 0], 0.02 * size)
-            far = torch.full_like(near, UNBOUNDED_REACH * size)
-        else:
-            # A zero component never crosses its slab: nudge it, so that the division gives +-huge instead of nan.
-            safe = torch.where(rays.directions.abs() < 1e-9, torch.full_like(rays.directions, 1e-9), rays.directions)
-            crossings = (self.aabb[:, None] - rays.origins) / safe
-            near = crossings.amin(0).amax(-1).clamp_min(0.0)
-            far = crossings.amax(0).amin(-1)
-        if self.near is not None:
-            near = near.clamp_min(self.near)
-        if self.far is not None:
-            far = far.clamp_max(self.far)
-        return near, far
+            near = torch.full_like(rays.origins[:, 0], 0.02 * size if self.near is None else self.near)
+            return near, torch.full_like(near, UNBOUNDED_REACH * size if self.far is None else self.far)
+        # A zero component never crosses its slab: nudge it, so that the division gives +-huge instead of nan.
+        safe = torch.where(rays.directions.abs() < 1e-9, torch.full_like(rays.directions, 1e-9), rays.directions)
+        crossings = (self.aabb[:, None] - rays.origins) / safe
+        near = crossings.amin(0).amax(-1).clamp_min(0.0 if self.near is None else max(self.near, 0.0))
+        far = crossings.amax(0).amin(-1)
+        return near, far if self.far is None else far.clamp_max(self.far)
 
     def distances(
         self, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "*#R S"]

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from nerf_lightning.cameras.cameras import Cameras
 
-
 ONE_SIDED = 0.35
 """Length of the mean viewing direction, less its vertical part, beyond which cameras stand on one side of the subject."""
 
@@ -31,11 +30,12 @@ def focus_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
     Solves sum_v (I - d_v d_v^T) (x - o_v) = 0; a small ridge pulls toward the mean centre, so that parallel axes
     (one view, a flat sweep) still give a finite answer.
     """
-    centres, axes = c2w[:, :3, 3].double(), c2w[:, :3, 2].double()
+    centres = c2w[:, :3, 3].double()
+    axes = torch.nn.functional.normalize(c2w[:, :3, 2].double(), dim=-1)
     eye = torch.eye(3, dtype=torch.float64, device=c2w.device)
     projectors = eye - axes[:, :, None] * axes[:, None, :]
     mean = centres.mean(0)
-    A = projectors.mean(0) + 1e-6 * eye
+    A = projectors.mean(0) + 1e-8 * eye
     b = (projectors @ (centres - mean)[:, :, None]).mean(0)[:, 0]
     return (mean + torch.linalg.solve(A, b)).to(c2w.dtype)
 

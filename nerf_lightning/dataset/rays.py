@@ -53,8 +53,7 @@ def draw_rays(views: Views, count: int, generator: torch.Generator) -> RayBatch:
     flat = torch.randint(len(views) * height * width, (count,), generator=generator)
     view, pixel = flat // (height * width), flat % (height * width)
     row, col = pixel // width, pixel % width
-    pixels = views.images.view(-1, views.images.shape[-1])[flat]
-    return RayBatch(views.cameras.rays(view, row, col), pixels)
+    return RayBatch(views.cameras.rays(view, row, col), views.images[view, row, col])
 
 
 class RayDataModule(L.LightningDataModule):

@@ -22,7 +22,7 @@ class OccupancySampler(Sampler):
     """Steps of one length through the bounds, kept only in cells where density was found.
 
     Each cell holds a decaying maximum of the optical thickness (density times step) seen in it at random places; a cell is
-    occupied while that stands above the lower of `threshold` and the grid's mean.
+    occupied while that stands above the lower of `threshold` and half the grid's mean.
 
     Args:
         bounds: where the content is.
@@ -65,7 +65,8 @@ class OccupancySampler(Sampler):
     def edges(self, rays: Rays, generator: Generator | None) -> tuple[Float[Tensor, "R S_plus_1"], Bool[Tensor, "R S"]]:
         """All candidate intervals of each ray, and which of them lie within the bounds."""
         near, far = self.bounds.near_far(rays)
-        steps = torch.arange(self.samples + 1, device=near.device)
+        # One more than the steps: the first one may be cut short by the shift, and the last must reach the far end.
+        steps = torch.arange(self.samples + 2, device=near.device)
         shift = torch.zeros_like(near)
         if generator is not None:
             shift = torch.rand(near.shape, generator=generator, device=near.device)
@@ -107,4 +108,4 @@ class OccupancySampler(Sampler):
         unit = (corner + torch.rand(corner.shape, generator=generator, device=device)) / n
         seen = torch.cat([density(part) for part in self.bounds.to_world(unit).split(1 << 15)]) * self.step_length
         self.thickness[cells] = torch.maximum(self.thickness[cells] * self.decay, seen)
-        self.occupied = self.thickness > min(self.threshold, float(self.thickness.mean()))
+        self.occupied = self.thickness > min(self.threshold, 0.5 * float(self.thickness.mean()))

@@ -78,13 +78,13 @@ def test_contraction_keeps_the_box_whole_and_everything_else_around_it():
 
 def test_contraction_is_continuous_and_moves_outward_along_a_ray():
     bounds = Bounds(BOX.double(), unbounded=True)
-    t = torch.linspace(0, 30, 30_001).double()[:, None]
+    t = torch.linspace(0, 30, 3001).double()[:, None]
     for direction in some_rays(20).directions.double():
         outward = (bounds.to_unit(bounds.centre + t * direction) - 0.5).abs().amax(-1)
         assert (outward.diff() > 0).all()
         passing = bounds.to_unit(BOX[1] * 1.3 + (t - 15) * direction)
         # In the box a step of t moves t / (4 half-sizes); the contraction moves nothing by more than twice that.
-        assert passing.diff(dim=0).abs().max() <= 2 * 0.001 / (4 * bounds.half_size.min())
+        assert passing.diff(dim=0).abs().max() <= 2 * 0.01 / (4 * bounds.half_size.min())
 
 
 @pytest.mark.parametrize(("near", "far"), [(0.5, None), (None, 2.0), (0.5, 2.0), (9.0, None)])

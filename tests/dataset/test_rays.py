@@ -121,7 +121,8 @@ def test_the_number_of_rays_is_kept_in_checkpoints(scene: Scene):
     other.load_state_dict(data.state_dict())
     assert other.rays == data.rays != 100
     assert torch.equal(other.draw(3).pixels, data.draw(3).pixels)
-    other.adapt(0), data.adapt(0)
+    other.adapt(0)
+    data.adapt(0)
     assert other.rays == data.rays
 
 

@@ -52,6 +52,20 @@ def test_samples_crowd_where_the_density_is(generator: int | None):
     assert ((x.abs() < 0.25).float().mean() > 0.65) and ((x.abs() < 0.25).sum() > 4 * 64)
 
 
+@pytest.mark.parametrize("training", [False, True])
+def test_fine_samples_are_spread_over_equal_shares_of_the_weight(training: bool):
+    """With a single interval and no weight in it, shares of the weight are shares of the length."""
+    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    chance = Generator().manual_seed(1) if training else None
+    samples = ImportanceSampler(box, 1, 20)(along_x(200), DENSITIES["nothing"], chance)
+    share = (samples.t + samples.dt / 2 - 2).view(200, 21)[:, :-1] / 2 * 20 - torch.arange(20)
+    if training:
+        assert -1e-4 < share.min() < 0.01 and 0.99 < share.max() < 1.0001
+        assert abs(float(share.mean()) - 0.5) < 0.03
+    else:
+        torch.testing.assert_close(share, torch.full((200, 20), 0.5), atol=1e-3, rtol=0)
+
+
 def test_nothing_is_looked_for_behind_a_wall():
     box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 

@@ -176,6 +176,14 @@ def test_a_field_of_one_density_everywhere_keeps_all_its_cells(density: float):
     assert sampler.occupied.all()
 
 
+@pytest.mark.parametrize(("share", "kept"), [(0.5, False), (2.0, True)])
+def test_the_threshold_is_the_optical_thickness_of_a_step(share: float, kept: bool):
+    sampler = OccupancySampler(CUBE, samples=100, resolution=4, threshold=0.02)
+    thin = share * 0.02 / (2 * math.sqrt(3) / 100)
+    sampler.update(0, lambda x: torch.where(x[:, 0] < 0, thin, 1000.0), seeded())
+    assert sampler.occupied.tolist() == [kept] * 32 + [True] * 32
+
+
 def test_an_unbounded_scene_is_learned_outside_its_box_too():
     sampler = OccupancySampler(replace(CUBE, unbounded=True), samples=64, resolution=16)
     sampler.update(0, lambda x: 10.0 * (x[:, 0] > 3).float(), seeded())

@@ -1,0 +1,91 @@
+import functools
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
+
+import lightning as L
+import pytest
+import torch
+
+from nerf_lightning.dataset import Picture, PixelDataModule
+from nerf_lightning.model import PictureField
+from nerf_lightning.system import NeRF2D, StepStats, ViewResult, constant
+
+
+class Clock:
+    """Stands in for time.perf_counter; moves only when told."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(time, "perf_counter", clock)
+    return clock
+
+
+class Grey(PictureField):
+    def __init__(self):
+        super().__init__()
+        self.level = torch.nn.Parameter(torch.tensor(0.5))
+
+    def forward(self, uv: torch.Tensor) -> torch.Tensor:
+        return self.level.expand(len(uv), 3)
+
+
+class Scripted(NeRF2D):
+    """Measures what it is told, and notes what it was asked."""
+
+    def __init__(self):
+        super().__init__(Grey(), functools.partial(torch.optim.SGD, lr=0.1), constant)
+        self.psnrs = iter(range(10, 1000))
+        self.asked: list[Any] = []
+        self.stats = StepStats(0.01, 30, 90)
+        self.groups = [{"lr": 0.1}]
+
+    @property
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        return self.groups
+
+    def evaluate(self, view: Any) -> ViewResult:
+        self.asked.append(view)
+        time.perf_counter.wait(50)  # slow, which must not count
+        picture = torch.rand(12, 16, 3)
+        return ViewResult(picture, picture, float(next(self.psnrs)), 0.5, 50.0)
+
+
+@pytest.fixture
+def system() -> Scripted:
+    return Scripted()
+
+
+class Data(PixelDataModule):
+    held_out_views = 10
+
+    def held_out(self, view: int) -> int:
+        return view
+
+
+@pytest.fixture
+def trainer_with(tmp_path: Path) -> Callable[..., L.Trainer]:
+    """A trainer with the given callbacks and nothing behind it."""
+
+    def make(*callbacks: L.Callback) -> L.Trainer:
+        trainer = Mock(spec=L.Trainer)
+        trainer.callbacks = list(callbacks)
+        trainer.datamodule = Data(Picture("grey", "test", torch.zeros(4, 4, 3, dtype=torch.uint8)))
+        trainer.global_step, trainer.should_stop = 0, False
+        trainer.default_root_dir = str(tmp_path)
+        trainer.logger = Mock()
+        return trainer
+
+    return make

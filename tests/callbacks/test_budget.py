@@ -1,0 +1,99 @@
+import pytest
+
+from nerf_lightning.callbacks import Budget
+from nerf_lightning.errors import InputError
+
+
+def test_the_clock_runs_from_the_first_step_and_stands_while_paused(clock, system, trainer_with):
+    budget = Budget(seconds=100)
+    trainer = trainer_with(budget)
+    clock.wait(7)
+    assert budget.seconds == 0
+    budget.on_train_start(trainer, system)
+    clock.wait(10)
+    assert budget.seconds == 10
+    with budget.paused():
+        clock.wait(1000)
+        assert budget.seconds == 10
+        with budget.paused():
+            clock.wait(1000)
+        clock.wait(1000)
+        assert budget.seconds == 10, "the inner pause does not start the clock"
+    clock.wait(5)
+    assert budget.seconds == 15
+    with pytest.raises(ZeroDivisionError), budget.paused():
+        clock.wait(1000)
+        raise ZeroDivisionError
+    clock.wait(1)
+    assert budget.seconds == 16, "runs again after an error"
+    budget.on_train_end(trainer, system)
+    clock.wait(1000)
+    with budget.paused():
+        clock.wait(1000)
+    clock.wait(1000)
+    assert budget.seconds == 16, "a pause after the end does not start it"
+
+
+@pytest.mark.parametrize(
+    ("steps", "seconds", "step", "spent", "expected"),
+    [
+        (200, None, 0, 30, 0),
+        (200, None, 50, 30, 0.25),
+        (200, None, 300, 30, 1),
+        (None, 60, 50, 30, 0.5),
+        (None, 60, 50, 90, 1),
+        (200, 60, 50, 30, 0.5),
+        (200, 60, 150, 30, 0.75),
+        (200, 60, 50, 61, 1),
+    ],
+)
+def test_progress_follows_the_limit_that_is_nearer(steps, seconds, step, spent, expected, clock, system, trainer_with):
+    budget = Budget(steps, seconds)
+    budget.on_train_start(trainer_with(budget), system)
+    clock.wait(spent)
+    assert budget.progress(step) == expected
+
+
+def test_training_stops_when_the_budget_is_spent(clock, system, trainer_with):
+    budget = Budget(steps=3, seconds=100)
+    trainer = trainer_with(budget)
+    budget.on_train_start(trainer, system)
+    for step, progress in ((1, 1 / 3), (2, 2 / 3), (3, 1)):
+        budget.on_train_batch_start(trainer, system, None, 0)
+        assert system.progress == (step - 1) / 3
+        assert not trainer.should_stop
+        trainer.global_step = step
+        budget.on_train_batch_end(trainer, system, None, None, 0)
+        assert system.progress == progress
+    assert trainer.should_stop
+
+
+def test_a_resumed_run_goes_on_where_it_stopped(clock, system, trainer_with):
+    first, second = Budget(seconds=20), Budget(seconds=20)
+    first.on_train_start(trainer_with(first), system)
+    clock.wait(15)
+    second.load_state_dict(first.state_dict())
+    clock.wait(1000)
+    trainer = trainer_with(second)
+    second.on_train_start(trainer, system)
+    assert second.seconds == 15 and not trainer.should_stop
+    clock.wait(5)
+    third = Budget(seconds=20)
+    third.load_state_dict(second.state_dict())
+    third.on_train_start(trainer, system)
+    assert trainer.should_stop, "a finished run has nothing left"
+
+
+@pytest.mark.parametrize(
+    ("steps", "seconds", "key"), [(None, None, "budget"), (0, None, "steps"), (-1, 5, "steps"), (5, 0.0, "seconds")]
+)
+def test_a_budget_must_allow_something(steps, seconds, key):
+    with pytest.raises(InputError, match=key):
+        Budget(steps, seconds)
+
+
+def test_a_trainer_needs_a_budget(trainer_with):
+    budget = Budget(steps=1)
+    assert Budget.of(trainer_with(budget)) is budget
+    with pytest.raises(RuntimeError, match="Budget"):
+        Budget.of(trainer_with())

@@ -1,0 +1,74 @@
+import pytest
+
+from nerf_lightning.callbacks import Budget, HeldOut
+from nerf_lightning.callbacks.heldout import evenly
+from nerf_lightning.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("total", "count", "expected"),
+    [
+        (5, None, [0, 1, 2, 3, 4]),
+        (5, 9, [0, 1, 2, 3, 4]),
+        (5, 5, [0, 1, 2, 3, 4]),
+        (5, 1, [2]),
+        (9, 3, [1, 4, 7]),
+        (100, 2, [24, 74]),
+    ],
+)
+def test_evenly(total, count, expected):
+    assert evenly(total, count) == expected
+
+
+def test_evenly_never_takes_a_view_twice_and_spreads_them():
+    for total in range(1, 60):
+        for count in range(1, total):
+            chosen = evenly(total, count)
+            assert len(set(chosen)) == count and chosen == sorted(chosen)
+            assert chosen[0] >= 0 and chosen[-1] < total
+            gaps = [b - a for a, b in zip([-1, *chosen], [*chosen, total], strict=True)]
+            assert max(gaps) <= total / count + 1.5
+
+
+def test_measurements_come_at_their_fractions_with_the_clock_stopped(clock, system, trainer_with):
+    budget, held_out = Budget(steps=10), HeldOut([0.2, 0.5, 0.55], views=2)
+    trainer = trainer_with(budget, held_out)
+    budget.on_train_start(trainer, system)
+    assert held_out.latest is None and held_out.planned(trainer) == 6
+    for step in range(1, 11):
+        clock.wait(1)
+        trainer.global_step = step
+        budget.on_train_batch_end(trainer, system, None, None, 0)
+        held_out.on_train_batch_end(trainer, system, None, None, 0)
+    # Two views a time: 10 and 11 dB, then 12 and 13, then 14 and 15.
+    assert held_out.curve == [[2, 2, 10.5], [5, 5, 12.5], [6, 6, 14.5]]
+    assert system.asked == [2, 7] * 3
+    assert held_out.latest == 14.5 and held_out.view_seconds == 50 and held_out.planned(trainer) == 0
+    assert budget.seconds == 10
+
+
+def test_a_step_that_passes_several_marks_measures_once(clock, system, trainer_with):
+    budget, held_out = Budget(steps=10), HeldOut([0.2, 0.5, 0.55], views=1)
+    trainer = trainer_with(budget, held_out)
+    system.progress, trainer.global_step = 0.52, 5
+    held_out.on_train_batch_end(trainer, system, None, None, 0)
+    assert held_out.curve == [[0, 5, 10], [0, 5, 10]] and len(system.asked) == 1
+    resumed = HeldOut([0.2, 0.5, 0.55], views=1)
+    resumed.load_state_dict(held_out.state_dict())
+    resumed.on_train_batch_end(trainer, system, None, None, 0)
+    assert len(resumed.curve) == 2, "what was measured before the pause is not measured again"
+
+
+def test_the_end_is_left_to_the_test(clock, system, trainer_with):
+    budget, held_out = Budget(steps=10), HeldOut([0.5])
+    system.progress = 1.0
+    held_out.on_train_batch_end(trainer_with(budget, held_out), system, None, None, 0)
+    assert held_out.curve == [] and system.asked == []
+
+
+@pytest.mark.parametrize(
+    ("at", "views", "key"), [([0.0], None, "at"), ([1.0], None, "at"), ([0.5, 0.2], None, "at"), ([0.5], 0, "views")]
+)
+def test_what_cannot_be_measured_is_refused(at, views, key):
+    with pytest.raises(InputError, match=f"callbacks.heldout.{key}"):
+        HeldOut(at, views)

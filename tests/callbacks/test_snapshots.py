@@ -1,0 +1,40 @@
+import pytest
+
+from nerf_lightning.callbacks import Budget, Snapshots
+from nerf_lightning.callbacks.snapshots import log_spaced
+from nerf_lightning.errors import InputError
+
+
+def test_log_spaced():
+    assert [step for step in range(3000) if log_spaced(step)] == [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000]
+
+
+@pytest.mark.parametrize(("steps", "expected"), [(None, [10, 20, 50, 100]), ([1, 7], [1, 7]), ([], [])])
+def test_due(steps, expected):
+    snapshots = Snapshots(steps=steps)
+    assert [step for step in range(150) if snapshots.due(step)] == expected
+
+
+def test_pictures_are_written_when_due_and_at_the_end_without_costing_training_time(
+    clock, system, trainer_with, tmp_path
+):
+    budget, snapshots = Budget(steps=9), Snapshots("pictures", steps=[2, 4], view=3)
+    trainer = trainer_with(budget, snapshots)
+    snapshots.setup(trainer, system, "fit")
+    budget.on_train_start(trainer, system)
+    for trainer.global_step in range(1, 6):
+        clock.wait(1)
+        snapshots.on_train_batch_end(trainer, system, None, None, 0)
+    snapshots.on_train_end(trainer, system)
+    names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
+    assert names == ["step_0000002.png", "step_0000004.png", "step_0000005.png"]
+    assert system.asked == [3, 3, 3] and budget.seconds == 5
+    trainer.global_step = 4
+    snapshots.on_train_end(trainer, system)
+    assert len(system.asked) == 3, "what is there already is not taken again"
+
+
+@pytest.mark.parametrize("view", [-1, 10])
+def test_a_view_that_is_not_there_is_refused(view, system, trainer_with):
+    with pytest.raises(InputError, match="callbacks.snapshots.view"):
+        Snapshots(view=view).setup(trainer_with(), system, "fit")
