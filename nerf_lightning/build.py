@@ -1,5 +1,6 @@
 """From configuration to objects. Nothing else in the package instantiates from a config."""
 
+import inspect
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,10 +34,7 @@ def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
     missing = sorted(OmegaConf.missing_keys(node))
     if missing:
         raise InputError("config", missing[0], "nothing", "a value", f"give {missing[0]}=...")
-    try:
-        target = hydra.utils.get_object(node["_target_"])
-    except (ImportError, AttributeError, ValueError, ConfigKeyError) as error:
-        raise InputError("config", f"{path}._target_", str(error), "an importable class or function") from error
+    target = target_of(cfg, path)
     late = bool(node.get("_partial_"))
     options = {key: value for key, value in resolved(node).items() if key not in ("_target_", "_partial_")}
     check_options(path, target, options, extra, complete=not late)
@@ -50,6 +48,18 @@ def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
         if isinstance(error, InputError) or target.__module__.split(".")[0] == "nerf_lightning":
             raise  # our own targets tell bad options apart from defects; libraries do not
         raise InputError("config", path, str(error), f"options that {target.__name__} takes") from error
+
+
+def target_of(cfg: DictConfig, path: str) -> Any:
+    """The class or function that the node at `path` names.
+
+    Raises:
+        InputError: where it names none, or none that can be imported.
+    """
+    try:
+        return hydra.utils.get_object(OmegaConf.select(cfg, path)["_target_"])
+    except (ImportError, AttributeError, ValueError, ConfigKeyError) as error:
+        raise InputError("config", f"{path}._target_", str(error), "an importable class or function") from error
 
 
 def resolved(cfg: DictConfig) -> dict[str, Any]:
@@ -66,10 +76,9 @@ def build_data(cfg: DictConfig) -> RayDataModule | PixelDataModule:
 
 def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> Any:
     """The field, if it has as many dimensions as the data."""
-    target = cfg.model.get("_target_", "") if cfg.get("model") is not None else ""
-    found = hydra.utils.get_class(target) if target else None
-    if found is None or not issubclass(found, kind):
-        name = found.__name__ if found else "nothing"
+    found = target_of(cfg, "model") if cfg.get("model") is not None else None
+    if not (inspect.isclass(found) and issubclass(found, kind)):
+        name = getattr(found, "__name__", "nothing")
         advice = "model=hashgrid or model=mlp" if kind is Field else "model=picture_mlp"
         raise InputError("config", "model", name, f"a field of {dimensions} for this dataset", f"choose {advice}")
     return make(cfg, "model", **extra)

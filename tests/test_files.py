@@ -19,6 +19,13 @@ def test_a_finished_block_replaces_the_file(tmp_path: Path):
     assert list(path.parent.iterdir()) == [path]
 
 
+def test_who_reads_meanwhile_reads_the_old_file_to_its_end(tmp_path: Path):
+    write_json(tmp_path / "a.json", "old")
+    with (tmp_path / "a.json").open() as reader:
+        write_json(tmp_path / "a.json", "new")
+        assert json.load(reader) == "old"
+
+
 @pytest.mark.parametrize("existing", [False, True])
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_a_failed_block_leaves_nothing_behind(existing: bool, error: type[BaseException], tmp_path: Path):

@@ -39,7 +39,7 @@ def panel(images: list[UInt8[ndarray, "H W 3"]], caption: str) -> UInt8[ndarray,
     font, thickness = cv2.FONT_HERSHEY_SIMPLEX, 1
     plain = caption.encode("ascii", "replace").decode()  # OpenCV's fonts have no other letters
     size, below = cv2.getTextSize(plain, font, 0.4, thickness)
-    fit = min(0.4, 0.4 * (row.shape[1] - 8) / size[0])
+    fit = min(0.4, 0.4 * (row.shape[1] - 8) / max(size[0], 1))
     strip = np.full((size[1] + below + 8, row.shape[1], 3), 24, np.uint8)
     cv2.putText(strip, plain, (4, size[1] + 4), font, fit, (235, 235, 235), thickness, cv2.LINE_AA)
     return np.concatenate([row, strip])

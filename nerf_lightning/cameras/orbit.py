@@ -15,9 +15,16 @@ ONE_SIDED = 0.35
 def look_at(
     eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*batch 4 4"]:
-    """Poses at `eye` whose z axis points at `target` and whose y axis points away from `up` (OpenCV, camera to world)."""
+    """Poses at `eye` whose z axis points at `target` and whose y axis points away from `up` (OpenCV, camera to world).
+
+    Looking along `up` itself, any roll would do; one is chosen.
+    """
     forward = torch.nn.functional.normalize(target - eye, dim=-1)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.expand_as(forward)), dim=-1)
+    right = torch.linalg.cross(forward, up.expand_as(forward))
+    other = torch.eye(3, dtype=up.dtype, device=up.device)[int(up.abs().argmin())]
+    along = right.norm(dim=-1, keepdim=True) < 1e-6
+    right = torch.where(along, torch.linalg.cross(forward, other.expand_as(forward)), right)
+    right = torch.nn.functional.normalize(right, dim=-1)
     down = torch.linalg.cross(forward, right)
     c2w = torch.eye(4, dtype=eye.dtype, device=eye.device).repeat(*eye.shape[:-1], 1, 1)
     c2w[..., :3, :] = torch.stack([right, down, forward, eye], dim=-1)

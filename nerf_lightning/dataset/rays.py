@@ -89,7 +89,7 @@ class RayDataModule(L.LightningDataModule):
         # Damped, since one batch's count is noisy; bounded, since empty space would ask for endless rays.
         wanted = self.rays * self.samples / max(drawn, 1)
         limit = self.first_rays * self.MOST_RAYS
-        self.rays = max(64, min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
+        self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
 
     def draw(self, step: int) -> RayBatch:
         return draw_rays(self.scene.train, self.rays, step_generator(self.seed, 0, step))

@@ -1,9 +1,9 @@
 """From a dataset's configuration to its data module: one function for each kind of source."""
 
+import logging
 import os
 import shutil
 import urllib.request
-import warnings
 from pathlib import Path
 
 from nerf_lightning.dataset.bricks import bricks
@@ -13,6 +13,8 @@ from nerf_lightning.dataset.pixels import Picture, PixelDataModule
 from nerf_lightning.dataset.rays import RayDataModule
 from nerf_lightning.files import atomic
 from nerf_lightning.options import Count
+
+log = logging.getLogger(__name__)
 
 DOWNLOAD_TIMEOUT = 10.0
 """Seconds without an answer after which a download is given up."""
@@ -77,7 +79,7 @@ def from_download(
             except OSError as error:
                 problem += f" and {url} could not be fetched ({error})"
         if problem:
-            warnings.warn(f"{problem}: training on the built-in scene 'bricks' instead", stacklevel=2)
+            log.warning("%s: training on the built-in scene 'bricks' instead", problem)
             return from_bricks(size=resize or 200, rays=rays, samples=samples, seed=seed)
         path = str(local)
     return from_photos(path, resize=resize, near=near, far=far, rays=rays, samples=samples, seed=seed)

@@ -19,7 +19,7 @@ class MLPField(Field):
         bounds: positions are scaled to [-1, 1] in them.
         depth: hidden layers of the trunk.
         width: neurons of each.
-        skip: the layer that sees the encoded position again.
+        skip: the layer that sees the encoded position again, or None.
         position_frequencies, direction_frequencies: octaves of the two encodings.
         density: "relu", "softplus" or "exp".
 
@@ -32,14 +32,15 @@ class MLPField(Field):
         bounds: Bounds,
         depth: Count = 8,
         width: Count = 256,
-        skip: int = 4,
+        skip: int | None = 4,
         position_frequencies: int = 10,
         direction_frequencies: int = 4,
         density: str = "relu",
     ):
         super().__init__(bounds)
-        if not 0 < skip < depth:
-            raise InputError("model.skip", "", str(skip), f"a layer from 1 to {depth - 1} (model.depth={depth})")
+        if skip is not None and not 0 < skip < depth:
+            expected = f"a layer from 1 to {depth - 1} (model.depth={depth}), or null for no skip"
+            raise InputError("model.skip", "", str(skip), expected)
         self.skip = skip
         self.position_frequencies = position_frequencies
         self.direction_frequencies = direction_frequencies

@@ -108,4 +108,6 @@ class OccupancySampler(Sampler):
         unit = (corner + torch.rand(corner.shape, generator=generator, device=device)) / n
         seen = torch.cat([density(part) for part in self.bounds.to_world(unit).split(1 << 15)]) * self.step_length
         self.thickness[cells] = torch.maximum(self.thickness[cells] * self.decay, seen)
-        self.occupied = self.thickness > min(self.threshold, 0.5 * float(self.thickness.mean()))
+        occupied = self.thickness > min(self.threshold, 0.5 * float(self.thickness.mean()))
+        # With no density anywhere there would be no samples, hence no gradient, for ever: look everywhere again.
+        self.occupied = occupied if occupied.any() else torch.ones_like(occupied)

@@ -47,7 +47,9 @@ def test_near_is_bright_and_what_is_empty_is_black():
     depth = torch.linspace(1, 2, 100).repeat(10, 1)
     opacity = torch.ones(10, 100)
     opacity[:, 90:] = 0
-    light = depth_colours(depth, opacity).astype(int).sum(-1)
+    colours = depth_colours(depth, opacity).astype(int)
+    light = colours.sum(-1)
+    assert colours[0, 30, 0] > 2 * colours[0, 30, 2], "in between it glows red"
     assert (light[:, 90:] == 0).all()
     assert (np.diff(light[0, :90]) <= 0).all() and light[0, 0] > light[0, 40] > light[0, 85]
 

@@ -118,3 +118,9 @@ def test_an_orbit_like_cameras_on_one_side_stays_there(spread):
 def test_an_orbit_like_a_single_camera_is_finite(frames):
     one = Cameras(torch.eye(3)[None], inward(1, torch.zeros(3)), 4, 4)
     assert orbit_like(one, frames).c2w.isfinite().all()
+
+
+def test_looking_straight_down_is_still_a_rotation():
+    c2w = look_at(torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    torch.testing.assert_close(c2w[0, :3, :3] @ c2w[0, :3, :3].T, torch.eye(3))
+    torch.testing.assert_close(torch.linalg.det(c2w[0, :3, :3]), torch.tensor(1.0))

@@ -210,3 +210,9 @@ def test_what_was_learned_is_kept_in_checkpoints():
     sampler.update(0, ball(), seeded())
     other.load_state_dict(sampler.state_dict())
     assert torch.equal(other.occupied, sampler.occupied) and torch.equal(other.thickness, sampler.thickness)
+
+
+def test_a_field_without_density_is_looked_at_everywhere():
+    sampler = OccupancySampler(CUBE, samples=16, resolution=4)
+    sampler.update(0, nowhere, seeded(0))
+    assert sampler.occupied.all()

@@ -51,11 +51,15 @@ def test_the_test_step_reports_what_evaluate_finds():
 class Slab(Field):
     """An opaque red slab at z > 0.5, where x > 0."""
 
+    def __init__(self, bounds: Bounds):
+        super().__init__(bounds)
+        self.red = torch.nn.Parameter(torch.tensor([1.0, 0, 0]))
+
     def features(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         return 1e6 * ((positions[:, 2] > 0.5) & (positions[:, 0] > 0)).float(), positions
 
     def colour(self, features: Tensor, directions: Tensor) -> Tensor:
-        return torch.tensor([1.0, 0, 0]).expand(len(features), 3)
+        return self.red.expand(len(features), 3)
 
 
 @pytest.fixture
@@ -101,8 +105,9 @@ def test_no_rays_meet_the_bounds(slab: NeRF3D):
 
 
 def test_rendering_leaves_no_gradient(slab: NeRF3D):
-    slab.field.weight = torch.nn.Parameter(torch.ones(()))
-    assert not slab.render(slab_view(0).rays[:5]).rgb.requires_grad
+    rays = slab_view(0).rays
+    assert slab.render(rays).opacity.max() == 1
+    assert not slab.render(rays).rgb.requires_grad
 
 
 def test_the_learning_rate_starts_from_the_optimisers_own():

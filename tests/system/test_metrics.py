@@ -31,7 +31,7 @@ def test_ssim():
 
 
 def test_ssim_of_flat_pictures_compares_their_brightness():
-    a, b, c1 = 0.2, 0.6, 0.01**2  # Wang et al. 2004, eq. 6, with a range of 1
+    a, b, c1 = 0.02, 0.06, 0.01**2  # Wang et al. 2004, eq. 6, with a range of 1
     expected = (2 * a * b + c1) / (a * a + b * b + c1)
     assert ssim(torch.full((16, 16, 3), a), torch.full((16, 16, 3), b)) == pytest.approx(expected, rel=1e-3)
 
