@@ -33,3 +33,15 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
 @pytest.fixture(autouse=True)
 def same_chance() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
+    """The folder of a finished run on the built-in scene, seconds long."""
+    from composing import composed
+
+    from nerf_lightning.training import train
+
+    folder = tmp_path_factory.mktemp("run")
+    train(composed(["+experiment=smoke_3d", "dataset.size=16", "budget.steps=10", "callbacks.orbit.frames=0"], folder))
+    return folder

@@ -4,9 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf, open_dict
+from composing import composed
 
 from nerf_lightning import cli
 from nerf_lightning.dataset import Scene, save_npz
@@ -15,16 +13,6 @@ from nerf_lightning.training import train
 
 EXPERIMENTS = sorted(path.stem for path in (cli.conf_dir() / "experiment").glob("*.yaml"))
 GROUPS = ("model", "sampler", "optimizer", "schedule")
-
-
-def composed(overrides: list[str], folder: Path) -> DictConfig:
-    """The configuration a command line would give, with `folder` as the run's."""
-    with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
-        cfg = compose("config", overrides, return_hydra_config=True)
-    with open_dict(cfg):
-        cfg.hydra.runtime.output_dir = str(folder)
-    HydraConfig.instance().set_config(cfg)
-    return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
 
 
 @pytest.fixture(scope="session")
@@ -53,6 +41,19 @@ def a_scene_for(small_scene: tuple[Path, Scene], tmp_path_factory: pytest.TempPa
 
 def test_the_experiments_shipped():
     assert {"lego", "lego_mlp", "fox_capture", "picture", "smoke_2d", "smoke_3d"} <= set(EXPERIMENTS)
+
+
+def test_the_courses_recipe(tmp_path: Path):
+    """8 layers of 256 with the encoding again at the fifth, L = 10 and 4, Adam at 5e-4, 4096 rays of 64 samples."""
+    cfg = composed(["+experiment=lego_mlp"], tmp_path)
+    model = {key: value for key, value in cfg.model.items() if key != "_target_"}
+    assert model == {
+        "depth": 8, "width": 256, "skip": 4, "position_frequencies": 10, "direction_frequencies": 4, "density": "relu",
+    }  # fmt: skip
+    assert (cfg.optimizer._target_, cfg.optimizer.lr) == ("torch.optim.Adam", 5e-4)
+    assert (cfg.dataset.rays, cfg.dataset.samples, cfg.sampler.samples) == (4096, None, 64)
+    cfg = composed(["+experiment=picture"], tmp_path)
+    assert (cfg.dataset.pixels, cfg.optimizer.lr, cfg.model.frequencies, cfg.model.width) == (10_000, 1e-2, 10, 256)
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
