@@ -88,7 +88,7 @@ def build_system(cfg: DictConfig, scene_frame: "SceneFrame | None") -> System:
     """The LightningModule: NeRF3D for a scene's frame, NeRF2D for a picture (None)."""
     optimizer = make(cfg, "optimizer")
     try:
-        optimizer([torch.zeros(1)])  # a rate below zero is told now, not after the scene is loaded
+        optimizer([torch.zeros(1)])  # a rate below zero is told now, not when training starts
     except (ValueError, TypeError, RuntimeError) as error:
         raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
     common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed}

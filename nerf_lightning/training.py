@@ -26,7 +26,7 @@ def train(cfg: DictConfig) -> float:
     """Builds, fits, tests, writes. Returns the held-out PSNR in dB.
 
     Raises:
-        InputError: on bad input, before anything is written into the run's folder except its log.
+        InputError: on bad input, most of it before anything is written into the run's folder.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
     checkpoint = None

@@ -40,7 +40,7 @@ class Progress(L.Callback):
         """Views that will be rendered after the test; who renders them adds them in its `setup`."""
         self._shown = 0.0
         self._start = (0.0, 0)  # seconds and steps when this process began to train
-        self._recent = (0.0, 0)  # the same at the last display
+        self._recent = 0.0  # seconds at the last display, and rays since
         self._rays = 0
 
     def rendering_left(self, trainer: L.Trainer) -> float:
@@ -66,10 +66,10 @@ class Progress(L.Callback):
         """One line: step, loss as dB, held-out dB, rays a second, time left."""
         budget = Budget.of(trainer)
         held_out = attached(trainer, HeldOut)
-        seconds, step = budget.seconds, trainer.global_step
-        speed = self._rays / max(seconds - self._recent[0], 1e-9)
-        self._recent, self._rays = (seconds, step), 0
-        parts = [f"step {step}", f"{speed:,.0f} rays/s"]
+        seconds = budget.seconds
+        speed = self._rays / max(seconds - self._recent, 1e-9)
+        self._recent, self._rays = seconds, 0
+        parts = [f"step {trainer.global_step}", f"{speed:,.0f} rays/s"]
         if held_out is not None and held_out.latest is not None:
             parts.insert(1, f"held out {held_out.latest:.2f} dB")
         training = self.training_left(trainer)
@@ -107,7 +107,8 @@ class Progress(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self.open(f"train {data_of(trainer).scene.name}")
-        self._start = self._recent = (Budget.of(trainer).seconds, trainer.global_step)
+        self._recent = Budget.of(trainer).seconds
+        self._start = (self._recent, trainer.global_step)
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int

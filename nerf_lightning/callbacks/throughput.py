@@ -1,13 +1,12 @@
 """Throughput: loss, learning rate and speed to the log."""
 
-import math
 from typing import Any
 
 import lightning as L
 
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.errors import InputError
-from nerf_lightning.system import System
+from nerf_lightning.system import System, decibels
 
 
 class Throughput(L.Callback):
@@ -45,7 +44,7 @@ class Throughput(L.Callback):
         if trainer.logger is not None:
             scalars = {
                 "train/loss": stats.mse,
-                "train/psnr": -10 * math.log10(max(stats.mse, 1e-12)),
+                "train/psnr": decibels(stats.mse),
                 "train/learning_rate": pl_module.parameter_groups[0]["lr"],
                 "speed/rays_per_second": rays / max(seconds - self._mark[0], 1e-9),
                 "speed/samples_per_ray": self._samples / max(rays, 1),

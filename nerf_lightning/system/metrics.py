@@ -8,10 +8,14 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 
+def decibels(mse: float) -> float:
+    """10 log10(1 / MSE), at most 120 dB."""
+    return -10 * math.log10(max(mse, 1e-12))
+
+
 def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> float:
     """Peak signal-to-noise ratio in dB, 10 log10(1 / MSE), of pictures in [0, 1]."""
-    mse = float(torch.mean((image.double() - truth.double()) ** 2))
-    return -10 * math.log10(max(mse, 1e-12))
+    return decibels(float(torch.mean((image.double() - truth.double()) ** 2)))
 
 
 SSIM_WINDOW = 11
