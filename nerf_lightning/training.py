@@ -16,6 +16,7 @@ from nerf_lightning.build import build_data, build_system, build_trainer, check_
 from nerf_lightning.callbacks import Results
 from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import use_kernels
 from nerf_lightning.options import AtLeast, Count, check_options
 from nerf_lightning.run_folder import load_config, read_checkpoint, save_config, save_scene
 
@@ -33,7 +34,7 @@ def train(cfg: DictConfig) -> float:
     if cfg.resume is not None:
         cfg, checkpoint = resume(cfg, folder)
     quiet()
-    settings = {"seed": cfg.seed, "threads": cfg.threads}
+    settings = {"seed": cfg.seed, "threads": cfg.threads, "kernels": cfg.kernels}
     check_options("", prepare_process, settings)
     prepare_process(**settings)
     data = build_data(cfg)
@@ -66,10 +67,11 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     return saved, checkpoint
 
 
-def prepare_process(seed: Annotated[int, AtLeast(0)], threads: Count | None) -> None:
+def prepare_process(seed: Annotated[int, AtLeast(0)], threads: Count | None, kernels: str) -> None:
     """What a run sets for its whole process."""
     if threads is not None:
         torch.set_num_threads(threads)
+    use_kernels(kernels)
     keep_freed_memory()
     torch.set_flush_denormal(True)  # dying weights otherwise slow the CPU down many times over
     L.seed_everything(seed, verbose=False)

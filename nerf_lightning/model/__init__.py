@@ -1,9 +1,9 @@
 """Stage 4, fields: position and direction -> density and rgb; and pictures as fields of two coordinates."""
 
 from nerf_lightning.model.activation import density_activation, truncated_exp
-from nerf_lightning.model.encoding import sinusoidal, spherical_harmonics
+from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import Field, PictureField
-from nerf_lightning.model.hashgrid import HashGrid, HashGridField, hash_interpolate
+from nerf_lightning.model.hashgrid import HashGrid, HashGridField
 from nerf_lightning.model.mlp import MLPField
 from nerf_lightning.model.picture import PictureMLP
 
@@ -15,8 +15,6 @@ __all__ = [
     "PictureField",
     "PictureMLP",
     "density_activation",
-    "hash_interpolate",
     "sinusoidal",
-    "spherical_harmonics",
     "truncated_exp",
 ]

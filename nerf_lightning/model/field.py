@@ -26,6 +26,18 @@ class Field(InBounds):
         """Features and unit directions -> rgb in [0, 1]."""
         raise TypeError(f"{type(self).__name__} must define colour(features, directions)")
 
+    def grow(self, progress: float) -> list[torch.nn.Parameter]:
+        """Called before each training step with the fraction of the budget done; a field may change its size here.
+
+        Returns:
+            Parameters whose data was replaced by data of another shape: what an optimiser remembers of them is void.
+        """
+        return []
+
+    def penalty(self) -> Float[Tensor, ""] | None:
+        """What training adds to the squared error, if anything."""
+        return None
+
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """World positions -> density, 1 / world unit."""
         return self.features(positions)[0] / self.unit_length

@@ -1,82 +1,23 @@
 """Multiresolution hash grid (Instant-NGP, Müller et al. 2022) and the field that reads from it."""
 
+from itertools import pairwise
+
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import hash_interpolate, mlp, spherical_harmonics
 from nerf_lightning.model.activation import density_activation
-from nerf_lightning.model.encoding import spherical_harmonics
 from nerf_lightning.model.field import Field
 from nerf_lightning.options import Count
-
-# Instant-NGP, eq. 4: pi_1 = 1, pi_2 = 2654435761, pi_3 = 805459861; the second as the int32 it wraps to.
-PRIMES = (1, 2654435761 - 2**32, 805459861)
 
 
 def level_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
     """Cells along each side of every level, growing geometrically from coarsest to finest (Instant-NGP, eq. 2 and 3)."""
     growth = (finest / coarsest) ** (1 / max(levels - 1, 1))
     return [round(coarsest * growth**level) for level in range(levels)]
-
-
-def corners(
-    cell: Int[Tensor, "3 N"], fraction: Float[Tensor, "3 N"], resolution: int, entries: int
-) -> tuple[Int[Tensor, "8 N"], Float[Tensor, "8 N"]]:
-    """Table entry and trilinear weight of the eight corners of each position's cell.
-
-    Entries are row-major where all corners of the grid fit in `entries` (a power of two if they do not), else hashed.
-
-    Args:
-        cell: lower corner, in [0, resolution).
-        fraction: position within the cell, in [0, 1].
-        resolution: cells along each side of the grid.
-        entries: size of the table.
-    """
-    side = resolution + 1
-    dense = side**3 <= entries
-    factors = (1, side, side * side) if dense else PRIMES
-    # A product an axis and side, which the corners then combine. Positions run last: long, contiguous vector operations.
-    low = [cell[axis] * factor for axis, factor in enumerate(factors)]
-    ends = [(a, a + factor) for a, factor in zip(low, factors, strict=True)]
-    shares = [(1 - f, f) for f in fraction]
-    index, weight = [], []
-    for i in (0, 1):
-        for j in (0, 1):
-            x, y = ends[0][i], ends[1][j]
-            both, share = (x + y if dense else x ^ y), shares[0][i] * shares[1][j]
-            for k in (0, 1):
-                index.append(both + ends[2][k] if dense else (both ^ ends[2][k]) & (entries - 1))
-                weight.append(share * shares[2][k])
-    return torch.stack(index), torch.stack(weight)
-
-
-def hash_interpolate(
-    tables: Float[Tensor, "T F"], unit: Float[Tensor, "N 3"], resolutions: list[int], sizes: list[int]
-) -> Float[Tensor, "N LF"]:
-    """Trilinear interpolation at every level, features side by side.
-
-    Args:
-        tables: the levels' entries, one level after the other.
-        unit: positions in [0, 1]^3; outside they are clamped.
-        resolutions: cells along each side, a level.
-        sizes: entries of each level's table.
-    """
-    places = unit.clamp(0, 1).T.contiguous()
-    indices, weights, start = [], [], 0
-    for resolution, size in zip(resolutions, sizes, strict=True):
-        scaled = places * resolution
-        cell = scaled.to(torch.int32).clamp_(max=resolution - 1)
-        index, weight = corners(cell, scaled - cell, resolution, size)
-        # int64, for which alone the CPU's index_add (the gather's gradient) is fast: 7 against 105 ms for two million.
-        indices.append(index.long() + start)
-        weights.append(weight)
-        start += size
-    # One gather for all levels: each gather's gradient is as large as the whole of `tables`.
-    index = torch.stack(indices)
-    entries = tables.index_select(0, index.flatten()).view(*index.shape, tables.shape[1])
-    return (entries * torch.stack(weights)[..., None]).sum(1).transpose(0, 1).flatten(1)
 
 
 class HashGrid(torch.nn.Module):
@@ -111,6 +52,16 @@ class HashGrid(torch.nn.Module):
         return hash_interpolate(self.tables, unit, self.resolutions, self.sizes)
 
 
+def layers(*widths: int) -> torch.nn.ModuleList:
+    """Fully connected layers from each width to the next."""
+    return torch.nn.ModuleList(torch.nn.Linear(i, o) for i, o in pairwise(widths))
+
+
+def run(net: torch.nn.ModuleList, x: Float[Tensor, "N I"], extra: Float[Tensor, "N E"] | None = None) -> Tensor:
+    """A small network of `layers`; see `kernels.mlp`."""
+    return mlp(x, [(layer.get_parameter("weight"), layer.get_parameter("bias")) for layer in net], extra)
+
+
 class HashGridField(Field):
     """Hash-grid features, a small density network, and a small colour network that also sees the direction.
 
@@ -137,17 +88,12 @@ class HashGridField(Field):
         super().__init__(bounds)
         self.grid = HashGrid(levels, log2_entries, features, coarsest, finest)
         self.activation = density_activation(density)
-        nn = torch.nn
-        self.density_net = nn.Sequential(
-            nn.Linear(self.grid.width, width), nn.ReLU(), nn.Linear(width, 1 + self.GEOMETRY)
-        )
-        self.colour_net = nn.Sequential(
-            nn.Linear(16 + self.GEOMETRY, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 3)
-        )
+        self.density_net = layers(self.grid.width, width, 1 + self.GEOMETRY)
+        self.colour_net = layers(self.GEOMETRY + 16, width, width, 3)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
-        out = self.density_net(self.grid(self.bounds.to_unit(positions)))
+        out = run(self.density_net, self.grid(self.bounds.to_unit(positions)))
         return self.activation(out[:, 0]), out[:, 1:]
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(self.colour_net(torch.cat([spherical_harmonics(directions), features], dim=1)))
+        return torch.sigmoid(run(self.colour_net, features, spherical_harmonics(directions)))

@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Rays
 from nerf_lightning.errors import InputError
-from nerf_lightning.renderer.volume import accumulate, volume_weights
+from nerf_lightning.kernels import composite
 from nerf_lightning.sampler import Samples
 
 FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]]
@@ -80,9 +80,6 @@ class VolumeRenderer(torch.nn.Module):
         if backgrounds is None:
             backgrounds = self.backgrounds(len(rays))
         density, rgb = field(samples.positions(rays), samples.directions(rays))
-        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
-        values = torch.cat([rgb, torch.ones_like(weights)[:, None], samples.t[:, None]], dim=1)
-        summed = accumulate(weights, values, samples.ray, len(rays))
-        opacity = summed[:, 3]
-        colour = summed[:, :3] + (1 - opacity)[:, None] * backgrounds
-        return Rendered(colour, opacity, summed[:, 4] / opacity.clamp_min(1e-6))
+        summed, opacity, depth = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
+        colour = summed + (1 - opacity)[:, None] * backgrounds
+        return Rendered(colour, opacity, depth / opacity.clamp_min(1e-6))

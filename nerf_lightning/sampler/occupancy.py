@@ -1,21 +1,15 @@
 """Skip empty space: a coarse grid remembers where the field has density (Instant-NGP, appendix C)."""
 
 import torch
-from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.kernels import keep_visible, march
 from nerf_lightning.options import Count
-from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack
+from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
 
-MAX_CANDIDATES = 1 << 20
-"""Intervals looked at together: bounds the memory of one call, whatever the number of rays."""
-
-
-def cell_index(unit: Float[Tensor, "*batch 3"], resolution: int) -> Int[Tensor, "*batch"]:
-    """Flat index of the cell of a resolution^3 grid over [0, 1]^3 that holds each position (clamped into the grid)."""
-    x, y, z = (unit * resolution).long().clamp_(0, resolution - 1).unbind(-1)
-    return (x * resolution + y) * resolution + z
+MAX_ASKED = 1 << 17
+"""Positions at which the density is asked together: bounds the memory of one call."""
 
 
 class OccupancySampler(Sampler):
@@ -32,6 +26,8 @@ class OccupancySampler(Sampler):
         decay: factor on a cell's memory at each update.
         update_every: training steps between updates.
         warmup: steps during which every update looks at every cell; afterwards at a quarter of them.
+        transparent: transmittance below which a ray has ended: what lies behind is dropped.
+        thin: opacity of a step below which it is dropped.
     """
 
     thickness: Tensor
@@ -46,6 +42,8 @@ class OccupancySampler(Sampler):
         decay: float = 0.95,
         update_every: Count = 16,
         warmup: int = 256,
+        transparent: float = 1e-4,
+        thin: float = 1e-3,
     ):
         super().__init__(bounds)
         self.samples = samples
@@ -54,6 +52,8 @@ class OccupancySampler(Sampler):
         self.decay = decay
         self.update_every = update_every
         self.warmup = warmup
+        self.transparent = transparent
+        self.thin = thin
         self.register_buffer("thickness", torch.zeros(resolution**3))
         self.register_buffer("occupied", torch.ones(resolution**3, dtype=torch.bool))
 
@@ -62,34 +62,15 @@ class OccupancySampler(Sampler):
         """Length of one step inside the box, in world units."""
         return 2 * float(self.bounds.half_size.norm()) / self.samples
 
-    def edges(self, rays: Rays, generator: Generator | None) -> tuple[Float[Tensor, "R S_plus_1"], Bool[Tensor, "R S"]]:
-        """All candidate intervals of each ray, and which of them lie within the bounds."""
+    def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
-        # One more than the steps: the first one may be cut short by the shift, and the last must reach the far end.
-        steps = torch.arange(self.samples + 2, device=near.device)
         shift = torch.zeros_like(near)
         if generator is not None:
             shift = torch.rand(near.shape, generator=generator, device=near.device)
-        if self.bounds.unbounded:
-            s = ((steps + shift[:, None] - 0.5) / self.samples).clamp(0, 1)
-            edges = self.bounds.distances(near, far, s)
-        else:
-            edges = near[:, None] + (steps + shift[:, None] - 0.5).clamp_min(0) * self.step_length
-            edges = torch.minimum(edges, far[:, None])
-        return edges, edges[:, 1:] > edges[:, :-1]
-
-    def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
-        edges, keep = self.edges(rays, generator)
-        rows = max(1, MAX_CANDIDATES // self.samples)
-        for start in range(0, len(rays), rows):
-            part = slice(start, start + rows)
-            inside = keep[part]
-            ray, column = inside.nonzero(as_tuple=True)
-            t = (edges[part][ray, column] + edges[part][ray, column + 1]) / 2
-            chunk = rays[part]
-            unit = self.bounds.to_unit(chunk.origins[ray] + t[:, None] * chunk.directions[ray])
-            inside[ray, column] = self.occupied[cell_index(unit, self.resolution)]
-        return pack(edges, keep)
+        packed = march(rays, self.bounds, near, far, shift, self.occupied, self.samples, self.step_length)
+        with torch.no_grad():
+            seen = torch.cat([density(part) for part in Samples(*packed).positions(rays).split(MAX_ASKED)])
+        return Samples(*keep_visible(seen, packed, self.transparent, self.thin))
 
     @torch.no_grad()
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:

@@ -4,11 +4,11 @@ import bisect
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import InBounds, Rays
+from nerf_lightning.kernels import pack_intervals, points
 
 DensityFn = Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N"]]
 """World positions -> density (1 / world unit); how samplers look at a field without knowing it."""
@@ -32,7 +32,7 @@ class Samples:
 
     def positions(self, rays: Rays) -> Float[Tensor, "N 3"]:
         """World positions of the midpoints."""
-        return rays.origins[self.ray] + self.t[:, None] * rays.directions[self.ray]
+        return points(rays.origins, rays.directions, self.ray, self.t)
 
     def directions(self, rays: Rays) -> Float[Tensor, "N 3"]:
         """Unit viewing direction of each sample."""
@@ -41,11 +41,7 @@ class Samples:
 
 def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Samples:
     """Packs the kept intervals between consecutive edges of each ray."""
-    counts = keep.sum(1)
-    offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-    ray, column = keep.nonzero(as_tuple=True)
-    start, end = edges[ray, column], edges[ray, column + 1]
-    return Samples((start + end) / 2, end - start, ray, offsets)
+    return Samples(*pack_intervals(edges, keep))
 
 
 def split(samples: Samples, most: int) -> Iterator[tuple[slice, Samples]]:

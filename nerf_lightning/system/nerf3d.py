@@ -39,6 +39,16 @@ class NeRF3D(System):
         self.sampler = sampler
         self.renderer = renderer
 
+    def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
+        super().on_train_batch_start(batch, batch_idx)
+        replaced = self.field.grow(self.progress)
+        if replaced:
+            optimizer = self.optimizers(use_pl_optimizer=False)
+            assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one
+            for parameter in replaced:
+                parameter.grad = None
+                optimizer.state.pop(parameter, None)
+
     def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
         generator = step_generator(self.seed, 1, self.global_step, self.device)
         with torch.no_grad():
@@ -47,9 +57,10 @@ class NeRF3D(System):
         backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
         rendered = self.renderer(batch.rays, samples, self.field, backgrounds)
         loss = torch.nn.functional.mse_loss(rendered.rgb, batch.target(backgrounds))
+        penalty = self.field.penalty()
         self.stats = StepStats(loss.detach().item(), len(batch.rays), len(samples))
         self.trainer.datamodule.adapt(len(samples))  # type: ignore[attr-defined]
-        return loss
+        return loss if penalty is None else loss + penalty
 
     @torch.no_grad()
     def render(self, rays: Rays) -> Rendered:

@@ -1,0 +1,48 @@
+"""The hot loops: each file holds a plain-torch reference, for every device, and the choice between it and a fast version.
+
+Fast versions for CPUs stand in `cpu/`; `use_kernels("reference")` (config key `kernels`) switches them all off.
+"""
+
+from nerf_lightning.kernels.composite import (
+    accumulate,
+    composite,
+    composite_reference,
+    keep_visible,
+    keep_visible_reference,
+    volume_weights,
+)
+from nerf_lightning.kernels.harmonics import spherical_harmonics, spherical_harmonics_reference
+from nerf_lightning.kernels.hashgrid import hash_interpolate, hash_interpolate_reference
+from nerf_lightning.kernels.march import (
+    cell_index,
+    march,
+    march_reference,
+    pack_intervals,
+    points,
+    points_reference,
+)
+from nerf_lightning.kernels.mlp import mlp, mlp_reference
+from nerf_lightning.kernels.switch import fast, use_kernels
+
+__all__ = [
+    "accumulate",
+    "cell_index",
+    "composite",
+    "composite_reference",
+    "fast",
+    "hash_interpolate",
+    "hash_interpolate_reference",
+    "keep_visible",
+    "keep_visible_reference",
+    "march",
+    "march_reference",
+    "mlp",
+    "mlp_reference",
+    "pack_intervals",
+    "points",
+    "points_reference",
+    "spherical_harmonics",
+    "spherical_harmonics_reference",
+    "use_kernels",
+    "volume_weights",
+]

@@ -1,0 +1,148 @@
+"""From samples to pixels: emission-absorption along rays (NeRF, eq. 3; Max 1995)."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerf_lightning.kernels.march import Packed
+from nerf_lightning.kernels.switch import fast
+
+Pixels = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
+"""Colour, opacity and depth summed along each ray, each sample by its weight."""
+
+
+def volume_weights(
+    density: Float[Tensor, "N"], dt: Float[Tensor, "N"], ray: Int[Tensor, "N"], offsets: Int[Tensor, "R_plus_1"]
+) -> Float[Tensor, "N"]:
+    """How much each sample contributes to its ray's pixel.
+
+    w_i = T_i (1 - exp(-sigma_i dt_i)),  T_i = exp(-sum_{j < i} sigma_j dt_j), the sum within the sample's ray.
+
+    Args:
+        density: sigma, 1 / world unit, not negative.
+        dt: interval lengths, world units.
+        ray: ray of each sample, ascending.
+        offsets: first sample of each ray, then N.
+
+    Returns:
+        Weights in [0, 1]; over a ray they add up to its opacity.
+    """
+    optical = density * dt
+    return torch.exp(-_thickness_before(optical, ray, offsets)).to(density.dtype) * -torch.expm1(-optical)
+
+
+def _thickness_before(
+    optical: Float[Tensor, "N"], ray: Int[Tensor, "N"], offsets: Int[Tensor, "R_plus_1"]
+) -> Float[Tensor, "N"]:
+    # One running sum over all rays, less its value where the ray starts. In double: the sum outgrows single precision.
+    total = torch.cat([optical.new_zeros(1, dtype=torch.float64), optical.double().cumsum(0)])
+    return total[:-1] - total[offsets[:-1]][ray]
+
+
+def accumulate(
+    weights: Float[Tensor, "N"], values: Float[Tensor, "N D"], ray: Int[Tensor, "N"], rays: int
+) -> Float[Tensor, "R D"]:
+    """Weighted sum of the samples' values over each of `rays` rays; zero where a ray has none."""
+    return values.new_zeros(rays, values.shape[1]).index_add(0, ray, weights[:, None] * values)
+
+
+def composite_reference(
+    density: Float[Tensor, "N"],
+    rgb: Float[Tensor, "N 3"],
+    t: Float[Tensor, "N"],
+    dt: Float[Tensor, "N"],
+    ray: Int[Tensor, "N"],
+    offsets: Int[Tensor, "R_plus_1"],
+) -> Pixels:
+    """`composite` in plain torch, for every device."""
+    weights = volume_weights(density, dt, ray, offsets)
+    values = torch.cat([rgb, torch.ones_like(weights)[:, None], t[:, None]], dim=1)
+    summed = accumulate(weights, values, ray, len(offsets) - 1)
+    return summed[:, :3], summed[:, 3], summed[:, 4]
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, offsets: Tensor) -> Pixels:
+        from nerf_lightning.kernels.cpu import composite as cpu
+        from nerf_lightning.kernels.cpu import workers
+
+        rays = len(offsets) - 1
+        density, rgb = density.contiguous(), rgb.T.contiguous()
+        colour, opacity, depth, before = torch.empty(3, rays), torch.empty(rays), torch.empty(rays), torch.empty(len(t))
+        given = [x.detach().numpy() for x in (density, rgb, t, dt, offsets)]
+        cpu.forward(*given, colour.numpy(), opacity.numpy(), depth.numpy(), before.numpy(), workers())
+        ctx.save_for_backward(density, rgb, t, dt, offsets, before)
+        return colour.T, opacity, depth
+
+    @staticmethod
+    def backward(ctx, colour: Tensor, opacity: Tensor, depth: Tensor) -> tuple[Tensor | None, ...]:
+        from nerf_lightning.kernels.cpu import composite as cpu
+        from nerf_lightning.kernels.cpu import workers
+
+        saved = [x.numpy() for x in ctx.saved_tensors]
+        above = colour.T.contiguous().numpy(), opacity.contiguous().numpy(), depth.contiguous().numpy()
+        density, rgb = torch.empty(saved[0].shape), torch.empty(saved[1].shape)
+        cpu.backward(*saved, *above, density.numpy(), rgb.numpy(), workers())
+        return density, rgb.T, None, None, None
+
+
+def composite(
+    density: Float[Tensor, "N"],
+    rgb: Float[Tensor, "N 3"],
+    t: Float[Tensor, "N"],
+    dt: Float[Tensor, "N"],
+    ray: Int[Tensor, "N"],
+    offsets: Int[Tensor, "R_plus_1"],
+) -> Pixels:
+    """Sums colour, one, and distance over each ray, weighted as in `volume_weights`.
+
+    Args:
+        density, dt, ray, offsets: see `volume_weights`.
+        rgb: colour of each sample.
+        t: distance of each sample along its ray, a constant.
+
+    Returns:
+        Colour without background, opacity in [0, 1], and the sum of distances (not divided by opacity).
+    """
+    if fast(density, rgb, t):
+        return _Composite.apply(density, rgb, t, dt, offsets)
+    return composite_reference(density, rgb, t, dt, ray, offsets)
+
+
+def keep_visible_reference(density: Float[Tensor, "M"], packed: Packed, transparent: float, thin: float) -> Packed:
+    """`keep_visible` in plain torch, for every device."""
+    t, dt, ray, offsets = packed
+    optical = density * dt
+    ended = _thickness_before(optical, ray, offsets) > -np.log(transparent)
+    keep = ~(ended | (optical < -np.log1p(-thin)))
+    kept = torch.cat([offsets.new_zeros(1), keep.cumsum(0)])[offsets]
+    return t[keep], dt[keep], ray[keep], kept
+
+
+def keep_visible(density: Float[Tensor, "M"], packed: Packed, transparent: float, thin: float) -> Packed:
+    """Drops samples that light cannot reach, and those that hold nothing.
+
+    Args:
+        density: of each sample, 1 / world unit.
+        packed: midpoints, lengths, rays and offsets of M samples.
+        transparent: transmittance below which a ray has ended, above 0.
+        thin: opacity of a sample below which it holds nothing, below 1.
+    """
+    t, dt, ray, offsets = packed
+    if not fast(density, t):
+        return keep_visible_reference(density, packed, transparent, thin)
+    from nerf_lightning.kernels.cpu import composite as cpu
+    from nerf_lightning.kernels.cpu import workers
+
+    threads, keep, counts = workers(), np.empty(len(t), np.bool_), np.empty(len(offsets) - 1, np.int64)
+    cpu.visible(
+        density.detach().contiguous().numpy(), dt.numpy(), offsets.numpy(), transparent, thin, keep, counts, threads
+    )
+    kept = torch.zeros_like(offsets)
+    np.cumsum(counts, out=kept.numpy()[1:])
+    total = int(kept[-1])
+    out = torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
+    cpu.gather(keep, offsets.numpy(), kept.numpy(), t.numpy(), dt.numpy(), *(x.numpy() for x in out), threads)
+    return *out, kept

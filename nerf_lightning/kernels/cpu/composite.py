@@ -1,0 +1,94 @@
+"""Emission-absorption rendering, ray after ray, and its gradient."""
+
+import math
+
+from numba import prange
+
+from nerf_lightning.kernels.cpu.compile import kernel
+
+
+@kernel
+def forward(density, rgb, t, dt, offsets, colour, opacity, depth, before, workers):
+    """Fills the sums over each ray, colour [3, R], opacity [R], depth [R], and the transmittance before each sample [N]."""
+    rays = len(offsets) - 1
+    for worker in prange(workers):
+        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
+            optical = 0.0  # in double: the sum over a ray outgrows single precision
+            red, green, blue, covered, distance = 0.0, 0.0, 0.0, 0.0, 0.0
+            for n in range(offsets[ray], offsets[ray + 1]):
+                through = math.exp(-optical)
+                step = density[n] * dt[n]
+                weight = through * -math.expm1(-step)
+                before[n] = through
+                optical += step
+                red += weight * rgb[0, n]
+                green += weight * rgb[1, n]
+                blue += weight * rgb[2, n]
+                covered += weight
+                distance += weight * t[n]
+            colour[0, ray], colour[1, ray], colour[2, ray] = red, green, blue
+            opacity[ray], depth[ray] = covered, distance
+
+
+@kernel
+def backward(
+    density, rgb, t, dt, offsets, before, colour_above, opacity_above, depth_above, grad_density, grad_rgb, workers
+):
+    """Gradients of density [N] and rgb [3, N] from those of colour [3, R], opacity [R] and depth [R].
+
+    With g_i the gradient of weight w_i:  d/d density_i = dt_i (T_{i+1} g_i - sum_{j > i} w_j g_j), taken from the far end.
+    """
+    rays = len(offsets) - 1
+    for worker in prange(workers):
+        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
+            red, green, blue = colour_above[0, ray], colour_above[1, ray], colour_above[2, ray]
+            behind = 0.0
+            for n in range(offsets[ray + 1] - 1, offsets[ray] - 1, -1):
+                step = density[n] * dt[n]
+                after = before[n] * math.exp(-step)
+                weight = before[n] * -math.expm1(-step)
+                grad_weight = (
+                    red * rgb[0, n]
+                    + green * rgb[1, n]
+                    + blue * rgb[2, n]
+                    + opacity_above[ray]
+                    + depth_above[ray] * t[n]
+                )
+                grad_density[n] = dt[n] * (after * grad_weight - behind)
+                behind += weight * grad_weight
+                grad_rgb[0, n], grad_rgb[1, n], grad_rgb[2, n] = weight * red, weight * green, weight * blue
+
+
+@kernel
+def visible(density, dt, offsets, transparent, thin, keep, counts, workers):
+    """Marks samples that light can reach and that hold something, and counts them a ray [R].
+
+    Args:
+        transparent: transmittance below which a ray has ended.
+        thin: opacity of a sample below which it holds nothing.
+    """
+    rays = len(offsets) - 1
+    furthest = -math.log(transparent)
+    thinnest = -math.log1p(-thin)
+    for worker in prange(workers):
+        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
+            optical, kept = 0.0, 0
+            for n in range(offsets[ray], offsets[ray + 1]):
+                step = density[n] * dt[n]
+                keep[n] = not (optical > furthest or step < thinnest)  # what is not a number stays, to be noticed
+                kept += keep[n]
+                optical += step
+            counts[ray] = kept
+
+
+@kernel
+def gather(keep, offsets, kept_offsets, t, dt, out_t, out_dt, out_ray, workers):
+    """Packs the kept samples."""
+    rays = len(offsets) - 1
+    for worker in prange(workers):
+        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
+            to = kept_offsets[ray]
+            for n in range(offsets[ray], offsets[ray + 1]):
+                if keep[n]:
+                    out_t[to], out_dt[to], out_ray[to] = t[n], dt[n], ray
+                    to += 1

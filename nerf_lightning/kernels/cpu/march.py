@@ -1,0 +1,161 @@
+"""Walking rays through an occupancy grid.
+
+Distances, positions and cells are rounded exactly as the torch reference rounds them, so that both keep the same samples.
+"""
+
+from numba import float32, int32, prange
+
+from nerf_lightning.kernels.cpu.compile import exact
+
+exact_inner = exact(parallel=False)
+
+
+@exact_inner
+def contraction(t, unit):
+    """The map that unbounded distances are uniform in; see `Bounds.distances`."""
+    x = t / unit
+    return x / float32(2) if x < float32(1) else float32(1) - float32(1) / (float32(2) * x)
+
+
+@exact_inner
+def edge(k, shift, near, far, step, samples, unbounded, low, span, unit):
+    """Distance at which interval k begins."""
+    steps = float32(k) + shift - float32(0.5)
+    if not unbounded:
+        return min(near + max(steps, float32(0)) * step, far)
+    y = low + span * min(max(steps / float32(samples), float32(0)), float32(1))
+    return unit * (float32(2) * y if y < float32(0.5) else float32(1) / max(float32(2) - float32(2) * y, float32(1e-6)))
+
+
+@exact_inner
+def to_unit(x, y, z, centre, half, unbounded):
+    """`Bounds.to_unit` of one position."""
+    a, b, c = (x - centre[0]) / half[0], (y - centre[1]) / half[1], (z - centre[2]) / half[2]
+    if not unbounded:
+        return a * float32(0.5) + float32(0.5), b * float32(0.5) + float32(0.5), c * float32(0.5) + float32(0.5)
+    norm = max(max(abs(a), abs(b)), max(abs(c), float32(1)))
+    reach = float32(2) - float32(1) / norm
+    quarter, middle = float32(0.25), float32(0.5)
+    return (
+        reach * (a / norm) * quarter + middle,
+        reach * (b / norm) * quarter + middle,
+        reach * (c / norm) * quarter + middle,
+    )
+
+
+@exact_inner
+def cell(u, resolution):
+    return min(max(int32(u * float32(resolution)), int32(0)), int32(resolution - 1))
+
+
+@exact_inner
+def steps_to_leave(origin, direction, centre, half, cells, u, v, w, t, step):
+    """How many steps surely stay within the present cell of a cells^3 grid over the box (0 if unsure)."""
+    nearest = float32(1e30)
+    for axis in range(3):
+        here = u if axis == 0 else (v if axis == 1 else w)
+        d = direction[axis]
+        if d == float32(0):
+            continue
+        low = float32(cell(here, cells))
+        wall = (low + (float32(1) if d > 0 else float32(0))) / float32(cells)
+        at = ((wall - float32(0.5)) * float32(2) * half[axis] + centre[axis] - origin[axis]) / d
+        nearest = min(nearest, at)
+    return max(int((nearest - t) / step) - 1, 0)
+
+
+@exact
+def walk(origins, directions, near, far, shift, occupied, resolution, blocks, cells, centre, half, unbounded, samples,
+         step, found, counts, workers):  # fmt: skip
+    """Notes which intervals of each ray to keep in found [R, samples + 1] and how many in counts [R].
+
+    Args:
+        occupied: [resolution^3], row by row.
+        blocks: [cells^3], whether any cell of a block is occupied: empty blocks are crossed in one leap.
+    """
+    rays, unit = len(near), max(half[0], max(half[1], half[2]))
+    for worker in prange(workers):
+        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
+            first, last, kept = near[ray], max(far[ray], near[ray]), 0
+            low, span = float32(0), float32(0)
+            if unbounded:
+                low = contraction(first, unit)
+                span = contraction(last, unit) - low
+            k = 0
+            start = edge(0, shift[ray], first, last, step, samples, unbounded, low, span, unit)
+            while k <= samples:
+                end = edge(k + 1, shift[ray], first, last, step, samples, unbounded, low, span, unit)
+                if not end > start:
+                    if start >= last:
+                        break
+                    k, start = k + 1, end
+                    continue
+                t = (start + end) / float32(2)
+                u, v, w = to_unit(
+                    origins[ray, 0] + t * directions[ray, 0],
+                    origins[ray, 1] + t * directions[ray, 1],
+                    origins[ray, 2] + t * directions[ray, 2],
+                    centre,
+                    half,
+                    unbounded,
+                )
+                if not blocks[(cell(u, cells) * cells + cell(v, cells)) * cells + cell(w, cells)]:
+                    leap = 0
+                    if not unbounded:
+                        leap = steps_to_leave(origins[ray], directions[ray], centre, half, cells, u, v, w, t, step)
+                    if leap > 0:
+                        k += leap
+                        end = edge(k + 1, shift[ray], first, last, step, samples, unbounded, low, span, unit)
+                elif occupied[
+                    (cell(u, resolution) * resolution + cell(v, resolution)) * resolution + cell(w, resolution)
+                ]:
+                    found[ray, kept] = k
+                    kept += 1
+                k, start = k + 1, end
+            counts[ray] = kept
+
+
+@exact
+def pack(near, far, shift, half, unbounded, samples, step, found, offsets, t, dt, ray_of, workers):
+    """Distances and lengths of the intervals that `walk` noted, one ray after the other."""
+    rays, unit = len(near), max(half[0], max(half[1], half[2]))
+    for worker in prange(workers):
+        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
+            first, last = near[ray], max(far[ray], near[ray])
+            low, span = float32(0), float32(0)
+            if unbounded:
+                low = contraction(first, unit)
+                span = contraction(last, unit) - low
+            for n in range(offsets[ray], offsets[ray + 1]):
+                k = found[ray, n - offsets[ray]]
+                start = edge(k, shift[ray], first, last, step, samples, unbounded, low, span, unit)
+                end = edge(k + 1, shift[ray], first, last, step, samples, unbounded, low, span, unit)
+                t[n], dt[n], ray_of[n] = (start + end) / float32(2), end - start, ray
+
+
+@exact
+def coarsen(occupied, resolution, blocks, cells, workers):
+    """blocks [cells^3]: whether any of a block's cells is occupied; cells divides resolution."""
+    size = resolution // cells
+    for worker in prange(workers):
+        for i in range(cells * worker // workers, cells * (worker + 1) // workers):
+            for j in range(cells):
+                for k in range(cells):
+                    some = False
+                    for x in range(i * size, (i + 1) * size):
+                        for y in range(j * size, (j + 1) * size):
+                            row = (x * resolution + y) * resolution
+                            for z in range(row + k * size, row + (k + 1) * size):
+                                some = some or occupied[z]
+                    blocks[(i * cells + j) * cells + k] = some
+
+
+@exact
+def points(origins, directions, ray, t, out, workers):
+    """out [3, N] = origins[ray] + t * directions[ray]."""
+    samples = len(t)
+    for worker in prange(workers):
+        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
+            r = ray[n]
+            for axis in range(3):
+                out[axis, n] = origins[r, axis] + t[n] * directions[r, axis]

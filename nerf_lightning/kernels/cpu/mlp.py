@@ -1,0 +1,175 @@
+"""A whole small network on one tile of samples at a time, so that its activations never leave the core's cache.
+
+Weights come as one row of numbers, layer after layer [O, I] then bias [O], every width filled up with zeros to a multiple
+of four: the loops handle four rows by four columns at once, in registers.
+"""
+
+import numpy as np
+from numba import float32, prange
+
+from nerf_lightning.kernels.cpu.compile import inner, kernel
+
+TILE = 128
+"""Samples worked on together; a constant, so that the inner loops need no remainder."""
+
+
+@inner
+def affine(W, b, x, y, rectify):
+    """y = W x + b, rectified or not."""
+    outputs, inputs = W.shape
+    for o in range(0, outputs, 4):
+        for k in range(o, o + 4):
+            for n in range(TILE):
+                y[k, n] = b[k]
+        for i in range(0, inputs, 4):
+            w00, w01, w02, w03 = W[o, i], W[o, i + 1], W[o, i + 2], W[o, i + 3]
+            w10, w11, w12, w13 = W[o + 1, i], W[o + 1, i + 1], W[o + 1, i + 2], W[o + 1, i + 3]
+            w20, w21, w22, w23 = W[o + 2, i], W[o + 2, i + 1], W[o + 2, i + 2], W[o + 2, i + 3]
+            w30, w31, w32, w33 = W[o + 3, i], W[o + 3, i + 1], W[o + 3, i + 2], W[o + 3, i + 3]
+            for n in range(TILE):
+                x0, x1, x2, x3 = x[i, n], x[i + 1, n], x[i + 2, n], x[i + 3, n]
+                y[o, n] += w00 * x0 + w01 * x1 + w02 * x2 + w03 * x3
+                y[o + 1, n] += w10 * x0 + w11 * x1 + w12 * x2 + w13 * x3
+                y[o + 2, n] += w20 * x0 + w21 * x1 + w22 * x2 + w23 * x3
+                y[o + 3, n] += w30 * x0 + w31 * x1 + w32 * x2 + w33 * x3
+        if rectify:
+            for k in range(o, o + 4):
+                for n in range(TILE):
+                    y[k, n] = float32(0) if y[k, n] < float32(0) else y[k, n]  # keeps what is not a number
+
+
+@inner
+def back_input(W, dy, dx):
+    """dx = W^T dy."""
+    outputs, inputs = W.shape
+    for i in range(0, inputs, 4):
+        dx[i : i + 4] = float32(0)
+        for o in range(0, outputs, 4):
+            w00, w01, w02, w03 = W[o, i], W[o, i + 1], W[o, i + 2], W[o, i + 3]
+            w10, w11, w12, w13 = W[o + 1, i], W[o + 1, i + 1], W[o + 1, i + 2], W[o + 1, i + 3]
+            w20, w21, w22, w23 = W[o + 2, i], W[o + 2, i + 1], W[o + 2, i + 2], W[o + 2, i + 3]
+            w30, w31, w32, w33 = W[o + 3, i], W[o + 3, i + 1], W[o + 3, i + 2], W[o + 3, i + 3]
+            for n in range(TILE):
+                y0, y1, y2, y3 = dy[o, n], dy[o + 1, n], dy[o + 2, n], dy[o + 3, n]
+                dx[i, n] += w00 * y0 + w10 * y1 + w20 * y2 + w30 * y3
+                dx[i + 1, n] += w01 * y0 + w11 * y1 + w21 * y2 + w31 * y3
+                dx[i + 2, n] += w02 * y0 + w12 * y1 + w22 * y2 + w32 * y3
+                dx[i + 3, n] += w03 * y0 + w13 * y1 + w23 * y2 + w33 * y3
+
+
+@inner
+def back_weight(dW, db, dy, x):
+    """dW += dy x^T, db += the sum of dy."""
+    outputs, inputs = dW.shape
+    zero = float32(0)
+    for o in range(0, outputs, 4):
+        for k in range(o, o + 4):
+            total = zero
+            for n in range(TILE):
+                total += dy[k, n]
+            db[k] += total
+        for i in range(0, inputs, 4):
+            s00, s01, s02, s03 = zero, zero, zero, zero
+            s10, s11, s12, s13 = zero, zero, zero, zero
+            s20, s21, s22, s23 = zero, zero, zero, zero
+            s30, s31, s32, s33 = zero, zero, zero, zero
+            for n in range(TILE):
+                x0, x1, x2, x3 = x[i, n], x[i + 1, n], x[i + 2, n], x[i + 3, n]
+                y0, y1, y2, y3 = dy[o, n], dy[o + 1, n], dy[o + 2, n], dy[o + 3, n]
+                s00, s01, s02, s03 = s00 + y0 * x0, s01 + y0 * x1, s02 + y0 * x2, s03 + y0 * x3
+                s10, s11, s12, s13 = s10 + y1 * x0, s11 + y1 * x1, s12 + y1 * x2, s13 + y1 * x3
+                s20, s21, s22, s23 = s20 + y2 * x0, s21 + y2 * x1, s22 + y2 * x2, s23 + y2 * x3
+                s30, s31, s32, s33 = s30 + y3 * x0, s31 + y3 * x1, s32 + y3 * x2, s33 + y3 * x3
+            for k, sums in enumerate(
+                ((s00, s01, s02, s03), (s10, s11, s12, s13), (s20, s21, s22, s23), (s30, s31, s32, s33))
+            ):
+                for m in range(4):
+                    dW[o + k, i + m] += sums[m]
+
+
+@inner
+def load(x, extra, first, count, tile):
+    """Copies columns first : first + count of x, then of extra, into a tile; zeros fill the rest of it."""
+    rows = len(x)
+    tile[rows + len(extra) :] = float32(0)
+    for i in range(rows):
+        tile[i, :count] = x[i, first : first + count]
+    for i in range(len(extra)):
+        tile[rows + i, :count] = extra[i, first : first + count]
+    if count < TILE:
+        tile[:, count:] = float32(0)
+
+
+@inner
+def layer(weights, start, inputs, outputs):
+    """The matrix [O, I] and the bias [O] of the layer that begins at `start`."""
+    end = start + outputs * inputs
+    return weights[start:end].reshape(outputs, inputs), weights[end : end + outputs]
+
+
+@inner
+def run_tile(weights, widths, activations):
+    """Runs the network on the tile in the first rows of `activations`; each layer's output follows its input.
+
+    Returns the rows where the last output begins and the length of `weights`.
+    """
+    start, row, layers = 0, 0, len(widths) - 1
+    for index in range(layers):
+        inputs, outputs = widths[index], widths[index + 1]
+        matrix, bias = layer(weights, start, inputs, outputs)
+        below, above = row + inputs, row + inputs + outputs
+        affine(matrix, bias, activations[row:below], activations[below:above], index < layers - 1)
+        start += outputs * inputs + outputs
+        row = below
+    return row, start
+
+
+@kernel
+def forward(weights, widths, x, extra, out, workers):
+    """out [O, N] from x [I, N] and extra [E, N]."""
+    samples = x.shape[1]
+    tiles = (samples + TILE - 1) // TILE
+    for worker in prange(workers):
+        activations = np.empty((widths.sum(), TILE), np.float32)
+        for tile in range(tiles * worker // workers, tiles * (worker + 1) // workers):
+            first = tile * TILE
+            count = min(TILE, samples - first)
+            load(x, extra, first, count, activations[: widths[0]])
+            row, _ = run_tile(weights, widths, activations)
+            for o in range(len(out)):
+                out[o, first : first + count] = activations[row + o, :count]
+
+
+@kernel
+def backward(weights, widths, x, extra, above, grad_x, grad_weights, workers):
+    """Fills grad_x [I, N] and one row of grad_weights [workers, W] a worker, running each tile again on the way."""
+    samples = x.shape[1]
+    tiles, layers = (samples + TILE - 1) // TILE, len(widths) - 1
+    nothing = np.empty((0, samples), np.float32)
+    for worker in prange(workers):
+        activations = np.empty((widths.sum(), TILE), np.float32)
+        grad_out = np.empty((widths.max(), TILE), np.float32)
+        grad_in = np.empty((widths.max(), TILE), np.float32)
+        sums = grad_weights[worker]
+        sums[:] = float32(0)
+        for tile in range(tiles * worker // workers, tiles * (worker + 1) // workers):
+            first = tile * TILE
+            count = min(TILE, samples - first)
+            load(x, extra, first, count, activations[: widths[0]])
+            row, start = run_tile(weights, widths, activations)
+            load(above, nothing, first, count, grad_out[: widths[layers]])
+            for index in range(layers - 1, -1, -1):
+                inputs, outputs = widths[index], widths[index + 1]
+                start -= outputs * inputs + outputs
+                row -= inputs
+                matrix, _ = layer(weights, start, inputs, outputs)
+                grad_matrix, grad_bias = layer(sums, start, inputs, outputs)
+                entered = activations[row : row + inputs]
+                back_weight(grad_matrix, grad_bias, grad_out[:outputs], entered)
+                back_input(matrix, grad_out[:outputs], grad_in[:inputs])
+                if index > 0:
+                    for i in range(inputs):
+                        for n in range(TILE):
+                            grad_out[i, n] = grad_in[i, n] if entered[i, n] > float32(0) else float32(0)
+            for i in range(len(grad_x)):
+                grad_x[i, first : first + count] = grad_in[i, :count]

@@ -1,0 +1,132 @@
+"""Where rays cross the occupied cells of a grid over the bounds."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.kernels.switch import fast
+
+MAX_CANDIDATES = 1 << 20
+"""Intervals the reference looks at together: bounds the memory of one call, whatever the number of rays."""
+BLOCK = 4
+"""Cells along a side of the blocks that the fast version crosses in one leap where they are empty."""
+
+Packed = tuple[Float[Tensor, "N"], Float[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "R_plus_1"]]
+"""Midpoint and length of each interval, its ray, and where each ray's intervals begin."""
+
+
+def cell_index(unit: Float[Tensor, "*batch 3"], resolution: int) -> Int[Tensor, "*batch"]:
+    """Flat index of the cell of a resolution^3 grid over [0, 1]^3 that holds each position (clamped into the grid)."""
+    x, y, z = (unit * resolution).long().clamp_(0, resolution - 1).unbind(-1)
+    return (x * resolution + y) * resolution + z
+
+
+def pack_intervals(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Packed:
+    """Packs the kept intervals between consecutive edges of each ray."""
+    counts = keep.sum(1)
+    offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    ray, column = keep.nonzero(as_tuple=True)
+    start, end = edges[ray, column], edges[ray, column + 1]
+    return (start + end) / 2, end - start, ray, offsets
+
+
+def march_reference(
+    rays: Rays,
+    bounds: Bounds,
+    near: Float[Tensor, "R"],
+    far: Float[Tensor, "R"],
+    shift: Float[Tensor, "R"],
+    occupied: Bool[Tensor, "cells"],
+    samples: int,
+    step: float,
+) -> Packed:
+    """`march` in plain torch, for every device."""
+    resolution = round(len(occupied) ** (1 / 3))
+    # One more than the steps: the first one may be cut short by the shift, and the last must reach the far end.
+    steps = torch.arange(samples + 2, device=near.device) + shift[:, None] - 0.5
+    if bounds.unbounded:
+        edges = bounds.distances(near, far, (steps / samples).clamp(0, 1))
+    else:
+        edges = torch.minimum(near[:, None] + steps.clamp_min(0) * step, far[:, None])
+    keep = edges[:, 1:] > edges[:, :-1]
+    rows = max(1, MAX_CANDIDATES // samples)
+    for start in range(0, len(rays), rows):
+        part = slice(start, start + rows)
+        inside = keep[part]
+        ray, column = inside.nonzero(as_tuple=True)
+        t = (edges[part][ray, column] + edges[part][ray, column + 1]) / 2
+        chunk = rays[part]
+        unit = bounds.to_unit(chunk.origins[ray] + t[:, None] * chunk.directions[ray])
+        inside[ray, column] = occupied[cell_index(unit, resolution)]
+    return pack_intervals(edges, keep)
+
+
+def march(
+    rays: Rays,
+    bounds: Bounds,
+    near: Float[Tensor, "R"],
+    far: Float[Tensor, "R"],
+    shift: Float[Tensor, "R"],
+    occupied: Bool[Tensor, "cells"],
+    samples: int,
+    step: float,
+) -> Packed:
+    """Equal steps from near to far, of which those are kept whose midpoint lies in an occupied cell.
+
+    Args:
+        rays, bounds: in world units.
+        near, far: distances along each ray; a ray with near >= far gets nothing.
+        shift: moves each ray's steps along it, as a share of a step, in [0, 1).
+        occupied: cells of a cubic grid over the bounds' unit cube, last axis fastest.
+        samples: steps of an unbounded ray, where they are as long as `Bounds.distances` says; otherwise at most so many.
+        step: length of a step inside bounds.
+    """
+    if not fast(rays.origins, near, shift):
+        return march_reference(rays, bounds, near, far, shift, occupied, samples, step)
+    from nerf_lightning.kernels.cpu import march as cpu
+    from nerf_lightning.kernels.cpu import workers
+
+    threads, count, resolution = workers(), len(rays), round(len(occupied) ** (1 / 3))
+    cells = resolution // BLOCK if resolution % BLOCK == 0 else resolution
+    blocks = np.empty(cells**3, np.bool_)
+    cpu.coarsen(occupied.numpy(), resolution, blocks, cells, threads)
+    found, counts = np.empty((count, samples + 1), np.int32), np.empty(count, np.int64)
+    origins, directions = rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy()
+    ends = near.contiguous().numpy(), far.contiguous().numpy(), shift.contiguous().numpy()
+    half, length = bounds.half_size.numpy(), np.float32(step)
+    box = bounds.centre.numpy(), half, bounds.unbounded
+    cpu.walk(
+        origins, directions, *ends, occupied.numpy(), resolution, blocks, cells, *box, samples, length, found, counts, threads
+    )  # fmt: skip
+    offsets = torch.zeros(count + 1, dtype=torch.int64)
+    np.cumsum(counts, out=offsets.numpy()[1:])
+    total = int(offsets[-1])
+    t, dt, ray = torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
+    cpu.pack(
+        *ends, half, bounds.unbounded, samples, length, found, offsets.numpy(), t.numpy(), dt.numpy(), ray.numpy(), threads
+    )  # fmt: skip
+    return t, dt, ray, offsets
+
+
+def points_reference(
+    origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
+) -> Float[Tensor, "N 3"]:
+    """`points` in plain torch, for every device."""
+    return origins[ray] + t[:, None] * directions[ray]
+
+
+def points(
+    origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
+) -> Float[Tensor, "N 3"]:
+    """Positions at distances `t` along the rays that `ray` numbers."""
+    if not fast(origins, directions, t) or any(x.requires_grad for x in (origins, directions, t)):
+        return points_reference(origins, directions, ray, t)
+    from nerf_lightning.kernels.cpu import march as cpu
+    from nerf_lightning.kernels.cpu import workers
+
+    out = torch.empty(3, len(t))
+    arrays = (x.contiguous().numpy() for x in (origins, directions, ray, t))
+    cpu.points(*arrays, out.numpy(), workers())
+    return out.T

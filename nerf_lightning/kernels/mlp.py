@@ -1,0 +1,84 @@
+"""Small fully connected networks, run sample by sample rather than layer by layer."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import linear
+
+from nerf_lightning.kernels.switch import fast
+
+Layers = Sequence[tuple[Float[Tensor, "O I"], Float[Tensor, "O"]]]
+"""Matrix and bias of each layer."""
+
+
+def mlp_reference(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None) -> Tensor:
+    """`mlp` in plain torch, for every device and precision; `extra` may have gradients too."""
+    h = x if extra is None else torch.cat([x, extra], dim=1)
+    for matrix, bias in layers[:-1]:
+        h = torch.relu(linear(h, matrix, bias))
+    return linear(h, *layers[-1])
+
+
+def _padded(width: int) -> int:
+    return -(-width // 4) * 4
+
+
+def _blocks(shapes: list[tuple[int, int]], row: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Views of the layers' matrices and biases in a row of numbers where every width is filled up to a multiple of 4."""
+    blocks, start = [], 0
+    for outputs, inputs in shapes:
+        o, i = _padded(outputs), _padded(inputs)
+        matrix = row[start : start + o * i].reshape(o, i)[:outputs, :inputs]
+        blocks.append((matrix, row[start + o * i :][:outputs]))
+        start += o * i + o
+    return blocks
+
+
+class _MLP(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, extra: Tensor, *flat: Tensor) -> Tensor:
+        from nerf_lightning.kernels.cpu import mlp, workers
+
+        shapes = [(len(matrix), matrix.shape[1]) for matrix in flat[::2]]
+        widths = np.array([_padded(n) for n in (shapes[0][1], *(outputs for outputs, _ in shapes))])
+        row = np.zeros((widths[1:] * (widths[:-1] + 1)).sum(), np.float32)
+        for block, matrix, bias in zip(_blocks(shapes, row), flat[::2], flat[1::2], strict=True):
+            block[0][:], block[1][:] = matrix.detach().numpy(), bias.detach().numpy()
+        x, extra = x.T.contiguous(), extra.T.contiguous()
+        out = torch.empty(shapes[-1][0], x.shape[1])
+        mlp.forward(row, widths, x.numpy(), extra.numpy(), out.numpy(), workers())
+        ctx.save_for_backward(x, extra)
+        ctx.network = shapes, widths, row
+        return out.T
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
+        from nerf_lightning.kernels.cpu import mlp, workers
+
+        x, extra = ctx.saved_tensors
+        shapes, widths, row = ctx.network
+        grad_x, threads = torch.empty_like(x), workers()
+        sums = np.empty((threads, len(row)), np.float32)
+        above = grad.T.contiguous().numpy()
+        mlp.backward(row, widths, x.numpy(), extra.numpy(), above, grad_x.numpy(), sums, threads)
+        grads = [torch.tensor(part) for block in _blocks(shapes, sums.sum(0)) for part in block]
+        return grad_x.T, None, *grads
+
+
+def mlp(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None) -> Float[Tensor, "N O"]:
+    """Linear layers with rectifiers between them.
+
+    Args:
+        x: inputs.
+        layers: of each layer the matrix [outputs, inputs] and the bias.
+        extra: further inputs after `x`, taken as constants: they get no gradient.
+    """
+    tensors = [x, *(parameter for layer in layers for parameter in layer)]
+    if extra is None:
+        extra = x.new_empty(len(x), 0)
+    if fast(*tensors, extra):
+        return _MLP.apply(x, extra, *tensors[1:])
+    return mlp_reference(x, layers, extra.detach())
