@@ -1,5 +1,6 @@
 """One training run, from a composed configuration to the files in its folder."""
 
+import copy
 import logging
 import warnings
 from contextlib import suppress
@@ -10,15 +11,19 @@ import lightning as L
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
 
 from nerf_lightning.allocator import keep_freed_memory
 from nerf_lightning.build import build_data, build_system, build_trainer, check_background, frame_of, resolved
 from nerf_lightning.callbacks import Results
 from nerf_lightning.callbacks.attached import attached
+from nerf_lightning.dataset import PixelDataModule, RayDataModule, draw_rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.options import AtLeast, Count, check_options
 from nerf_lightning.run_folder import load_config, read_checkpoint, save_config, save_scene
+from nerf_lightning.seeding import step_generator
+from nerf_lightning.system import NeRF3D, System
 
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
@@ -43,6 +48,7 @@ def train(cfg: DictConfig) -> float:
     trainer = build_trainer(cfg, folder)
     save_config(cfg, folder)
     save_scene(data, folder)
+    warm_up(system, data)
     trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(system, data, verbose=False)
     results = written(trainer)
@@ -75,6 +81,16 @@ def prepare_process(seed: Annotated[int, AtLeast(0)], threads: Count | None, ker
     keep_freed_memory()
     torch.set_flush_denormal(True)  # dying weights otherwise slow the CPU down many times over
     L.seed_everything(seed, verbose=False)
+
+
+def warm_up(system: System, data: RayDataModule | PixelDataModule) -> None:
+    """Runs a small step on a copy, so that kernels are compiled before the clock starts (half a minute the first time)."""
+    if not isinstance(system, NeRF3D) or isinstance(data, PixelDataModule):
+        return
+    with Console().status("getting the kernels ready (the first time they are compiled: half a minute)"):
+        trial = copy.deepcopy(system)
+        batch = draw_rays(data.scene.train, 64, step_generator(0, 0, 0))
+        trial.loss(batch, step_generator(0, 1, 0), 1)[0].backward()  # step 1: without a look at the whole grid
 
 
 def written(trainer: L.Trainer) -> dict[str, Any]:

@@ -1,18 +1,33 @@
 """Fixtures that all tests share."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from jaxtyping import install_import_hook
 
+ROOT = Path(__file__).resolve().parents[1]
+UNCHECKED = "nerf_lightning.kernels.cpu"
+
+
+def checked_modules() -> list[str]:
+    """All modules but those in `UNCHECKED`, whose functions numba must see undecorated, and the packages that hold it."""
+    files = (file.relative_to(ROOT).with_suffix("") for file in (ROOT / "nerf_lightning").rglob("*.py"))
+    names = {".".join(file.parts).removesuffix(".__init__") for file in files}
+    # The hook takes a name for everything below it.
+    return sorted(n for n in names if not f"{UNCHECKED}.".startswith(f"{n}.") and not n.startswith(f"{UNCHECKED}."))
+
+
 # Before anything imports the package: from here on a wrong shape fails the test that met it.
-install_import_hook("nerf_lightning", "typechecker.check")
+install_import_hook(checked_modules(), "typechecker.check")
 
 # ruff: noqa: E402
 import pytest
 import torch
+from torch.nn.functional import normalize
 
-ROOT = Path(__file__).resolve().parents[1]
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.kernels import use_kernels
 
 
 @pytest.fixture(scope="session")
@@ -35,6 +50,20 @@ def same_chance() -> None:
     torch.manual_seed(0)
 
 
+@pytest.fixture(autouse=True)
+def fast_kernels() -> Iterator[None]:
+    """Whatever a test switches, the next one finds the fast kernels."""
+    yield
+    use_kernels("auto")
+
+
+@pytest.fixture(params=["auto", "reference"])
+def kernels(request: pytest.FixtureRequest, fast_kernels: None) -> str:
+    """Runs a test with the fast kernels, and again with the reference."""
+    use_kernels(request.param)
+    return request.param
+
+
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
     """The folder of a finished run on the built-in scene, seconds long."""
@@ -45,3 +74,21 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path
     folder = tmp_path_factory.mktemp("run")
     train(composed(["+experiment=smoke_3d", "dataset.size=16", "budget.steps=10", "callbacks.orbit.frames=0"], folder))
     return folder
+
+
+LOW, HIGH = torch.tensor([-1.0, -1.5, -0.5]), torch.tensor([1.0, 0.5, 1.5])
+
+
+@pytest.fixture
+def box() -> Bounds:
+    return Bounds(torch.stack([LOW, HIGH]))
+
+
+@pytest.fixture
+def rays() -> Rays:
+    """60 rays from outside toward the box, some of which miss; 10 from inside; 1 that certainly misses."""
+    origins = torch.cat([4 * normalize(torch.randn(60, 3), dim=-1), LOW + torch.rand(10, 3) * (HIGH - LOW)])
+    toward = LOW + torch.rand(70, 3) * (HIGH - LOW) * 1.4
+    directions = normalize(toward - origins, dim=-1)
+    away = torch.tensor([[5.0, 5.0, 5.0]])
+    return Rays(torch.cat([origins, away]), torch.cat([directions, normalize(away, dim=-1)]))

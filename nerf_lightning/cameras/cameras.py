@@ -1,6 +1,7 @@
 """Cameras and Rays, the currency of the first stages."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -59,8 +60,17 @@ class Cameras:
 
     def rays(self, view: Int[Tensor, "R"], row: Int[Tensor, "R"], col: Int[Tensor, "R"]) -> Rays:
         """Rays through the centres of the given pixels."""
-        uv = torch.stack([col, row], dim=-1).to(self.K.dtype) + 0.5
-        return Rays(*pixel_to_ray(self.K[view], self.c2w[view], uv))
+        u, v = col.to(self.K.dtype) + 0.5, row.to(self.K.dtype) + 0.5
+        across, down, ahead = self.pixel_axes[view].unbind(1)
+        directions = torch.nn.functional.normalize(across * u[:, None] + down * v[:, None] + ahead, dim=1)
+        return Rays(self.centres[view], directions)
+
+    @cached_property
+    def pixel_axes(self) -> Float[Tensor, "V 3 3"]:
+        """World vectors a, b, c of each view: pixel (u, v) looks along u a + v b + c, as `pixel_to_ray` says of one pixel."""
+        identity = torch.eye(3, dtype=torch.float64, device=self.K.device).expand_as(self.K)
+        inverse = torch.linalg.solve_triangular(self.K.double(), identity, upper=True)
+        return (self.c2w[:, :3, :3].double() @ inverse).mT.to(self.K.dtype).contiguous()
 
     def view_rays(self, view: int) -> Rays:
         """All H*W rays of one view, row by row."""

@@ -17,12 +17,21 @@ from nerf_lightning.kernels.march import (
     cell_index,
     march,
     march_reference,
+    mark_cells,
+    mark_cells_reference,
     pack_intervals,
     points,
     points_reference,
 )
-from nerf_lightning.kernels.mlp import mlp, mlp_reference
+from nerf_lightning.kernels.mlp import mlp, mlp_heads, mlp_reference
 from nerf_lightning.kernels.switch import fast, use_kernels
+from nerf_lightning.kernels.voxels import (
+    touch_rows,
+    voxel_colour,
+    voxel_colour_reference,
+    voxel_value,
+    voxel_values_reference,
+)
 
 __all__ = [
     "accumulate",
@@ -36,13 +45,21 @@ __all__ = [
     "keep_visible_reference",
     "march",
     "march_reference",
+    "mark_cells",
+    "mark_cells_reference",
     "mlp",
+    "mlp_heads",
     "mlp_reference",
     "pack_intervals",
     "points",
     "points_reference",
     "spherical_harmonics",
     "spherical_harmonics_reference",
+    "touch_rows",
     "use_kernels",
     "volume_weights",
+    "voxel_colour",
+    "voxel_colour_reference",
+    "voxel_value",
+    "voxel_values_reference",
 ]

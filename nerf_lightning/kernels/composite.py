@@ -10,6 +10,8 @@ from nerf_lightning.kernels.switch import fast
 
 Pixels = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
 """Colour, opacity and depth summed along each ray, each sample by its weight."""
+Kept = tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
+"""`Packed`, of the K samples that are left of N."""
 
 
 def volume_weights(
@@ -101,17 +103,17 @@ def composite(
     Args:
         density, dt, ray, offsets: see `volume_weights`.
         rgb: colour of each sample.
-        t: distance of each sample along its ray, a constant.
+        t: distance of each sample along its ray.
 
     Returns:
         Colour without background, opacity in [0, 1], and the sum of distances (not divided by opacity).
     """
-    if fast(density, rgb, t):
+    if fast(density, rgb, t, dt) and not (t.requires_grad or dt.requires_grad):
         return _Composite.apply(density, rgb, t, dt, offsets)
     return composite_reference(density, rgb, t, dt, ray, offsets)
 
 
-def keep_visible_reference(density: Float[Tensor, "M"], packed: Packed, transparent: float, thin: float) -> Packed:
+def keep_visible_reference(density: Float[Tensor, "N"], packed: Packed, transparent: float, thin: float) -> Kept:
     """`keep_visible` in plain torch, for every device."""
     t, dt, ray, offsets = packed
     optical = density * dt
@@ -121,17 +123,17 @@ def keep_visible_reference(density: Float[Tensor, "M"], packed: Packed, transpar
     return t[keep], dt[keep], ray[keep], kept
 
 
-def keep_visible(density: Float[Tensor, "M"], packed: Packed, transparent: float, thin: float) -> Packed:
+def keep_visible(density: Float[Tensor, "N"], packed: Packed, transparent: float, thin: float) -> Kept:
     """Drops samples that light cannot reach, and those that hold nothing.
 
     Args:
         density: of each sample, 1 / world unit.
-        packed: midpoints, lengths, rays and offsets of M samples.
+        packed: midpoints, lengths, rays and offsets of N samples.
         transparent: transmittance below which a ray has ended, above 0.
         thin: opacity of a sample below which it holds nothing, below 1.
     """
     t, dt, ray, offsets = packed
-    if not fast(density, t):
+    if not fast(density, t, dt) or t.requires_grad or dt.requires_grad:
         return keep_visible_reference(density, packed, transparent, thin)
     from nerf_lightning.kernels.cpu import composite as cpu
     from nerf_lightning.kernels.cpu import workers

@@ -50,7 +50,7 @@ def hash_interpolate_reference(
     indices, weights, start = [], [], 0
     for resolution, size in zip(resolutions, sizes, strict=True):
         scaled = places * resolution
-        cell = scaled.to(torch.int32).clamp_(max=resolution - 1)
+        cell = scaled.to(torch.int32).clamp_(0, resolution - 1)  # what is not a number stays so, in some cell
         index, weight = corners(cell, scaled - cell, resolution, size)
         # int64, for which alone the CPU's index_add (the gather's gradient) is fast: 7 against 105 ms for two million.
         indices.append(index.long() + start)

@@ -83,7 +83,8 @@ def march(
         samples: steps of an unbounded ray, where they are as long as `Bounds.distances` says; otherwise at most so many.
         step: length of a step inside bounds.
     """
-    if not fast(rays.origins, near, shift):
+    constants = not any(x.requires_grad for x in (rays.origins, rays.directions, near, far, shift))
+    if not (constants and fast(rays.origins, near, shift)):
         return march_reference(rays, bounds, near, far, shift, occupied, samples, step)
     from nerf_lightning.kernels.cpu import march as cpu
     from nerf_lightning.kernels.cpu import workers
@@ -130,3 +131,25 @@ def points(
     arrays = (x.contiguous().numpy() for x in (origins, directions, ray, t))
     cpu.points(*arrays, out.numpy(), workers())
     return out.T
+
+
+def mark_cells_reference(
+    marks: Int[Tensor, "cells"], mark: int, rays: Rays, bounds: Bounds, ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
+) -> None:
+    """`mark_cells` in plain torch, for every device."""
+    unit = bounds.to_unit(points_reference(rays.origins, rays.directions, ray, t))
+    marks[cell_index(unit, round(len(marks) ** (1 / 3)))] = mark
+
+
+def mark_cells(
+    marks: Int[Tensor, "cells"], mark: int, rays: Rays, bounds: Bounds, ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
+) -> None:
+    """Writes `mark` into each cell of a cubic grid over the bounds that holds one of the samples."""
+    if not fast(rays.origins, rays.directions, t):
+        return mark_cells_reference(marks, mark, rays, bounds, ray, t)
+    from nerf_lightning.kernels.cpu import march as cpu
+    from nerf_lightning.kernels.cpu import workers
+
+    arrays = (x.detach().contiguous().numpy() for x in (rays.origins, rays.directions, ray, t))
+    box = bounds.centre.numpy(), bounds.half_size.numpy(), bounds.unbounded
+    cpu.mark(*arrays, *box, marks.numpy(), round(len(marks) ** (1 / 3)), mark, workers())

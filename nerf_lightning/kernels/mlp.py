@@ -10,8 +10,8 @@ from torch.nn.functional import linear
 
 from nerf_lightning.kernels.switch import fast
 
-Layers = Sequence[tuple[Float[Tensor, "O I"], Float[Tensor, "O"]]]
-"""Matrix and bias of each layer."""
+Layers = Sequence[tuple[Float[Tensor, "_ _"], Float[Tensor, "_"]]]
+"""Matrix [outputs, inputs] and bias [outputs] of each layer."""
 
 
 def mlp_reference(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None) -> Tensor:
@@ -39,7 +39,7 @@ def _blocks(shapes: list[tuple[int, int]], row: np.ndarray) -> list[tuple[np.nda
 
 class _MLP(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x: Tensor, extra: Tensor, *flat: Tensor) -> Tensor:
+    def forward(ctx, x: Tensor, extra: Tensor, first: int, *flat: Tensor) -> tuple[Tensor, Tensor]:
         from nerf_lightning.kernels.cpu import mlp, workers
 
         shapes = [(len(matrix), matrix.shape[1]) for matrix in flat[::2]]
@@ -52,20 +52,32 @@ class _MLP(torch.autograd.Function):
         mlp.forward(row, widths, x.numpy(), extra.numpy(), out.numpy(), workers())
         ctx.save_for_backward(x, extra)
         ctx.network = shapes, widths, row
-        return out.T
+        return out[:first].T, out[first:].T
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx, *grads: Tensor) -> tuple[Tensor | None, ...]:
         from nerf_lightning.kernels.cpu import mlp, workers
 
         x, extra = ctx.saved_tensors
         shapes, widths, row = ctx.network
         grad_x, threads = torch.empty_like(x), workers()
         sums = np.empty((threads, len(row)), np.float32)
-        above = grad.T.contiguous().numpy()
+        above = torch.cat([grad.T for grad in grads]).numpy()
         mlp.backward(row, widths, x.numpy(), extra.numpy(), above, grad_x.numpy(), sums, threads)
-        grads = [torch.tensor(part) for block in _blocks(shapes, sums.sum(0)) for part in block]
-        return grad_x.T, None, *grads
+        return grad_x.T, None, None, *(torch.tensor(part) for block in _blocks(shapes, sums.sum(0)) for part in block)
+
+
+def mlp_heads(
+    x: Float[Tensor, "N I"], layers: Layers, first: int, extra: Float[Tensor, "N E"] | None = None
+) -> tuple[Float[Tensor, "N first"], Float[Tensor, "N rest"]]:
+    """Like `mlp`, with the first outputs apart from the others, which spares taking them apart."""
+    parameters = [parameter for layer in layers for parameter in layer]
+    if extra is None:
+        extra = x.new_empty(len(x), 0)
+    if fast(x, extra, *parameters):
+        return _MLP.apply(x, extra, first, *parameters)
+    out = mlp_reference(x, layers, extra.detach())
+    return out[:, :first], out[:, first:]
 
 
 def mlp(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None) -> Float[Tensor, "N O"]:
@@ -76,9 +88,4 @@ def mlp(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | N
         layers: of each layer the matrix [outputs, inputs] and the bias.
         extra: further inputs after `x`, taken as constants: they get no gradient.
     """
-    tensors = [x, *(parameter for layer in layers for parameter in layer)]
-    if extra is None:
-        extra = x.new_empty(len(x), 0)
-    if fast(*tensors, extra):
-        return _MLP.apply(x, extra, *tensors[1:])
-    return mlp_reference(x, layers, extra.detach())
+    return mlp_heads(x, layers, 0, extra)[1]

@@ -6,6 +6,7 @@ from nerf_lightning.model.field import Field, PictureField
 from nerf_lightning.model.hashgrid import HashGrid, HashGridField
 from nerf_lightning.model.mlp import MLPField
 from nerf_lightning.model.picture import PictureMLP
+from nerf_lightning.model.voxels import VoxelField
 
 __all__ = [
     "Field",
@@ -16,5 +17,6 @@ __all__ = [
     "PictureMLP",
     "density_activation",
     "sinusoidal",
+    "VoxelField",
     "truncated_exp",
 ]

@@ -7,6 +7,14 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, InBounds
 
 
+def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
+    """Gives a parameter data of another shape. It stays the same parameter, in modules and optimisers."""
+    parameter.grad = None
+    # Autograd remembers a parameter's shape as long as some graph that used it lives; a change of type makes it forget.
+    parameter.data = data.new_empty(0, dtype=torch.float64)
+    parameter.data = data
+
+
 class Field(InBounds):
     """A radiance field in world coordinates. Subclasses define `features` and `colour`.
 

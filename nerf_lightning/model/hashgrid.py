@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import hash_interpolate, mlp, spherical_harmonics
+from nerf_lightning.kernels import hash_interpolate, mlp, mlp_heads, spherical_harmonics
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field
 from nerf_lightning.options import Count
@@ -33,7 +33,7 @@ class HashGrid(torch.nn.Module):
     def __init__(
         self,
         levels: Count = 8,
-        log2_entries: Count = 16,
+        log2_entries: Count = 17,
         features: Count = 2,
         coarsest: Count = 16,
         finest: Count = 256,
@@ -57,9 +57,9 @@ def layers(*widths: int) -> torch.nn.ModuleList:
     return torch.nn.ModuleList(torch.nn.Linear(i, o) for i, o in pairwise(widths))
 
 
-def run(net: torch.nn.ModuleList, x: Float[Tensor, "N I"], extra: Float[Tensor, "N E"] | None = None) -> Tensor:
-    """A small network of `layers`; see `kernels.mlp`."""
-    return mlp(x, [(layer.get_parameter("weight"), layer.get_parameter("bias")) for layer in net], extra)
+def weights(net: torch.nn.ModuleList) -> list[tuple[Tensor, Tensor]]:
+    """Matrix and bias of each of the `layers`."""
+    return [(layer.get_parameter("weight"), layer.get_parameter("bias")) for layer in net]
 
 
 class HashGridField(Field):
@@ -78,11 +78,11 @@ class HashGridField(Field):
         self,
         bounds: Bounds,
         levels: Count = 8,
-        log2_entries: Count = 16,
+        log2_entries: Count = 17,
         features: Count = 2,
         coarsest: Count = 16,
         finest: Count = 256,
-        width: Count = 32,
+        width: Count = 64,
         density: str = "exp",
     ):
         super().__init__(bounds)
@@ -92,8 +92,9 @@ class HashGridField(Field):
         self.colour_net = layers(self.GEOMETRY + 16, width, width, 3)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
-        out = run(self.density_net, self.grid(self.bounds.to_unit(positions)))
-        return self.activation(out[:, 0]), out[:, 1:]
+        encoded = self.grid(self.bounds.to_unit(positions))
+        raw, geometry = mlp_heads(encoded, weights(self.density_net), 1)
+        return self.activation(raw[:, 0]), geometry
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(run(self.colour_net, features, spherical_harmonics(directions)))
+        return torch.sigmoid(mlp(features, weights(self.colour_net), spherical_harmonics(directions)))

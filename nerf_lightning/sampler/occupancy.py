@@ -4,7 +4,8 @@ import torch
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import keep_visible, march
+from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import keep_visible, march, mark_cells
 from nerf_lightning.options import Count
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
 
@@ -13,49 +14,68 @@ MAX_ASKED = 1 << 17
 
 
 class OccupancySampler(Sampler):
-    """Steps of one length through the bounds, kept only in cells where density was found.
+    """Steps of one length through the bounds, kept only where there is something that light can reach.
 
-    Each cell holds a decaying maximum of the optical thickness (density times step) seen in it at random places; a cell is
-    occupied while that stands above the lower of `threshold` and half the grid's mean.
+    A coarse grid says where to look. Each cell holds a decaying maximum of the optical thickness (density times step) found
+    in it at random places; it is occupied while that stands above the lower of `threshold` and half the grid's mean. In
+    training, only cells that light reached lately are looked at, but for one step in `update_every` that looks at all
+    occupied ones: what lies inside a solid costs nothing. Then the field's density is asked along the steps found, and those
+    behind something opaque, and those that hold nothing, are dropped.
 
     Args:
         bounds: where the content is.
         samples: steps along the diagonal of the bounds; rays that cross less of it get fewer.
         resolution: cells along each side.
         threshold: optical thickness of a step above which a cell counts as occupied.
-        decay: factor on a cell's memory at each update.
+        decay: factor on a cell's memory each time it is looked at.
         update_every: training steps between updates.
         warmup: steps during which every update looks at every cell; afterwards at a quarter of them.
-        transparent: transmittance below which a ray has ended: what lies behind is dropped.
-        thin: opacity of a step below which it is dropped.
+        memory: updates after which a cell that light no longer reached is left out.
+        transparent: transmittance below which a ray has ended, above 0.
+        thin: opacity of a step below which training drops it; never more than half the mean, so that a fog trains too.
     """
 
     thickness: Tensor
     occupied: Tensor
+    reached: Tensor
+    lit: Tensor
 
     def __init__(
         self,
         bounds: Bounds,
-        samples: Count = 256,
+        samples: Count = 192,
         resolution: Count = 64,
         threshold: float = 0.01,
-        decay: float = 0.95,
+        decay: float = 0.8,
         update_every: Count = 16,
         warmup: int = 256,
+        memory: Count = 8,
         transparent: float = 1e-4,
-        thin: float = 1e-3,
+        thin: float = 5e-3,
     ):
         super().__init__(bounds)
+        if not 0 < transparent < 1:
+            raise InputError("sampler.transparent", "", str(transparent), "between 0 and 1")
+        if not 0 <= thin < 1:
+            raise InputError("sampler.thin", "", str(thin), "at least 0, below 1")
         self.samples = samples
         self.resolution = resolution
         self.threshold = threshold
         self.decay = decay
         self.update_every = update_every
         self.warmup = warmup
+        self.memory = memory
         self.transparent = transparent
         self.thin = thin
-        self.register_buffer("thickness", torch.zeros(resolution**3))
-        self.register_buffer("occupied", torch.ones(resolution**3, dtype=torch.bool))
+        cells = resolution**3
+        self.register_buffer("thickness", torch.zeros(cells))
+        self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
+        self.register_buffer("reached", torch.zeros(cells, dtype=torch.int32))
+        self.register_buffer("lit", torch.ones(cells, dtype=torch.bool))
+        self.updates = 0
+        """Number of the last update; `reached` holds the number of the update after which light last met the cell."""
+        self.look_everywhere = True
+        """Whether the next training step looks at all occupied cells."""
 
     @property
     def step_length(self) -> float:
@@ -64,17 +84,30 @@ class OccupancySampler(Sampler):
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
-        shift = torch.zeros_like(near)
+        shift, cells = torch.zeros_like(near), self.occupied
         if generator is not None:
             shift = torch.rand(near.shape, generator=generator, device=near.device)
-        packed = march(rays, self.bounds, near, far, shift, self.occupied, self.samples, self.step_length)
+            cells = self.occupied if self.look_everywhere else self.lit
+        packed = march(rays, self.bounds, near, far, shift, cells, self.samples, self.step_length)
+        candidates = Samples(*packed)
+        if not len(candidates):
+            return candidates
         with torch.no_grad():
-            seen = torch.cat([density(part) for part in Samples(*packed).positions(rays).split(MAX_ASKED)])
-        return Samples(*keep_visible(seen, packed, self.transparent, self.thin))
+            found = torch.cat([density(part) for part in candidates.positions(rays).split(MAX_ASKED)])
+        # A picture must not depend on how its rays are cut into calls: only training looks at the mean, and drops.
+        thin = 0.0
+        if generator is not None:
+            thin = min(self.thin, 0.5 * float(torch.dot(found, candidates.dt)) / len(candidates))
+        samples = Samples(*keep_visible(found, packed, self.transparent, thin))
+        if generator is not None:
+            mark_cells(self.reached, self.updates, rays, self.bounds, samples.ray, samples.t)
+        return samples
 
     @torch.no_grad()
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
-        if step % self.update_every:
+        self.updates, phase = divmod(step, self.update_every)
+        self.look_everywhere = not phase
+        if phase:
             return
         device = self.thickness.device
         total = self.resolution**3
@@ -82,13 +115,14 @@ class OccupancySampler(Sampler):
             cells = torch.arange(total, device=device)
         else:
             # A random phase of a stride of four: no cell twice, and every cell has the same chance.
-            phase = int(torch.randint(4, (), generator=generator, device=device))
-            cells = torch.arange(phase, total, 4, device=device)
+            start = int(torch.randint(4, (), generator=generator, device=device))
+            cells = torch.arange(start, total, 4, device=device)
         n = self.resolution
-        corner = torch.stack([cells // (n * n), cells // n % n, cells % n], dim=-1)
-        unit = (corner + torch.rand(corner.shape, generator=generator, device=device)) / n
-        seen = torch.cat([density(part) for part in self.bounds.to_world(unit).split(1 << 15)]) * self.step_length
-        self.thickness[cells] = torch.maximum(self.thickness[cells] * self.decay, seen)
+        corner = torch.stack([cells // (n * n), cells // n % n, cells % n])
+        unit = ((corner + torch.rand(corner.shape, generator=generator, device=device)) / n).T
+        found = torch.cat([density(part) for part in self.bounds.to_world(unit).split(MAX_ASKED)]) * self.step_length
+        self.thickness[cells] = torch.maximum(self.thickness[cells] * self.decay, found)
         occupied = self.thickness > min(self.threshold, 0.5 * float(self.thickness.mean()))
         # With no density anywhere there would be no samples, hence no gradient, for ever: look everywhere again.
         self.occupied = occupied if occupied.any() else torch.ones_like(occupied)
+        self.lit = self.occupied & (self.reached >= self.updates - self.memory)

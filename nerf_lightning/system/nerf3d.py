@@ -46,21 +46,25 @@ class NeRF3D(System):
             optimizer = self.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one
             for parameter in replaced:
-                parameter.grad = None
                 optimizer.state.pop(parameter, None)
 
-    def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
-        generator = step_generator(self.seed, 1, self.global_step, self.device)
+    def loss(self, batch: RayBatch, generator: torch.Generator, step: int) -> tuple[Tensor, StepStats]:
+        """What a step minimises, and what it did; `generator` is all its chance."""
         with torch.no_grad():
-            self.sampler.update(self.global_step, self.field.density, generator)
+            self.sampler.update(step, self.field.density, generator)
             samples = self.sampler(batch.rays, self.field.density, generator)
         backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
         rendered = self.renderer(batch.rays, samples, self.field, backgrounds)
         loss = torch.nn.functional.mse_loss(rendered.rgb, batch.target(backgrounds))
+        stats = StepStats(loss.detach().item(), len(batch.rays), len(samples))
         penalty = self.field.penalty()
-        self.stats = StepStats(loss.detach().item(), len(batch.rays), len(samples))
-        self.trainer.datamodule.adapt(len(samples))  # type: ignore[attr-defined]
-        return loss if penalty is None else loss + penalty
+        return loss if penalty is None else loss + penalty, stats
+
+    def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
+        generator = step_generator(self.seed, 1, self.global_step, self.device)
+        loss, self.stats = self.loss(batch, generator, self.global_step)
+        self.trainer.datamodule.adapt(self.stats.samples)  # type: ignore[attr-defined]
+        return loss
 
     @torch.no_grad()
     def render(self, rays: Rays) -> Rendered:

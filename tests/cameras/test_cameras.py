@@ -38,7 +38,7 @@ def test_view_rays_go_row_by_row(cameras):
     for row in range(5):
         for col in range(7):
             one = cameras.rays(*(torch.tensor([i]) for i in (1, row, col)))
-            assert torch.equal(one.directions[0], everything.directions[row * 7 + col])
+            torch.testing.assert_close(one.directions[0], everything.directions[row * 7 + col], rtol=1e-12, atol=1e-12)
             assert torch.equal(one.origins[0], everything.origins[row * 7 + col])
 
 

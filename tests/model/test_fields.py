@@ -6,6 +6,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, PictureMLP
 
 BOX = torch.tensor([[-1.0, -0.5, 0.2], [1.5, 2.0, 1.0]])
@@ -79,6 +80,19 @@ def test_every_parameter_learns(make: Make):
     (density.sum() + rgb.square().sum()).backward()
     for name, parameter in field.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_fast_and_reference_kernels_make_the_same_field(unbounded: bool):
+    field, results = hashgrid(Bounds(BOX, unbounded)), []
+    positions, directions = 2 * places(300), ways(300)
+    for choice in ("auto", "reference"):
+        use_kernels(choice)
+        density, rgb = field(positions, directions)
+        gradients = torch.autograd.grad(density.sum() + rgb.square().sum(), list(field.parameters()))
+        results.append([density, rgb, *gradients])
+    for fast, reference in zip(*results, strict=True):
+        torch.testing.assert_close(fast, reference, rtol=1e-4, atol=1e-5 * float(reference.detach().abs().max()))
 
 
 @pytest.mark.parametrize("depth", [2, 4])

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from ragged import ragged
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
@@ -19,9 +20,9 @@ def fixed(density: Tensor, rgb: Tensor):
     return lambda positions, directions: (density, rgb)
 
 
-def test_colour_opacity_and_depth_agree_with_a_loop(ragged_samples):
+def test_colour_opacity_and_depth_agree_with_a_loop(kernels: str):
     counts = [4, 0, 6]
-    samples, rays = ragged_samples(counts), along_z(3)
+    samples, rays = ragged(counts), along_z(3)
     density, rgb = 5 * torch.rand(10), torch.rand(10, 3)
     behind = torch.rand(3, 3)
     seen = VolumeRenderer()(rays, samples, fixed(density, rgb), behind)
@@ -37,8 +38,8 @@ def test_colour_opacity_and_depth_agree_with_a_loop(ragged_samples):
         assert float(seen.depth[ray]) == pytest.approx(depth / (1 - left) if count else 0, rel=1e-4)
 
 
-def test_the_field_is_asked_at_the_samples_in_their_directions(ragged_samples):
-    samples = ragged_samples([2, 3])
+def test_the_field_is_asked_at_the_samples_in_their_directions():
+    samples = ragged([2, 3])
     rays = Rays(torch.randn(2, 3), torch.eye(3)[:2])
     asked = []
 
@@ -54,7 +55,7 @@ def test_the_field_is_asked_at_the_samples_in_their_directions(ragged_samples):
 
 
 @pytest.mark.parametrize("distance", [0.3, 1.0, 2.5])
-def test_the_depth_of_a_thin_wall_is_its_distance(distance: float):
+def test_the_depth_of_a_thin_wall_is_its_distance(distance: float, kernels: str):
     box, rays = Bounds(torch.tensor([[-1.0, -1, 0], [1, 1, 3]])), along_z(2)
 
     def wall(positions: Tensor, directions: Tensor):
@@ -70,8 +71,8 @@ def test_the_depth_of_a_thin_wall_is_its_distance(distance: float):
     ("background", "colour"),
     [("black", (0, 0, 0)), ("white", (1, 1, 1)), ([0.1, 0.5, 1], (0.1, 0.5, 1)), ("scene", SCENE), ("random", SCENE)],
 )
-def test_what_is_not_covered_shows_the_background(background, colour, sigma, ragged_samples):
-    samples = ragged_samples([5])
+def test_what_is_not_covered_shows_the_background(background, colour, sigma, kernels: str):
+    samples = ragged([5])
     red = torch.tensor([1.0, 0, 0]).repeat(5, 1)
     seen = VolumeRenderer(background, SCENE)(along_z(1), samples, fixed(torch.full((5,), sigma), red))
     opacity = -torch.expm1(-sigma * samples.dt.sum())
@@ -98,8 +99,8 @@ def test_other_backgrounds_are_refused(background):
         VolumeRenderer(background)
 
 
-def test_gradients_of_everything_seen(ragged_samples):
-    samples, rays = ragged_samples([3, 0, 4], torch.float64), along_z(3, torch.float64)
+def test_gradients_of_everything_seen():
+    samples, rays = ragged([3, 0, 4], torch.float64), along_z(3, torch.float64)
     renderer = VolumeRenderer("white").double()
     density = (0.2 + 2 * torch.rand(7, dtype=torch.float64)).requires_grad_()
     rgb = torch.rand(7, 3, dtype=torch.float64, requires_grad=True)

@@ -6,126 +6,74 @@ import torch
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.sampler import OccupancySampler, occupancy
-from nerf_lightning.sampler.occupancy import cell_index
+from nerf_lightning.kernels import cell_index
+from nerf_lightning.sampler import OccupancySampler
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 
 
 def nowhere(positions: Tensor) -> Tensor:
-    raise AssertionError("marching does not ask the field")
+    raise AssertionError("not every step asks")
 
 
 def seeded(seed: int = 3) -> Generator:
     return Generator().manual_seed(seed)
 
 
-def cell_of(point: list[float], bounds: Bounds, n: int) -> int:
-    """The cell of a point in a bounded box, one coordinate at a time."""
-    index = 0
-    for x, low, high in zip(point, *bounds.aabb.tolist(), strict=True):
-        index = index * n + min(max(math.floor((x - low) / (high - low) * n), 0), n - 1)
-    return index
+def toward_the_cube(count: int, seed: int) -> Rays:
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=seeded(seed)), dim=-1)
+    aside = torch.rand(count, 3, generator=seeded(seed + 1)) - 0.5
+    return Rays(aside - 4 * directions, directions)
 
 
-def test_cells_are_numbered_row_by_row(box: Bounds):
-    points = box.aabb[0] + torch.rand(300, 3) * (box.aabb[1] - box.aabb[0])
-    assert cell_index(box.to_unit(points), 5).tolist() == [cell_of(p, box, 5) for p in points.tolist()]
-    outside = torch.tensor([[-0.2, 0.5, 1.0], [1.7, 0.0, -3.0]])
-    assert cell_index(outside, 5).tolist() == [0 * 25 + 2 * 5 + 4, 4 * 25 + 0 + 0]
+def test_what_lies_inside_a_solid_is_looked_at_once_in_a_while():
+    """A hard ball: training asks the field in its shell alone, but for the first step after each update."""
+    sampler = OccupancySampler(CUBE, samples=100, resolution=16, memory=2)
+    asked: list[Tensor] = []
+
+    def solid(x: Tensor) -> Tensor:
+        asked.append(x)
+        return 500.0 * (x.norm(dim=-1) < 0.6).float()
+
+    deepest = []
+    for step in range(16 * 6):
+        sampler.update(step, solid, seeded(step))
+        asked.clear()
+        sampler(toward_the_cube(200, step), solid, seeded(step))
+        deepest.append(min(float(x.norm(dim=-1).min()) for x in asked))
+    assert all(deepest[step] < 0.2 for step in range(32)), "everywhere at first"
+    assert all((deepest[step] < 0.2) == (step % 16 == 0) for step in range(64, 96))
+    assert min(deepest[step] for step in range(64, 96) if step % 16) > 0.6 - 0.4
+    shell = {"lit": sampler.lit.clone(), "reached": sampler.reached.clone()}
+    whole = sampler(toward_the_cube(200, 1000), solid)
+    assert asked[-1].norm(dim=-1).min() < 0.2, "pictures look at all that is occupied"
+    assert torch.equal(shell["lit"], sampler.lit) and torch.equal(shell["reached"], sampler.reached)
+    sampler.look_everywhere = False
+    trained = sampler(toward_the_cube(200, 1000), solid, seeded(1))
+    near = torch.full((200,), torch.inf)
+    full = solid(whole.positions(toward_the_cube(200, 1000))) > 0  # a picture keeps empty steps, training does not
+    first = near.clone().scatter_reduce(0, trained.ray, trained.t, "amin")
+    second = near.clone().scatter_reduce(0, whole.ray[full], whole.t[full], "amin")
+    hit = second.isfinite()
+    close = (first - second)[hit].abs() < 2 * sampler.step_length
+    assert hit.sum() > 150 and close.float().mean() > 0.95, "and both see the surface"
 
 
-@pytest.mark.parametrize("training", [False, True])
-def test_marching_agrees_with_a_loop_over_rays_and_steps(training: bool, box: Bounds, rays: Rays):
-    sampler = OccupancySampler(box, samples=40, resolution=6)
-    sampler.occupied = torch.rand(6**3) < 0.4
-    step = float((box.aabb[1] - box.aabb[0]).norm()) / 40
-    near, far = box.near_far(rays)
-    shift = torch.rand(len(rays), generator=seeded()).tolist() if training else [0.0] * len(rays)
-    actual = sampler(rays, nowhere, seeded() if training else None)
-    total = 0
-    for r in range(len(rays)):
-        expected = []
-        for i in range(40):
-            start = min(float(near[r]) + max(i + shift[r] - 0.5, 0) * step, float(far[r]))
-            end = min(float(near[r]) + max(i + 1 + shift[r] - 0.5, 0) * step, float(far[r]))
-            point = (rays.origins[r] + (start + end) / 2 * rays.directions[r]).tolist()
-            if end > start and sampler.occupied[cell_of(point, box, 6)]:
-                expected.append(((start + end) / 2, end - start))
-        part = slice(int(actual.offsets[r]), int(actual.offsets[r + 1]))
-        got = torch.stack([actual.t[part], actual.dt[part]], dim=-1)
-        # Rounding may decide on a midpoint that lies on a border of cells, or on an interval of no length.
-        got, wanted = got[got[:, 1] > 1e-5], torch.tensor([e for e in expected if e[1] > 1e-5]).view(-1, 2)
-        torch.testing.assert_close(got, wanted, rtol=1e-4, atol=1e-4)
-        total += len(wanted)
-    assert total > 100
-
-
-@pytest.mark.parametrize("unbounded", [False, True])
-@pytest.mark.parametrize("training", [False, True])
-def test_with_every_cell_occupied_steps_are_of_one_length(unbounded, training, box: Bounds, rays: Rays):
-    bounds = replace(box, unbounded=unbounded)
-    sampler = OccupancySampler(bounds, samples=64, resolution=4)
-    samples = sampler(rays, nowhere, seeded() if training else None)
-    near, far = bounds.near_far(rays)
-    for r in range(len(rays)):
-        part = slice(int(samples.offsets[r]), int(samples.offsets[r + 1]))
-        if near[r] >= far[r]:
-            assert part.start == part.stop
-            continue
-        start, end = samples.t[part] - samples.dt[part] / 2, samples.t[part] + samples.dt[part] / 2
-        torch.testing.assert_close(start[1:], end[:-1], rtol=1e-5, atol=1e-5)
-        if not training:
-            torch.testing.assert_close(start[0], near[r], rtol=1e-4, atol=1e-4)
-        if unbounded:
-            assert (samples.dt[part][2:-1].diff() > -1e-4).all(), "longer and longer"
-        else:
-            torch.testing.assert_close(
-                samples.dt[part][1:-1], torch.full_like(start[1:-1], sampler.step_length), rtol=1e-3, atol=1e-5
-            )
-
-
-@pytest.mark.parametrize("direction", [(1.0, 0, 0), (1.0, 1, 0), (1.0, 1, 1)])
-def test_with_every_cell_occupied_rays_are_covered_to_their_end(direction):
-    direction = torch.nn.functional.normalize(torch.tensor([direction]), dim=-1)
-    rays = Rays(-4 * direction, direction)
-    samples = OccupancySampler(CUBE, samples=4, resolution=4)(rays, nowhere)
-    near, far = CUBE.near_far(rays)
-    torch.testing.assert_close(samples.dt.sum(), (far - near)[0])
-
-
-def test_a_rod_one_cell_thick_is_never_missed(box: Bounds):
-    n, resolution = 200, 16
-    sampler = OccupancySampler(box, n, resolution)
-    everything = OccupancySampler(box, n, resolution)
-    grid = torch.zeros(resolution, resolution, resolution, dtype=torch.bool)
-    grid[5, 9, :] = True
-    sampler.occupied = grid.flatten()
-    low, side = box.aabb[0], (box.aabb[1] - box.aabb[0]) / resolution
-    corner = low[:2] + torch.tensor([5.0, 9.0]) * side[:2]
-    # From all around to points of the rod.
-    target = torch.cat([corner + torch.rand(300, 2) * side[:2], low[2] + torch.rand(300, 1) * 16 * side[2]], dim=1)
-    origins = 5 * torch.nn.functional.normalize(torch.randn(300, 3), dim=-1)
-    rays = Rays(origins, torch.nn.functional.normalize(target - origins, dim=-1))
-    every, kept = everything(rays, nowhere, seeded()), sampler(rays, nowhere, seeded())
-    position = every.positions(rays)[:, :2]
-    inside = ((position > corner + 1e-5) & (position < corner + side[:2] - 1e-5)).all(-1)
-    assert inside.sum() > 300
-    found = set(zip(kept.ray.tolist(), kept.t.tolist(), strict=True))
-    assert set(zip(every.ray[inside].tolist(), every.t[inside].tolist(), strict=True)) <= found
-    margin = ((position > corner - 1e-5) & (position < corner + side[:2] + 1e-5)).all(-1)
-    assert len(kept) <= int(margin.sum()), "and nothing else is kept"
-
-
-@pytest.mark.parametrize("candidates", [1, 100, 1000])
-def test_looking_at_fewer_intervals_together_changes_nothing(candidates: int, box: Bounds, rays: Rays, monkeypatch):
-    sampler = OccupancySampler(box, samples=40, resolution=6)
-    sampler.occupied = torch.rand(6**3) < 0.4
-    whole = sampler(rays, nowhere, seeded())
-    monkeypatch.setattr(occupancy, "MAX_CANDIDATES", candidates)
-    parts = sampler(rays, nowhere, seeded())
-    for name in ("t", "dt", "ray", "offsets"):
-        assert torch.equal(getattr(whole, name), getattr(parts, name))
+def test_a_cell_that_light_reaches_again_is_looked_at_again():
+    sampler = OccupancySampler(CUBE, samples=100, resolution=8, memory=2, decay=0.0)
+    rays = Rays(torch.tensor([[-3.0, 0.1, 0.1]]), torch.tensor([[1.0, 0, 0]]))
+    behind = int(cell_index(torch.tensor([[0.9, 0.55, 0.55]]), 8))
+    wall = 500.0
+    for step in range(16 * 12):
+        if step == 16 * 8:
+            wall = 0.0
+        density = lambda x: torch.where(x[:, 0] < 0, wall, 500.0)  # noqa: E731, B023
+        sampler.update(step, density, seeded(step))
+        sampler(rays, density, seeded(step))
+        if step == 16 * 8 - 1:
+            assert sampler.occupied[behind] and not sampler.lit[behind]
+    middle = int(cell_index(torch.tensor([[0.51, 0.55, 0.55]]), 8))
+    assert sampler.lit[middle] and not sampler.lit[behind]
 
 
 def ball(centre: float = 0.0):
@@ -207,12 +155,34 @@ def test_updates_come_every_so_often_and_follow_the_generator():
 
 def test_what_was_learned_is_kept_in_checkpoints():
     sampler, other = (OccupancySampler(CUBE, samples=64, resolution=6) for _ in range(2))
-    sampler.update(0, ball(), seeded())
+    for step in range(33):
+        sampler.update(step, ball(), seeded(step))
+        sampler(toward_the_cube(50, step), ball(), seeded(step))
     other.load_state_dict(sampler.state_dict())
-    assert torch.equal(other.occupied, sampler.occupied) and torch.equal(other.thickness, sampler.thickness)
+    for name in ("occupied", "thickness", "reached", "lit"):
+        assert torch.equal(getattr(other, name), getattr(sampler, name)), name
 
 
 def test_a_field_without_density_is_looked_at_everywhere():
     sampler = OccupancySampler(CUBE, samples=16, resolution=4)
     sampler.update(0, lambda x: torch.zeros(len(x)), seeded(0))
     assert sampler.occupied.all()
+
+
+@pytest.mark.parametrize("stop", [48, 52, 63])
+def test_a_restored_sampler_goes_on_as_the_unbroken_one(stop: int):
+    sampler, restored = (OccupancySampler(CUBE, samples=64, resolution=8, memory=1) for _ in range(2))
+
+    def solid(x: Tensor) -> Tensor:
+        return 500.0 * (x.norm(dim=-1) < 0.7).float()
+
+    for step in range(80):
+        if step == stop:
+            restored.load_state_dict(sampler.state_dict())
+        taken = []
+        for s in (sampler, restored) if step >= stop else (sampler,):
+            s.update(step, solid, seeded(step))
+            asked: list[Tensor] = []
+            s(toward_the_cube(60, step), lambda x, to=asked: (to.append(x), solid(x))[1], seeded(step))
+            taken.append(torch.cat(asked))
+        assert torch.equal(taken[0], taken[-1]), step

@@ -10,9 +10,9 @@ PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)  # Instant-NGP, e
 
 @inner(inline="always")
 def cell_of(x, resolution):
-    """Lower corner and fraction of one coordinate in [0, 1]; clamped outside."""
+    """Lower corner and fraction of one coordinate in [0, 1]; clamped outside. What is not a number stays so, in some cell."""
     scaled = min(max(x, float32(0)), float32(1)) * float32(resolution)
-    cell = min(int32(scaled), int32(resolution - 1))
+    cell = int32(min(uint32(int32(scaled)), uint32(resolution - 1)))
     return uint32(cell), scaled - float32(cell)
 
 
@@ -86,15 +86,18 @@ def scatter_level(grad, unit, resolution, above, features):
 
 @kernel
 def interpolate(tables, unit, resolutions, sizes, out, features, workers):
-    """out [LF, N] from tables [T, F] and unit [3, N]."""
+    """out [LF, N] from tables [T, F] and unit [3, N]. A level belongs to few workers: its table then stays in their cache."""
     samples, levels, width = unit.shape[1], len(resolutions), len(features)
+    parts = max(1, workers // levels)
     for worker in prange(workers):
-        first, last = samples * worker // workers, samples * (worker + 1) // workers
         start = 0
         for level in range(levels):
             table = tables[start : start + sizes[level]]
             rows = out[level * width : (level + 1) * width]
-            interpolate_level(table, unit, first, last, resolutions[level], rows, features)
+            for part in range(parts):
+                if (level * parts + part) % workers == worker:
+                    first, last = samples * part // parts, samples * (part + 1) // parts
+                    interpolate_level(table, unit, first, last, resolutions[level], rows, features)
             start += sizes[level]
 
 

@@ -159,3 +159,21 @@ def points(origins, directions, ray, t, out, workers):
             r = ray[n]
             for axis in range(3):
                 out[axis, n] = origins[r, axis] + t[n] * directions[r, axis]
+
+
+@exact
+def mark(origins, directions, ray, t, centre, half, unbounded, marks, resolution, value, workers):
+    """Writes a value into the cells that hold the samples. Workers may meet in a cell: they write the same there."""
+    samples = len(t)
+    for worker in prange(workers):
+        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
+            r = ray[n]
+            u, v, w = to_unit(
+                origins[r, 0] + t[n] * directions[r, 0],
+                origins[r, 1] + t[n] * directions[r, 1],
+                origins[r, 2] + t[n] * directions[r, 2],
+                centre,
+                half,
+                unbounded,
+            )
+            marks[(cell(u, resolution) * resolution + cell(v, resolution)) * resolution + cell(w, resolution)] = value

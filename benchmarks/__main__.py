@@ -1,0 +1,84 @@
+"""python -m benchmarks: what the methods, the kernels and the framework cost on this machine."""
+
+import argparse
+import os
+import platform
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import nerf_lightning
+from benchmarks import growth, kernels, methods, overhead
+from nerf_lightning.files import write_json
+
+PARTS = ("methods", "kernels", "growth", "overhead")
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Rows as text, numbers to three figures, columns as wide as they need."""
+
+    def cell(value: Any) -> str:
+        if value is None:
+            return "-"
+        if isinstance(value, float | int) and not isinstance(value, bool):
+            return f"{value / 1e6:.1f}M" if value >= 1e6 else f"{value:.4g}"
+        return str(value)
+
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    cells = [[cell(row.get(key)) for key in keys] for row in rows]
+    widths = [max(len(key), *(len(line[i]) for line in cells)) for i, key in enumerate(keys)]
+    lines = [keys, ["-" * width for width in widths], *cells]
+    return "\n".join("  ".join(text.rjust(width) for text, width in zip(line, widths, strict=True)) for line in lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    chosen = f"which of {', '.join(PARTS)} (all by default), and overrides KEY=VALUE for all runs"
+    parser.add_argument("parts", nargs="*", metavar="part", help=chosen)
+    parser.add_argument("--experiments", default="lego,lego_voxels,lego_tensorf", help="experiments to train")
+    parser.add_argument("--budgets", default="60", help="seconds of training, separated by commas")
+    parser.add_argument("--seeds", default="0,1,2")
+    parser.add_argument("--output", type=Path, default=Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S"))
+    arguments = parser.parse_args()
+    overrides = [part for part in arguments.parts if "=" in part]
+    parts = [part for part in arguments.parts if "=" not in part] or list(PARTS)
+    unknown = sorted(set(parts) - set(PARTS))
+    if unknown:
+        parser.error(f"found {unknown[0]}, expected some of {', '.join(PARTS)}, or overrides KEY=VALUE")
+    budgets, seeds = [float(x) for x in arguments.budgets.split(",")], [int(x) for x in arguments.seeds.split(",")]
+    experiments = arguments.experiments.split(",")
+    report: dict[str, Any] = {
+        "machine": {
+            "processor": platform.processor() or platform.machine(),
+            "cores": os.cpu_count(),
+            "threads": torch.get_num_threads(),
+            "load_at_start": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "nerf_lightning": nerf_lightning.__version__,
+        },
+        "overrides": overrides,
+    }
+    text = []
+    for part in parts:
+        if part == "methods":
+            rows, report["runs"] = methods.measure(experiments, overrides, budgets, seeds, arguments.output)
+        elif part == "kernels":
+            rows = kernels.measure()
+        elif part == "growth":
+            rows = growth.measure([f"+experiment={experiments[0]}", *overrides])
+        else:
+            rows = [overhead.measure([f"+experiment={experiments[0]}", *overrides])]
+        report[part] = rows
+        text.append(f"{part}\n\n{table(rows)}\n")
+        print("\n" + text[-1], flush=True)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    (arguments.output / "table.txt").write_text("\n".join(text))
+    write_json(arguments.output / "benchmarks.json", report)
+    print(f"written to {arguments.output}")
+
+
+if __name__ == "__main__":
+    main()

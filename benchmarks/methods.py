@@ -1,0 +1,82 @@
+"""Methods side by side: each is trained as a user would train it, in a process of its own, one after the other."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+TARGETS_DB = (24, 27, 30)
+MOMENTS = (10, 30, 60, 300)
+CHECKS = (2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 180, 240)
+"""Seconds of training after which a run is measured, where its budget is longer."""
+
+Run = dict[str, Any]
+
+
+def train(experiment: str, overrides: list[str], seconds: float, seed: int, folder: Path) -> Run:
+    """One run; returns its results.json."""
+    marks = ",".join(str(check / seconds) for check in CHECKS if check < seconds)
+    command = [sys.executable, "-m", "nerf_lightning", f"+experiment={experiment}", *overrides]
+    command += [f"budget.seconds={seconds}", f"seed={seed}", f"callbacks.heldout.at=[{marks}]"]
+    command += ["callbacks.snapshots.steps=[]", "callbacks.orbit.frames=0", f"hydra.run.dir='{folder}'"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"benchmarks: {experiment} failed: {done.stderr.strip().splitlines()[-1:]}")
+    return json.loads((folder / "results.json").read_text())
+
+
+def seconds_to(curve: list[list[float]], target: float) -> float | None:
+    """Training seconds at which the curve [[seconds, step, dB], ...] first stands at the target."""
+    return next((seconds for seconds, _, quality in curve if quality >= target), None)
+
+
+def middle(values: list[float | None]) -> float | None:
+    """The median; None where more than half of the values are missing (they count as infinitely large)."""
+    known = median(float("inf") if value is None else value for value in values)
+    return None if known == float("inf") else known
+
+
+def summary(method: str, by_budget: dict[float, list[Run]]) -> dict[str, Any]:
+    """One line of the table: medians over seeds.
+
+    Seconds to a quality come from the budget that gets there first; dB at a moment from the shortest budget that lasts so
+    long, since a run anneals its learning rate toward the end of its budget.
+    """
+    row: dict[str, Any] = {"method": method, "seeds": min(len(runs) for runs in by_budget.values())}
+    for target in TARGETS_DB:
+        times = [middle([seconds_to(run["curve"], target) for run in runs]) for runs in by_budget.values()]
+        row[f"seconds_to_{target}_db"] = min((t for t in times if t is not None), default=None)
+    for moment in MOMENTS:
+        budget = min((seconds for seconds in by_budget if seconds >= moment), default=None)
+        if budget is not None:
+            row[f"db_at_{moment}_s"] = median(
+                max((point for point in run["curve"] if point[0] <= moment + 1), key=lambda point: point[0])[2]
+                for run in by_budget[budget]
+            )
+    runs = by_budget[max(by_budget)]
+    row["steps_per_second"] = median(run["steps"] / run["train_seconds"] for run in runs)
+    row["rays_per_second"] = median(run["rays_per_second"] for run in runs)
+    row["render_seconds_per_view"] = median(run["render_seconds_per_view"] for run in runs)
+    row["peak_memory_bytes"] = median(run["peak_memory_bytes"] for run in runs)
+    row["parameter_bytes"] = median(4 * run["parameters"] for run in runs)
+    row["psnr_worst_seed"] = min(run["psnr"] for run in runs)
+    return row
+
+
+def measure(
+    experiments: list[str], overrides: list[str], budgets: list[float], seeds: list[int], folder: Path
+) -> tuple[list[dict[str, Any]], list[Run]]:
+    """Trains every experiment with every budget and seed. Returns the table's lines and all runs."""
+    rows, everything = [], []
+    for experiment in experiments:
+        by_budget: dict[float, list[Run]] = {}
+        for seconds in budgets:
+            for seed in seeds:
+                run = train(experiment, overrides, seconds, seed, folder / f"{experiment}_{seconds:g}s_seed{seed}")
+                print(f"{experiment}, {seconds:g} s, seed {seed}: {run['psnr']:.2f} dB", flush=True)
+                by_budget.setdefault(seconds, []).append(run)
+                everything.append({"experiment": experiment, "budget_seconds": seconds, **run})
+        rows.append(summary(experiment, by_budget))
+    return rows, everything

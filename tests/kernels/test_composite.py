@@ -1,0 +1,195 @@
+import math
+
+import jaxtyping
+import pytest
+import torch
+from agreement import agree, outcome, with_threads
+from ragged import COUNTS, MANY, ragged
+from torch import Tensor
+
+from nerf_lightning.kernels import accumulate, composite, use_kernels, volume_weights
+from nerf_lightning.sampler import Samples
+
+NAN = float("nan")
+
+
+@pytest.fixture(params=["formula", "auto", "reference"])
+def weights_of(request: pytest.FixtureRequest):
+    """How much each sample weighs: by the formula, and as the gradient of a ray's colour with respect to the sample's."""
+    if request.param == "formula":
+        return lambda density, samples: volume_weights(density, samples.dt, samples.ray, samples.offsets)
+    use_kernels(request.param)
+
+    def weights(density: Tensor, samples: Samples) -> Tensor:
+        rgb = torch.zeros(len(samples), 3, requires_grad=True)
+        colour, _, _ = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
+        gradients = [torch.autograd.grad(c.sum(), rgb, retain_graph=True)[0][:, i] for i, c in enumerate(colour.T)]
+        assert torch.equal(gradients[0], gradients[1]) and torch.equal(gradients[0], gradients[2])
+        return gradients[0]
+
+    return weights
+
+
+@pytest.mark.parametrize("counts", COUNTS)
+@pytest.mark.parametrize("scale", [0.1, 3.0, 100.0])
+def test_weights_agree_with_a_loop_along_each_ray(counts, scale, weights_of):
+    samples = ragged(counts)
+    density = scale * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.7)
+    expected, i = [], 0
+    for count in counts:
+        transmittance = 1.0
+        for _ in range(count):
+            alpha = 1 - math.exp(-float(density[i]) * float(samples.dt[i]))
+            expected.append(transmittance * alpha)
+            transmittance *= 1 - alpha
+            i += 1
+    actual = weights_of(density, samples)
+    torch.testing.assert_close(actual, torch.tensor(expected), rtol=1e-4, atol=1e-6)
+    opacity = accumulate(actual, torch.ones(len(samples), 1), samples.ray, len(counts))[:, 0]
+    assert (actual >= 0).all() and (opacity <= 1 + 1e-6).all()
+    assert (opacity[torch.tensor(counts) == 0] == 0).all()
+
+
+@pytest.mark.parametrize("wall", [0, 2, 4])
+def test_one_huge_density_takes_all_the_weight(wall, weights_of):
+    samples = ragged([3, 5, 2])
+    density = torch.zeros(10)
+    density[3 + wall] = 1e9
+    assert torch.equal(weights_of(density, samples), torch.eye(10)[3 + wall])
+
+
+def test_behind_a_wall_nothing_counts(weights_of):
+    density = torch.tensor([0.0, 1e9, 1e9, 5.0])
+    assert weights_of(density, ragged([4])).tolist() == [0, 1, 0, 0]
+
+
+@pytest.mark.parametrize("splits", [1, 2, 7, 100])
+@pytest.mark.parametrize("sigma", [0.0, 0.01, 0.7, 20.0])
+def test_constant_density_is_as_opaque_however_it_is_split(splits, sigma, weights_of):
+    samples = ragged([splits, 3, splits])
+    weights = weights_of(torch.full((len(samples),), sigma), samples)
+    for ray in range(3):
+        part = slice(int(samples.offsets[ray]), int(samples.offsets[ray + 1]))
+        expected = -math.expm1(-sigma * float(samples.dt[part].double().sum()))
+        assert float(weights[part].double().sum()) == pytest.approx(expected, rel=1e-5, abs=1e-9)
+
+
+def test_thin_fog_keeps_its_digits(weights_of):
+    samples = ragged([3])
+    torch.testing.assert_close(weights_of(torch.full((3,), 1e-9), samples), 1e-9 * samples.dt, rtol=1e-5, atol=0)
+
+
+def test_thick_rays_leave_the_later_ones_exact(weights_of):
+    thick, thin = ragged([100] * 300), ragged([6])
+    both = Samples(
+        torch.cat([thick.t, thin.t]),
+        torch.cat([thick.dt, thin.dt]),
+        torch.cat([thick.ray, thin.ray + 300]),
+        torch.cat([thick.offsets, thin.offsets[1:] + len(thick)]),
+    )
+    density = torch.cat([torch.full((len(thick),), 1e6), torch.rand(6)])
+    weights = weights_of(density, both)
+    assert weights.isfinite().all()
+    torch.testing.assert_close(weights[-6:], weights_of(density[-6:], thin), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("counts", [[4], [3, 0, 5], [0, 2]])
+def test_gradients(counts):
+    samples = ragged(counts, torch.float64)
+    density = (2 * torch.rand(len(samples), dtype=torch.float64)).requires_grad_()
+    dt = samples.dt.clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda s, d: volume_weights(s, d, samples.ray, samples.offsets), (density, dt))
+    values = torch.rand(len(samples), 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda w, v: accumulate(w, v, samples.ray, len(counts)), (density, values))
+
+
+def test_gradients_behind_something_opaque_are_finite(kernels: str):
+    samples = ragged([4])
+    density = torch.tensor([1e6, 1.0, 1e6, 0.0], requires_grad=True)
+    volume_weights(density, samples.dt, samples.ray, samples.offsets).square().sum().backward()
+    assert density.grad.isfinite().all()
+    seen = composite(density, torch.rand(4, 3), samples.t, samples.dt, samples.ray, samples.offsets)
+    (gradient,) = torch.autograd.grad(sum(x.square().sum() for x in seen), density)
+    assert gradient.isfinite().all() and gradient[0].abs() < 1e-6, "no more of it can be seen"
+
+
+@pytest.mark.parametrize("counts", COUNTS)
+def test_accumulate_sums_over_each_ray(counts):
+    samples = ragged(counts)
+    weights, values = torch.rand(len(samples)), torch.rand(len(samples), 3)
+    expected = [(w[:, None] * v).sum(0) for w, v in zip(weights.split(counts), values.split(counts), strict=True)]
+    torch.testing.assert_close(accumulate(weights, values, samples.ray, len(counts)), torch.stack(expected))
+
+
+def seen(samples: Samples):
+    """`composite` as a function of what may have gradients."""
+    return lambda density, rgb: composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
+
+
+@pytest.mark.parametrize("counts", [*COUNTS, [], [0, 0], MANY])
+@pytest.mark.parametrize("scale", [0.1, 3.0, 100.0])
+def test_compositing_agrees_with_the_reference(counts: list[int], scale: float):
+    samples = ragged(counts)
+    density = scale * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.7)
+    agree(seen(samples), [density, torch.rand(len(samples), 3)])
+
+
+def test_strides_do_not_matter():
+    """Fields hand over colours as the transpose of [3, N], and densities as a column."""
+    samples = ragged(MANY)
+    density, rgb = torch.rand(len(samples), 4), torch.rand(3, len(samples))
+    agree(lambda d, c: seen(samples)(d[:, 1], c.T), [density, rgb])
+    use_kernels("auto")
+    whole = seen(samples)(density[:, 1].contiguous(), rgb.T.contiguous())
+    assert all(torch.equal(a, b) for a, b in zip(seen(samples)(density[:, 1], rgb.T), whole, strict=True))
+
+
+def test_compositing_needs_no_gradient(kernels: str):
+    samples = ragged(MANY)
+    density, rgb = torch.rand(len(samples), requires_grad=True), torch.rand(len(samples), 3)
+    colour, opacity, depth = seen(samples)(density, rgb)
+    (gradient,) = torch.autograd.grad(opacity.sum(), density, retain_graph=True)
+    with torch.no_grad():
+        plain = seen(samples)(density, rgb)
+    assert not plain[0].requires_grad
+    assert torch.equal(plain[0], colour) and torch.equal(plain[1], opacity) and torch.equal(plain[2], depth)
+    left = (1 - opacity.detach())[samples.ray]
+    torch.testing.assert_close(gradient, samples.dt * left, rtol=1e-3, atol=1e-6)
+
+
+def test_compositing_gives_the_same_with_any_number_of_threads():
+    samples = ragged(MANY)
+    inputs = [3 * torch.rand(len(samples)), torch.rand(len(samples), 3)]
+    one, two = (with_threads(lambda: outcome(seen(samples), inputs), n) for n in (1, 2))
+    for a, b in zip(one, two, strict=True):
+        assert torch.equal(a, b), "rays do not share sums"
+
+
+@pytest.mark.parametrize("where", [0, 2, 4])
+@pytest.mark.parametrize("kind", ["density", "rgb"])
+def test_what_is_not_a_number_shows_in_its_ray(where: int, kind: str, kernels: str):
+    samples = ragged([3, 5, 2])
+    density, rgb = 0.1 + torch.rand(10), torch.rand(10, 3)
+    (density if kind == "density" else rgb)[3 + where] = NAN
+    colour, opacity, depth = seen(samples)(density.requires_grad_(), rgb.requires_grad_())
+    assert colour[1].isnan().all() and colour[0].isfinite().all()
+    if kind == "density":
+        assert opacity[1].isnan() and depth[1].isnan()
+    else:
+        assert opacity.isfinite().all() and colour[2].isfinite().all()
+    loss = colour.sum()
+    loss.backward()
+    assert loss.isnan() and density.grad[3 : 3 + where + 1].isnan().any()
+
+
+def test_a_wrong_shape_is_refused_in_tests():
+    n, ray, offsets = torch.zeros(3), torch.zeros(3).long(), torch.tensor([0, 3])
+    for call in (
+        lambda: volume_weights(n, torch.zeros(2), ray, offsets),
+        lambda: volume_weights(n, n, n, offsets),
+        lambda: accumulate(n, n, ray, 1),
+        lambda: composite(n, torch.zeros(3, 2), n, n, ray, offsets),
+        lambda: composite(n, torch.zeros(2, 3), n, n, ray, offsets),
+    ):
+        with pytest.raises(jaxtyping.TypeCheckError):
+            call()

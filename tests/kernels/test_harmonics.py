@@ -1,0 +1,68 @@
+import math
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+from agreement import agree, with_threads
+from torch.nn.functional import normalize
+
+from nerf_lightning.kernels import spherical_harmonics
+
+PRECISIONS = pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-12), (torch.float32, 3e-6)])
+"""The reference alone speaks double precision."""
+
+
+def sphere() -> tuple[torch.Tensor, np.ndarray]:
+    """Directions and weights of a quadrature exact for polynomials up to degree 15."""
+    z, weight = np.polynomial.legendre.leggauss(8)
+    angle = np.arange(16) * 2 * np.pi / 16
+    r = np.sqrt(1 - z**2)[:, None]
+    xyz = np.stack([r * np.cos(angle), r * np.sin(angle), np.broadcast_to(z[:, None], (8, 16))], -1)
+    return torch.from_numpy(xyz.reshape(-1, 3)), (weight[:, None] * np.full(16, 2 * np.pi / 16)).ravel()
+
+
+@PRECISIONS
+def test_spherical_harmonics_are_orthonormal(dtype: torch.dtype, atol: float):
+    d, weight = sphere()
+    y = spherical_harmonics(d.to(dtype)).double().numpy()
+    np.testing.assert_allclose(y.T @ (weight[:, None] * y), np.eye(16), atol=atol)
+
+
+@PRECISIONS
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_each_degree_of_spherical_harmonics_is_in_its_place(degree: int, dtype: torch.dtype, atol: float):
+    """The squares of a degree add up to (2 l + 1) / (4 pi) in every direction (Unsöld)."""
+    d = normalize(torch.randn(100, 3, dtype=torch.float64), dim=-1).to(dtype)
+    block = slice(degree**2, (degree + 1) ** 2)
+    squares = spherical_harmonics(d)[:, block].square().sum(1)
+    expected = torch.full((100,), (2 * degree + 1) / (4 * math.pi), dtype=dtype)
+    torch.testing.assert_close(squares, expected, atol=atol, rtol=0)
+    sign = 1 if degree % 2 == 0 else -1
+    torch.testing.assert_close(spherical_harmonics(-d)[:, block], sign * spherical_harmonics(d)[:, block])
+
+
+@pytest.mark.parametrize("samples", [0, 1, 2, 1000])
+def test_harmonics_agree_with_the_reference(samples: int):
+    d = normalize(torch.randn(samples, 3), dim=-1)
+    agree(spherical_harmonics, [d], constants=(0,), rtol=1e-5)
+    agree(lambda x: spherical_harmonics(x.T), [d.T.contiguous()], constants=(0,), rtol=1e-5)
+    agree(spherical_harmonics, [d], rtol=1e-5)  # with a gradient
+
+
+def test_harmonics_are_the_same_with_any_number_of_threads():
+    d = normalize(torch.randn(1001, 3), dim=-1)
+    one, two = (with_threads(lambda: [spherical_harmonics(d)], n)[0] for n in (1, 2))
+    assert torch.equal(one, two)
+
+
+def test_a_direction_that_is_not_a_number_shows(kernels: str):
+    d = normalize(torch.randn(5, 3), dim=-1)
+    d[2] = float("nan")
+    y = spherical_harmonics(d)
+    assert y[2, 1:].isnan().all() and y[[0, 1, 3, 4]].isfinite().all()
+
+
+def test_a_wrong_shape_is_refused_in_tests():
+    with pytest.raises(jaxtyping.TypeCheckError):
+        spherical_harmonics(torch.zeros(5, 2))

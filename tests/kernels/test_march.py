@@ -1,0 +1,253 @@
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib import import_module
+
+import jaxtyping
+import pytest
+import torch
+from agreement import with_threads
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.kernels import cell_index, march, use_kernels
+from nerf_lightning.sampler import Samples
+
+CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+
+
+def marched(
+    rays: Rays, bounds: Bounds, occupied: Tensor, samples: int, jittered: bool = False, step: float | None = None
+) -> Samples:
+    near, far = bounds.near_far(rays)
+    shift = torch.zeros_like(near)
+    if jittered:
+        shift = torch.rand(near.shape, generator=torch.Generator().manual_seed(3))
+    step = 2 * float(bounds.half_size.norm()) / samples if step is None else step
+    return Samples(*march(rays, bounds, near, far, shift, occupied, samples, step))
+
+
+def everywhere(resolution: int) -> Tensor:
+    return torch.ones(resolution**3, dtype=torch.bool)
+
+
+def cell_of(point: list[float], bounds: Bounds, n: int) -> int:
+    """The cell of a point in a bounded box, one coordinate at a time."""
+    index = 0
+    for x, low, high in zip(point, *bounds.aabb.tolist(), strict=True):
+        index = index * n + min(max(math.floor((x - low) / (high - low) * n), 0), n - 1)
+    return index
+
+
+def test_cells_are_numbered_row_by_row(box: Bounds):
+    positions = box.aabb[0] + torch.rand(300, 3) * (box.aabb[1] - box.aabb[0])
+    assert cell_index(box.to_unit(positions), 5).tolist() == [cell_of(p, box, 5) for p in positions.tolist()]
+    outside = torch.tensor([[-0.2, 0.5, 1.0], [1.7, 0.0, -3.0]])
+    assert cell_index(outside, 5).tolist() == [0 * 25 + 2 * 5 + 4, 4 * 25 + 0 + 0]
+
+
+@pytest.mark.parametrize("resolution", [6, 8])
+@pytest.mark.parametrize("training", [False, True])
+def test_marching_agrees_with_a_loop_over_rays_and_steps(
+    training: bool, resolution: int, box: Bounds, rays: Rays, kernels: str
+):
+    occupied = torch.rand(resolution**3) < 0.4
+    step = float((box.aabb[1] - box.aabb[0]).norm()) / 40
+    near, far = box.near_far(rays)
+    shift = torch.rand(len(rays)) if training else torch.zeros(len(rays))
+    actual = Samples(*march(rays, box, near, far, shift, occupied, 40, step))
+    total = 0
+    for r in range(len(rays)):
+        expected = []
+        for i in range(41):
+            start = min(float(near[r]) + max(i + float(shift[r]) - 0.5, 0) * step, float(far[r]))
+            end = min(float(near[r]) + max(i + 1 + float(shift[r]) - 0.5, 0) * step, float(far[r]))
+            point = (rays.origins[r] + (start + end) / 2 * rays.directions[r]).tolist()
+            if end > start and occupied[cell_of(point, box, resolution)]:
+                expected.append(((start + end) / 2, end - start))
+        part = slice(int(actual.offsets[r]), int(actual.offsets[r + 1]))
+        assert (actual.ray[part] == r).all()
+        got = torch.stack([actual.t[part], actual.dt[part]], dim=-1)
+        # Rounding may decide on a midpoint that lies on a border of cells, or on an interval of no length.
+        got, wanted = got[got[:, 1] > 1e-5], torch.tensor([e for e in expected if e[1] > 1e-5]).view(-1, 2)
+        torch.testing.assert_close(got, wanted, rtol=1e-4, atol=1e-4)
+        total += len(wanted)
+    assert total > 100
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("training", [False, True])
+def test_with_every_cell_occupied_steps_are_of_one_length(unbounded, training, box: Bounds, rays: Rays, kernels: str):
+    bounds = replace(box, unbounded=unbounded)
+    samples = marched(rays, bounds, everywhere(4), 64, training)
+    near, far = bounds.near_far(rays)
+    step = 2 * float(box.half_size.norm()) / 64
+    for r in range(len(rays)):
+        part = slice(int(samples.offsets[r]), int(samples.offsets[r + 1]))
+        if near[r] >= far[r]:
+            assert part.start == part.stop
+            continue
+        start, end = samples.t[part] - samples.dt[part] / 2, samples.t[part] + samples.dt[part] / 2
+        torch.testing.assert_close(start[1:], end[:-1], rtol=1e-5, atol=1e-5)
+        if not training:
+            torch.testing.assert_close(start[0], near[r], rtol=1e-4, atol=1e-4)
+        if unbounded:
+            assert (samples.dt[part][2:-1].diff() > -1e-4).all(), "longer and longer"
+        else:
+            torch.testing.assert_close(samples.dt[part][1:-1], torch.full_like(start[1:-1], step), rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0, 0), (1.0, 1, 0), (1.0, 1, 1)])
+def test_with_every_cell_occupied_rays_are_covered_to_their_end(direction, kernels: str):
+    direction = normalize(torch.tensor([direction]), dim=-1)
+    rays = Rays(-4 * direction, direction)
+    samples = marched(rays, CUBE, everywhere(4), 4)
+    near, far = CUBE.near_far(rays)
+    torch.testing.assert_close(samples.dt.sum(), (far - near)[0])
+
+
+def test_a_rod_one_cell_thick_is_never_missed(box: Bounds, kernels: str):
+    resolution = 16
+    grid = torch.zeros(resolution, resolution, resolution, dtype=torch.bool)
+    grid[5, 9, :] = True
+    low, side = box.aabb[0], (box.aabb[1] - box.aabb[0]) / resolution
+    corner = low[:2] + torch.tensor([5.0, 9.0]) * side[:2]
+    # From all around to points of the rod.
+    target = torch.cat([corner + torch.rand(300, 2) * side[:2], low[2] + torch.rand(300, 1) * 16 * side[2]], dim=1)
+    origins = 5 * normalize(torch.randn(300, 3), dim=-1)
+    rays = Rays(origins, normalize(target - origins, dim=-1))
+    every = marched(rays, box, everywhere(resolution), 200, jittered=True)
+    kept = marched(rays, box, grid.flatten(), 200, jittered=True)
+    position = every.positions(rays)[:, :2]
+    inside = ((position > corner + 1e-5) & (position < corner + side[:2] - 1e-5)).all(-1)
+    assert inside.sum() > 300
+    found = set(zip(kept.ray.tolist(), kept.t.tolist(), strict=True))
+    assert set(zip(every.ray[inside].tolist(), every.t[inside].tolist(), strict=True)) <= found
+    margin = ((position > corner - 1e-5) & (position < corner + side[:2] + 1e-5)).all(-1)
+    assert len(kept) <= int(margin.sum()), "and nothing else is kept"
+
+
+@pytest.mark.parametrize("candidates", [1, 100, 1000])
+def test_looking_at_fewer_intervals_together_changes_nothing(candidates: int, box: Bounds, rays: Rays, monkeypatch):
+    use_kernels("reference")
+    occupied = torch.rand(6**3) < 0.4
+    whole = marched(rays, box, occupied, 40, jittered=True)
+    module, asked = import_module("nerf_lightning.kernels.march"), []
+    monkeypatch.setattr(module, "cell_index", lambda unit, n: (asked.append(len(unit)), cell_index(unit, n))[1])
+    monkeypatch.setattr(module, "MAX_CANDIDATES", candidates)
+    parts = marched(rays, box, occupied, 40, jittered=True)
+    assert len(asked) > 1 and max(asked) <= max(candidates, 41)
+    for name in ("t", "dt", "ray", "offsets"):
+        assert torch.equal(getattr(whole, name), getattr(parts, name))
+
+
+def many_rays(bounds: Bounds) -> Rays:
+    """Toward the box from outside and from inside, past it, and parallel to axes: on borders of cells and between them."""
+    low, size = bounds.aabb[0], bounds.aabb[1] - bounds.aabb[0]
+    outside = bounds.centre + 4 * size.norm() * normalize(torch.randn(150, 3), dim=-1)
+    origins = torch.cat([outside, low + torch.rand(100, 3) * size])
+    directions = normalize(low + torch.rand(250, 3) * size * 1.4 - origins, dim=-1)
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).repeat_interleave(9, 0)
+    places = torch.cartesian_prod(
+        torch.tensor([0.0, 0.25, 0.5]), torch.tensor([0.5, 0.37, 1.0]), torch.tensor([0.3, 0.75])
+    )
+    along = bounds.aabb[0] + size * places.repeat(3, 1)
+    through = along - axes * size.norm() * torch.randint(0, 2, (54, 1))
+    away = bounds.centre + 5 * size
+    diagonal = normalize(size, dim=0)
+    return Rays(
+        torch.cat([origins, through, away[None], (low - diagonal)[None]]),
+        torch.cat([directions, axes, diagonal[None], diagonal[None]]),
+    )
+
+
+def grids(resolution: int) -> Iterator[Tensor]:
+    """Empty, full, one cell, a few cells, many cells, and a ball."""
+    yield torch.zeros(resolution**3, dtype=torch.bool)
+    yield everywhere(resolution)
+    yield torch.arange(resolution**3) == resolution**3 // 2
+    yield torch.rand(resolution**3) < 0.03
+    yield torch.rand(resolution**3) < 0.5
+    middle = (torch.arange(resolution) + 0.5) / resolution - 0.5
+    yield torch.cartesian_prod(middle, middle, middle).norm(dim=-1) < 0.3
+
+
+VARIANTS = {
+    "bounded": {},
+    "near": {"near": 1.5},
+    "far": {"far": 3.0},
+    "near and far": {"near": 2.0, "far": 4.0},
+    "near beyond far": {"near": 4.0, "far": 2.0},
+    "unbounded": {"unbounded": True},
+    "unbounded, near and far": {"unbounded": True, "near": 0.3, "far": 9.0},
+    "unbounded, from the origin": {"unbounded": True, "near": 0.0},
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("resolution", [1, 4, 6, 8, 32])
+@pytest.mark.parametrize("samples", [1, 7, 150])
+def test_the_very_samples_of_the_reference_are_kept(variant: str, resolution: int, samples: int, box: Bounds):
+    bounds, total = replace(box, **VARIANTS[variant]), 0
+    rays = many_rays(bounds)
+    for grid in grids(resolution):
+        for jittered in (False, True):
+            use_kernels("reference")
+            expected = marched(rays, bounds, grid, samples, jittered)
+            use_kernels("auto")
+            actual, again = (marched(rays, bounds, grid, samples, jittered) for _ in range(2))
+            for name in ("t", "dt", "ray", "offsets"):
+                assert torch.equal(getattr(actual, name), getattr(expected, name)), name
+                assert torch.equal(getattr(actual, name), getattr(again, name)), name
+            total += len(actual)
+            assert grid.any() or not len(actual)
+    assert (total == 0) == (variant == "near beyond far")
+
+
+@pytest.mark.parametrize("resolution", [6, 16])
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_the_very_samples_are_kept_whatever_the_unit_of_length(factor, unbounded, resolution, box: Bounds):
+    bounds = Bounds(factor * (box.aabb + torch.tensor([10.0, -20.0, 5.0])), unbounded)
+    rays = many_rays(bounds)
+    for grid in grids(resolution):
+        use_kernels("reference")
+        expected = marched(rays, bounds, grid, 100, jittered=True)
+        use_kernels("auto")
+        actual = marched(rays, bounds, grid, 100, jittered=True)
+        assert torch.equal(actual.t, expected.t) and torch.equal(actual.offsets, expected.offsets)
+
+
+def test_steps_may_be_longer_or_shorter_than_the_diagonal_asks(box: Bounds):
+    """At most one more than `samples` of them, also where they do not reach the far end."""
+    rays, grid = many_rays(box), torch.rand(8**3) < 0.3
+    for step in (1e-3, 0.05, 10.0):
+        use_kernels("reference")
+        expected = marched(rays, box, grid, 30, step=step)
+        use_kernels("auto")
+        actual = marched(rays, box, grid, 30, step=step)
+        assert torch.equal(actual.t, expected.t) and torch.equal(actual.offsets, expected.offsets)
+        assert actual.offsets.diff().max() <= 31
+
+
+def test_marching_is_the_same_with_any_number_of_threads(box: Bounds):
+    rays, grid = many_rays(box), torch.rand(8**3) < 0.3
+    one, two = (with_threads(lambda: [marched(rays, box, grid, 50, jittered=True)], n)[0] for n in (1, 2))
+    assert torch.equal(one.t, two.t) and torch.equal(one.dt, two.dt) and torch.equal(one.offsets, two.offsets)
+
+
+def test_no_rays_or_only_misses_give_no_samples(box: Bounds, rays: Rays, kernels: str):
+    assert marched(rays[:0], box, everywhere(4), 8).offsets.tolist() == [0]
+    missing = marched(rays[-1:], box, everywhere(4), 8)
+    assert len(missing) == 0 and missing.offsets.tolist() == [0, 0]
+
+
+def test_a_wrong_shape_is_refused_in_tests(box: Bounds, rays: Rays):
+    near, far = box.near_far(rays)
+    for call in (
+        lambda: march(rays, box, near[1:], far, near, everywhere(4), 8, 0.1),
+        lambda: march(rays, box, near, far, near, torch.ones(64), 8, 0.1),
+    ):
+        with pytest.raises(jaxtyping.TypeCheckError):
+            call()

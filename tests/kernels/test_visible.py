@@ -1,0 +1,82 @@
+import math
+
+import jaxtyping
+import pytest
+import torch
+from agreement import with_threads
+from ragged import COUNTS, MANY, ragged
+
+from nerf_lightning.kernels import composite, keep_visible, use_kernels
+from nerf_lightning.sampler import Samples
+
+
+def packed(samples: Samples):
+    return samples.t, samples.dt, samples.ray, samples.offsets
+
+
+@pytest.mark.parametrize("counts", COUNTS)
+@pytest.mark.parametrize("transparent", [1e-4, 0.5])
+@pytest.mark.parametrize("thin", [0.0, 1e-3, 0.2])
+def test_what_is_seen_agrees_with_a_loop(counts: list[int], transparent: float, thin: float, kernels: str):
+    samples = ragged(counts)
+    density = 20 * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.7)
+    kept, ends, i = [], [0], 0
+    for count in counts:
+        transmittance = 1.0
+        for _ in range(count):
+            opacity = 1 - math.exp(-float(density[i]) * float(samples.dt[i]))
+            if transmittance >= transparent and opacity >= thin:
+                kept.append(i)
+            transmittance *= 1 - opacity
+            i += 1
+        ends.append(len(kept))
+    t, dt, ray, offsets = keep_visible(density, packed(samples), transparent, thin)
+    assert torch.equal(t, samples.t[kept]) and torch.equal(dt, samples.dt[kept])
+    assert torch.equal(ray, samples.ray[kept]) and offsets.tolist() == ends
+
+
+@pytest.mark.parametrize("counts", [[], [0, 0], MANY])
+@pytest.mark.parametrize("thin", [0.0, 0.1])
+def test_what_is_seen_agrees_with_the_reference(counts: list[int], thin: float):
+    samples = ragged(counts)
+    density = 30 * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.5)
+    results = {}
+    for choice in ("auto", "reference"):
+        use_kernels(choice)
+        results[choice] = keep_visible(density, packed(samples), 1e-3, thin)
+    assert all(torch.equal(a, b) for a, b in zip(*results.values(), strict=True))
+    use_kernels("auto")
+    one = with_threads(lambda: keep_visible(density, packed(samples), 1e-3, thin), 1)
+    assert all(torch.equal(a, b) for a, b in zip(one, results["auto"], strict=True))
+
+
+def test_nothing_is_dropped_when_all_may_stay(kernels: str):
+    samples = ragged(MANY)
+    kept = keep_visible(torch.zeros(len(samples)), packed(samples), 1e-4, 0.0)
+    assert all(torch.equal(a, b) for a, b in zip(kept, packed(samples), strict=True))
+
+
+def test_dropping_what_is_not_seen_changes_pixels_by_no_more_than_it_may():
+    samples = ragged(MANY)
+    density, rgb = 20 * torch.rand(len(samples)) ** 4, torch.rand(len(samples), 3)
+    whole = composite(density, rgb, *packed(samples))
+    t, dt, ray, offsets = keep_visible(density, packed(samples), 1e-3, 0.0)
+    assert 0 < len(t) < len(samples)
+    place = {key: i for i, key in enumerate(zip(samples.ray.tolist(), samples.t.tolist(), strict=True))}
+    index = torch.tensor([place[key] for key in zip(ray.tolist(), t.tolist(), strict=True)])
+    part = composite(density[index], rgb[index], t, dt, ray, offsets)
+    assert 0 < (whole[0] - part[0]).abs().max() <= 1e-3 and (whole[1] - part[1]).abs().max() <= 1e-3
+
+
+def test_a_density_that_is_not_a_number_stays(kernels: str):
+    samples = ragged([3, 5, 2])
+    density = torch.zeros(10)
+    density[5] = float("nan")
+    t, _, ray, _ = keep_visible(density, packed(samples), 1e-4, 0.01)
+    assert float(samples.t[5]) in t.tolist() and (ray == 1).any()
+
+
+def test_a_wrong_shape_is_refused_in_tests():
+    n, ray, offsets = torch.zeros(3), torch.zeros(3).long(), torch.tensor([0, 3])
+    with pytest.raises(jaxtyping.TypeCheckError):
+        keep_visible(torch.zeros(2), (n, n, ray, offsets), 1e-4, 0.0)

@@ -1,0 +1,145 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import march
+from nerf_lightning.sampler import OccupancySampler, Samples, occupancy
+
+CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+OPEN = {"transparent": 1e-30, "thin": 0.0}
+"""Nothing is dropped for what the field says."""
+
+
+def fog(positions: Tensor) -> Tensor:
+    return torch.ones(len(positions))
+
+
+def waves(positions: Tensor) -> Tensor:
+    """Densities from 0 to 30."""
+    return 30 * (4 * positions).sin().prod(1).clamp_min(0)
+
+
+def seeded(seed: int = 3) -> Generator:
+    return Generator().manual_seed(seed)
+
+
+def same(a: Samples, b: Samples) -> bool:
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("t", "dt", "ray", "offsets"))
+
+
+def bare(sampler: OccupancySampler, rays: Rays, cells: Tensor, generator: Generator | None = None) -> Samples:
+    """All steps in the given cells, whatever the field says."""
+    near, far = sampler.bounds.near_far(rays)
+    shift = torch.zeros_like(near) if generator is None else torch.rand(near.shape, generator=generator)
+    return Samples(*march(rays, sampler.bounds, near, far, shift, cells, sampler.samples, sampler.step_length))
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("training", [False, True])
+def test_steps_are_taken_in_occupied_cells(training: bool, unbounded: bool, box: Bounds, rays: Rays, kernels: str):
+    sampler = OccupancySampler(replace(box, unbounded=unbounded), samples=40, resolution=6, **OPEN)
+    sampler.occupied = torch.rand(6**3) < 0.4
+    actual = sampler(rays, fog, seeded() if training else None)
+    assert same(actual, bare(sampler, rays, sampler.occupied, seeded() if training else None)) and len(actual) > 300
+
+
+def test_steps_follow_the_generator(box: Bounds, rays: Rays):
+    sampler = OccupancySampler(box, samples=40, resolution=6, **OPEN)
+    assert same(sampler(rays, fog, seeded()), sampler(rays, fog, seeded()))
+    assert same(sampler(rays, fog), sampler(rays, fog))
+    assert not same(sampler(rays, fog, seeded()), sampler(rays, fog, seeded(4)))
+    assert not same(sampler(rays, fog, seeded()), sampler(rays, fog))
+
+
+@pytest.mark.parametrize("transparent", [1e-4, 0.3])
+@pytest.mark.parametrize("thin", [0.0, 5e-3, 0.1])
+def test_what_is_kept_agrees_with_a_loop(transparent: float, thin: float, box: Bounds, rays: Rays, kernels: str):
+    sampler = OccupancySampler(box, samples=40, resolution=6, transparent=transparent, thin=thin)
+    sampler.occupied = torch.rand(6**3) < 0.6
+    steps, actual = bare(sampler, rays, sampler.occupied, seeded()), sampler(rays, waves, seeded())
+    thickness = (waves(steps.positions(rays)) * steps.dt).tolist()
+    assert 0.5 * sum(thickness) / len(thickness) > thin
+    kept, ends = [], [0]
+    for first, last in zip(steps.offsets[:-1].tolist(), steps.offsets[1:].tolist(), strict=True):
+        before = 0.0
+        for i in range(first, last):
+            if math.exp(-before) >= transparent and 1 - math.exp(-thickness[i]) >= thin:
+                kept.append(i)
+            before += thickness[i]
+        ends.append(len(kept))
+    assert same(actual, Samples(steps.t[kept], steps.dt[kept], steps.ray[kept], torch.tensor(ends)))
+    assert len(kept) < len(steps) and len(kept) > 50
+
+
+def test_nothing_is_kept_behind_a_wall_or_in_empty_space():
+    rays = Rays(torch.tensor([[-3.0, 0.1, 0.2]]), torch.tensor([[1.0, 0, 0]]))
+    sampler = OccupancySampler(CUBE, samples=64, resolution=8)
+
+    def wall(p: Tensor) -> Tensor:
+        return 1e3 * ((p[:, 0] > -0.5) & (p[:, 0] < 0.2)).float()
+
+    x = sampler(rays, wall).positions(rays)[:, 0]
+    assert len(x) > 10 and x.max() < -0.4, "pictures keep what is empty, too: they must not depend on the other rays"
+    x = sampler(rays, wall, seeded()).positions(rays)[:, 0]
+    assert 1 <= len(x) <= 2 and (x > -0.5).all() and (x < -0.4).all()
+
+
+def test_a_picture_does_not_depend_on_how_its_rays_are_cut(box: Bounds, rays: Rays):
+    sampler = OccupancySampler(box, samples=40, resolution=6)
+    whole, parts = sampler(rays, waves), [sampler(rays[i : i + 7], waves) for i in range(0, len(rays), 7)]
+    assert torch.equal(whole.t, torch.cat([part.t for part in parts]))
+
+
+@pytest.mark.parametrize("density", [0.0, 1e-6, 1e-3])
+def test_a_thin_fog_is_kept(density: float, box: Bounds, rays: Rays):
+    sampler = OccupancySampler(box, samples=40, resolution=6, thin=0.1)
+    everything = bare(sampler, rays, sampler.occupied, seeded())
+    samples = sampler(rays, lambda x: torch.full((len(x),), density), seeded())
+    short = everything.dt < 0.5 * everything.dt.mean() * (density > 0)  # cut off where a ray ends
+    assert torch.equal(samples.t, everything.t[~short]) and short.float().mean() < 0.1
+
+
+def test_what_is_not_a_number_is_kept(box: Bounds, rays: Rays, kernels: str):
+    sampler = OccupancySampler(box, samples=40, resolution=6)
+    samples = sampler(rays, lambda x: torch.where(x[:, 2] > 0.5, float("nan"), 0.0))
+    assert (samples.positions(rays)[:, 2] > 0.5).any()
+
+
+@pytest.mark.parametrize("most", [1, 100, 1000])
+def test_asking_fewer_positions_together_changes_nothing(most: int, box: Bounds, rays: Rays, monkeypatch):
+    sampler, asked = OccupancySampler(box, samples=40, resolution=6), []
+    whole = sampler(rays, waves, seeded())
+    sampler.look_everywhere = True
+    monkeypatch.setattr(occupancy, "MAX_ASKED", most)
+    parts = sampler(rays, lambda x: (asked.append(len(x)), waves(x))[1], seeded())
+    assert same(whole, parts) and max(asked) == min(most, sum(asked)) and sum(asked) > 900
+
+
+def test_the_field_is_asked_without_gradient(box: Bounds, rays: Rays):
+    level = torch.tensor(20.0, requires_grad=True)
+    samples = OccupancySampler(box, samples=40, resolution=6)(rays, lambda x: level.expand(len(x)), seeded())
+    assert len(samples) and not samples.t.requires_grad
+
+
+def test_no_rays_or_only_misses_give_no_samples(box: Bounds, rays: Rays, kernels: str):
+    sampler = OccupancySampler(box, samples=8, resolution=4)
+    assert sampler(rays[:0], waves, seeded()).offsets.tolist() == [0]
+    missing = sampler(rays[-1:], waves)
+    assert len(missing) == 0 and missing.offsets.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("transparent", [0.0, 1.0, -1e-4])
+def test_other_transmittances_are_refused(transparent: float):
+    with pytest.raises(InputError, match="sampler.transparent"):
+        OccupancySampler(CUBE, transparent=transparent)
+
+
+@pytest.mark.parametrize("thin", [-0.1, 1.0])
+def test_other_opacities_are_refused(thin: float):
+    with pytest.raises(InputError, match="sampler.thin"):
+        OccupancySampler(CUBE, thin=thin)
