@@ -37,7 +37,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     chosen = f"which of {', '.join(PARTS)} (all by default), and overrides KEY=VALUE for all runs"
     parser.add_argument("parts", nargs="*", metavar="part", help=chosen)
-    parser.add_argument("--experiments", default="lego,lego_voxels,lego_tensorf", help="experiments to train")
+    parser.add_argument("--experiments", default="lego,lego_hashgrid,lego_voxels", help="experiments to train")
     parser.add_argument("--budgets", default="60", help="seconds of training, separated by commas")
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--output", type=Path, default=Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S"))

@@ -41,7 +41,7 @@ def measure(overrides: list[str], rounds: int = 5) -> dict[str, float]:
             bare.append(median(bare_loop(system, data, STEPS)[FROM:]))
             cfg, data, system = built(settings, Path(folder))
             trainer, watch = build_trainer(cfg, Path(folder)), Stopwatch()
-            trainer.callbacks.insert(0, watch)
+            trainer.callbacks.insert(0, watch)  # type: ignore[attr-defined]
             trainer.fit(system, data)
             times = watch.times[FROM:]
             full.append(median(b - a for a, b in zip(times, times[1:], strict=False)))

@@ -67,8 +67,7 @@ def kernels(request: pytest.FixtureRequest, fast_kernels: None) -> str:
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
     """The folder of a finished run on the built-in scene, seconds long."""
-    from composing import composed
-
+    from nerf_lightning.compose import composed
     from nerf_lightning.training import train
 
     folder = tmp_path_factory.mktemp("run")

@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
-from composing import composed
 
 from nerf_lightning import cli
+from nerf_lightning.compose import composed
 from nerf_lightning.dataset import Scene, save_npz
 from nerf_lightning.dataset.bricks import bricks
 from nerf_lightning.training import train

@@ -3,6 +3,7 @@
 import math
 import platform
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -118,6 +119,7 @@ class Results(L.Callback):
                 "python": platform.python_version(),
                 "torch": torch.__version__,
                 "lightning": L.__version__,
+                "numba": version("numba"),
                 "nerf_lightning": nerf_lightning.__version__,
             },
             "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),

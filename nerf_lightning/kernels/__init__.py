@@ -24,6 +24,7 @@ from nerf_lightning.kernels.march import (
     points_reference,
 )
 from nerf_lightning.kernels.mlp import mlp, mlp_heads, mlp_reference
+from nerf_lightning.kernels.planes import plane_line_products, plane_line_products_reference, plane_line_sum
 from nerf_lightning.kernels.switch import fast, use_kernels
 from nerf_lightning.kernels.voxels import (
     touch_rows,
@@ -51,6 +52,9 @@ __all__ = [
     "mlp_heads",
     "mlp_reference",
     "pack_intervals",
+    "plane_line_products",
+    "plane_line_products_reference",
+    "plane_line_sum",
     "points",
     "points_reference",
     "spherical_harmonics",

@@ -6,6 +6,7 @@ from nerf_lightning.model.field import Field, PictureField
 from nerf_lightning.model.hashgrid import HashGrid, HashGridField
 from nerf_lightning.model.mlp import MLPField
 from nerf_lightning.model.picture import PictureMLP
+from nerf_lightning.model.tensorf import TensoRFField
 from nerf_lightning.model.voxels import VoxelField
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "MLPField",
     "PictureField",
     "PictureMLP",
+    "TensoRFField",
     "density_activation",
     "sinusoidal",
     "VoxelField",

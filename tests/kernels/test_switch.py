@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from composing import composed
 from torch import Tensor
 
 from nerf_lightning import kernels as k
 from nerf_lightning import training
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.compose import composed
 from nerf_lightning.errors import InputError
 
 RAY, OFFSETS = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 2, 4])

@@ -1,4 +1,4 @@
-"""Configurations for tests, composed as the command line would."""
+"""Configurations composed as the command line would, for code that runs without one: tests, benchmarks."""
 
 from pathlib import Path
 
@@ -16,4 +16,4 @@ def composed(overrides: list[str], folder: Path) -> DictConfig:
     with open_dict(cfg):
         cfg.hydra.runtime.output_dir = str(folder)
     HydraConfig.instance().set_config(cfg)
-    return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    return OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])

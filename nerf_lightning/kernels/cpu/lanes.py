@@ -1,0 +1,102 @@
+"""A run of neighbouring numbers as one value, for numba: it loads, adds, multiplies and stores them in vector registers.
+
+Numba leaves short loops to scalar instructions and cannot know that rows do not overlap; this says both.
+"""
+
+import operator
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic, models, overload, register_model
+
+
+class Lanes(types.Type):
+    """So many single-precision numbers."""
+
+    def __init__(self, width):
+        self.width = width
+        super().__init__(name=f"Lanes({width})")
+
+
+@register_model(Lanes)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager, lanes):
+        super().__init__(manager, lanes, ir.VectorType(ir.FloatType(), lanes.width))
+
+
+def _pointer(context, builder, types_, values, width):
+    """To `width` numbers of an array's row, given array, row and first column."""
+    array = context.make_array(types_[0])(context, builder, values[0])
+    place = [context.cast(builder, values[i], types_[i], types.intp) for i in (1, 2)]
+    pointer = cgutils.get_item_pointer(context, builder, types_[0], array, place, wraparound=False)
+    return builder.bitcast(pointer, ir.VectorType(ir.FloatType(), width).as_pointer())
+
+
+@intrinsic
+def load(typing, array, row, first, lanes):
+    """array[row, first : first + len(lanes)], inside a float32 array [., .] in C order; `lanes` is any tuple so long."""
+    width = len(lanes)
+
+    def code(context, builder, signature, values):
+        return builder.load(_pointer(context, builder, signature.args, values, width), align=4)
+
+    return Lanes(width)(array, row, first, lanes), code
+
+
+@intrinsic
+def store(typing, array, row, first, values):
+    """array[row, first : first + width] = values."""
+
+    def code(context, builder, signature, args):
+        builder.store(args[3], _pointer(context, builder, signature.args, args, values.width), align=4)
+        return context.get_dummy_value()
+
+    return types.none(array, row, first, values), code
+
+
+@intrinsic
+def total(typing, a):
+    """The sum of all lanes."""
+
+    def code(context, builder, signature, values):
+        kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), values[0].type])
+        add = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.fadd.v{a.width}f32")
+        return builder.call(add, [ir.Constant(ir.FloatType(), 0.0), values[0]], fastmath=("reassoc",))
+
+    return types.float32(a), code
+
+
+@intrinsic
+def _added(typing, a, b):
+    return a(a, b), lambda context, builder, signature, values: builder.fadd(*values)
+
+
+@intrinsic
+def _multiplied(typing, a, b):
+    return a(a, b), lambda context, builder, signature, values: builder.fmul(*values)
+
+
+@intrinsic
+def _scaled(typing, factor, a):
+    def code(context, builder, signature, values):
+        vector, index = values[1].type, ir.IntType(32)
+        empty = ir.Constant(vector, ir.Undefined)
+        first = builder.insert_element(empty, values[0], index(0))
+        everywhere = builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(index, a.width), [0] * a.width))
+        return builder.fmul(everywhere, values[1])
+
+    return a(types.float32, a), code
+
+
+@overload(operator.add)
+def _add(a, b):
+    if isinstance(a, Lanes) and a == b:
+        return lambda a, b: _added(a, b)
+
+
+@overload(operator.mul)
+def _multiply(a, b):
+    if isinstance(a, Lanes) and a == b:
+        return lambda a, b: _multiplied(a, b)
+    if a == types.float32 and isinstance(b, Lanes):
+        return lambda a, b: _scaled(a, b)

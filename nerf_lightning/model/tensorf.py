@@ -1,0 +1,135 @@
+"""TensoRF (Chen et al. 2022): volumes as sums of planes times lines, and the field that reads from them."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import mlp, plane_line_products, plane_line_sum, spherical_harmonics
+from nerf_lightning.model.activation import density_activation
+from nerf_lightning.model.field import Field, replace_data
+from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
+from nerf_lightning.options import Count
+
+
+class VectorMatrix(torch.nn.Module):
+    """Trainable planes and lines over the unit cube: a vector-matrix decomposition (TensoRF, eq. 3).
+
+    Args:
+        cells: along each side.
+        components: channels of each of the three planes, and of the lines across them.
+    """
+
+    SPREAD = 0.1  # standard deviation at the start, as in the authors' code
+
+    def __init__(self, cells: int, components: int):
+        super().__init__()
+        side = cells + 1
+        self.planes = torch.nn.Parameter(self.SPREAD * torch.randn(3, side, side, components))
+        self.lines = torch.nn.Parameter(self.SPREAD * torch.randn(3, side, components))
+
+    @property
+    def cells(self) -> int:
+        """Cells along each side at present."""
+        return self.lines.shape[1] - 1
+
+    def products(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N threeC"]:
+        """All components at positions in the unit cube, side by side."""
+        return plane_line_products(self.planes, self.lines, unit)
+
+    def total(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        """Their sum."""
+        return plane_line_sum(self.planes, self.lines, unit)
+
+    @torch.no_grad()
+    def resize(self, cells: int) -> None:
+        """Interpolates planes and lines onto another grid; the same function where that has all the old vertices."""
+        planes = self.planes.permute(0, 3, 1, 2)
+        lines = self.lines.transpose(1, 2)
+        planes = interpolate(planes, (cells + 1, cells + 1), mode="bilinear", align_corners=True)
+        lines = interpolate(lines, cells + 1, mode="linear", align_corners=True)
+        replace_data(self.planes, planes.permute(0, 2, 3, 1).contiguous())
+        replace_data(self.lines, lines.transpose(1, 2).contiguous())
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        """Takes the size of what is loaded, which may be of another stage of training."""
+        lines = state_dict.get(f"{prefix}lines")
+        if lines is not None and lines.ndim == 3 and 1 < lines.shape[1] != self.lines.shape[1]:
+            self.resize(lines.shape[1] - 1)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+class TensoRFField(Field):
+    """Density as a sum of planes times lines; colour from a small network of other such products and the direction.
+
+    The planes grow finer while training: a coarse grid finds the shape sooner. The network's first layer stands for the
+    paper's basis matrix too.
+
+    Args:
+        bounds: the box the planes cover.
+        density_components, colour_components: channels of each plane. Multiples of 8 are the fast ones on a CPU.
+        coarsest, finest: cells along a side at the start and at the end.
+        stages: how many sizes there are, growing geometrically.
+        grown: fraction of the budget after which the planes have their finest size; the stages before are equally long.
+        width: neurons of the hidden layer.
+        density: "relu", "softplus" or "exp".
+
+    Raises:
+        InputError: where coarsest > finest, for a single stage of two sizes, or `grown` outside [0, 1].
+    """
+
+    def __init__(
+        self,
+        bounds: Bounds,
+        density_components: Count = 16,
+        colour_components: Count = 16,
+        coarsest: Count = 64,
+        finest: Count = 128,
+        stages: Count = 4,
+        grown: float = 0.3,
+        width: Count = 32,
+        density: str = "exp",
+    ):
+        super().__init__(bounds)
+        if coarsest > finest:
+            raise InputError("model.coarsest", "", f"{coarsest} with model.finest={finest}", "coarsest <= finest")
+        if stages == 1 and coarsest < finest:
+            raise InputError("model.stages", "", f"1 with sizes {coarsest} and {finest}", "at least 2, or one size")
+        if not 0 <= grown <= 1:
+            raise InputError("model.grown", "", str(grown), "between 0 and 1")
+        self.resolutions = level_resolutions(stages, coarsest, finest)
+        self.grown = grown
+        self.density_volume = VectorMatrix(coarsest, density_components)
+        self.colour_volume = VectorMatrix(coarsest, colour_components)
+        self.activation = density_activation(density)
+        self.colour_net = layers(3 * colour_components + 16, width, 3)
+
+    def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
+        unit = self.bounds.to_unit(positions)
+        return self.activation(self.density_volume.total(unit)), self.colour_volume.products(unit)
+
+    def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        """As `forward` gives it, without the work for the colour."""
+        return self.activation(self.density_volume.total(self.bounds.to_unit(positions))) / self.unit_length
+
+    def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        return torch.sigmoid(mlp(features, weights(self.colour_net), spherical_harmonics(directions)))
+
+    def resolution_at(self, progress: float) -> int:
+        """Cells along a side that the planes should have after this fraction of the budget."""
+        last = len(self.resolutions) - 1
+        return self.resolutions[last if progress >= self.grown else int(progress / self.grown * last)]
+
+    def grow(self, progress: float) -> list[torch.nn.Parameter]:
+        """Refines planes and lines where `progress` asks for more than they have; they never shrink."""
+        wanted = self.resolution_at(progress)
+        replaced: list[torch.nn.Parameter] = []
+        for volume in (self.density_volume, self.colour_volume):
+            if volume.cells < wanted:
+                volume.resize(wanted)
+                replaced += volume.parameters()
+        return replaced

@@ -1,0 +1,137 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.errors import InputError
+from nerf_lightning.model import TensoRFField
+
+BOX = Bounds(torch.tensor([[-2.0, -1, 0], [2, 3, 5]]))
+SMALL = {"density_components": 3, "colour_components": 8, "coarsest": 4, "finest": 16, "stages": 3, "grown": 0.5}
+
+
+def field(**options) -> TensoRFField:
+    made = TensoRFField(BOX, **SMALL | {"width": 8} | options)
+    for volume in (made.density_volume, made.colour_volume):
+        for parameter in volume.parameters():
+            parameter.data = torch.randn(parameter.shape)
+    return made
+
+
+def positions(count: int = 200) -> torch.Tensor:
+    return BOX.to_world(torch.rand(count, 3))
+
+
+def directions(count: int = 200) -> torch.Tensor:
+    return normalize(torch.randn(count, 3), dim=1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 200])
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_it_gives_density_and_colour(count: int, unbounded: bool, kernels: str):
+    tensorf = TensoRFField(Bounds(BOX.aabb, unbounded), **SMALL)
+    x = 3 * positions(count)
+    density, rgb = tensorf(x, directions(count))
+    assert density.shape == (count,) and rgb.shape == (count, 3)
+    assert (density >= 0).all() and (rgb >= 0).all() and (rgb <= 1).all()
+    assert torch.equal(tensorf.density(x), density)
+    assert count < 2 or (density.std() > 0 and rgb.std(0).min() > 0)
+
+
+def test_density_is_per_longest_half_size_and_the_same_from_all_sides():
+    tensorf, x = field(), positions()
+    raw, _ = tensorf.features(x)
+    (density, rgb), (density2, rgb2) = tensorf(x, directions()), tensorf(x, directions())
+    torch.testing.assert_close(density * 2.5, raw)
+    assert torch.equal(density, density2) and (rgb - rgb2).abs().max() > 1e-4
+
+
+def test_density_is_the_sum_of_planes_times_lines():
+    tensorf = field(density_components=1, coarsest=1, finest=1, stages=1)
+    planes, lines = tensorf.density_volume.planes.detach(), tensorf.density_volume.lines.detach()
+    for i, j, k in ((0, 0, 0), (1, 0, 0), (0, 1, 1), (1, 0, 1)):
+        total = planes[0, j, k] * lines[0, i] + planes[1, i, k] * lines[1, j] + planes[2, i, j] * lines[2, k]
+        corner = BOX.to_world(torch.tensor([[i, j, k]]).float())
+        torch.testing.assert_close(tensorf.features(corner)[0], total.exp(), rtol=1e-4, atol=0)
+
+
+def test_every_parameter_learns(kernels: str):
+    tensorf = field()
+    density, rgb = tensorf(positions(500), directions(500))
+    (density.log().sum() + rgb.square().sum()).backward()
+    for name, parameter in tensorf.named_parameters():
+        assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
+
+
+def test_it_grows_with_progress_and_never_back():
+    tensorf = field()
+    assert tensorf.resolutions == [4, 8, 16]
+    assert [tensorf.resolution_at(p) for p in (0.0, 0.24, 0.25, 0.49, 0.5, 1.0)] == [4, 4, 8, 8, 16, 16]
+    assert field(grown=0.0).resolution_at(0.0) == 16 and field(finest=4, stages=1).resolution_at(0.0) == 4
+    volumes = [*tensorf.density_volume.parameters(), *tensorf.colour_volume.parameters()]
+    assert tensorf.grow(0.2) == []
+    for progress, cells in ((0.25, 8), (0.9, 16)):
+        replaced = tensorf.grow(progress)
+        assert [id(p) for p in replaced] == [id(p) for p in volumes], "the same parameters, with other data"
+        assert all(p.shape[1] == cells + 1 for p in volumes)
+    assert tensorf.grow(1.0) == [] and tensorf.grow(0.0) == []
+    assert tensorf.density_volume.cells == 16
+
+
+@pytest.mark.parametrize(("progress", "exact"), [(0.25, True), (1.0, True), (1.0, False)])
+def test_growing_keeps_the_field_where_all_vertices_stay(progress: float, exact: bool):
+    tensorf = field() if exact else field(finest=10)
+    x, d = positions(), directions()
+    before = [part.detach() for part in tensorf(x, d)]
+    assert tensorf.grow(progress)
+    differences = [(ours - theirs).abs().max() for ours, theirs in zip(tensorf(x, d), before, strict=True)]
+    assert (max(differences) < 1e-3) == exact
+
+
+def test_training_goes_on_after_growing_while_old_graphs_live():
+    tensorf, x, d = field(), positions(), directions()
+    optimizer = torch.optim.Adam(tensorf.parameters())
+    kept = []
+    for progress in (0.0, 0.3, 1.0):
+        for parameter in tensorf.grow(progress):
+            optimizer.state.pop(parameter, None)
+        optimizer.zero_grad()
+        kept.append(tensorf(x, d)[1].square().sum())
+        kept[-1].backward()
+        optimizer.step()
+    assert tensorf.colour_volume.cells == 16
+
+
+@pytest.mark.parametrize(("saved_at", "loaded_at"), [(1.0, 0.0), (0.0, 1.0), (0.3, 1.0)])
+def test_a_state_of_any_stage_loads_into_any_other(saved_at: float, loaded_at: float):
+    saved, loaded = field(), field()
+    saved.grow(saved_at)
+    loaded.grow(loaded_at)
+    wrapped = torch.nn.ModuleDict({"field": loaded})  # as a system holds it
+    wrapped.load_state_dict(torch.nn.ModuleDict({"field": saved}).state_dict())
+    x, d = positions(), directions()
+    for ours, theirs in zip(loaded(x, d), saved(x, d), strict=True):
+        assert torch.equal(ours, theirs)
+    assert loaded.grow(saved_at) == [], "what was loaded has the size of its stage"
+    loaded.grow(1.0)
+    assert loaded.density_volume.cells == 16
+
+
+def test_a_state_with_other_components_is_refused():
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        field().load_state_dict(field(colour_components=4, finest=8).state_dict())
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"coarsest": 17}, "model.coarsest"),
+        ({"stages": 1}, "model.stages"),
+        ({"grown": 1.1}, "model.grown"),
+        ({"grown": -0.1}, "model.grown"),
+        ({"density": "square"}, "model.density"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options: dict, named: str):
+    with pytest.raises(InputError, match=named):
+        field(**options)
