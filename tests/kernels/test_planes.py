@@ -8,7 +8,7 @@ from nerf_lightning.kernels import plane_line_products, plane_line_products_refe
 
 NAN = float("nan")
 READS = pytest.mark.parametrize("read", [plane_line_products, plane_line_sum])
-SIZES = pytest.mark.parametrize(("side", "channels"), [(2, 8), (3, 1), (5, 3), (9, 16), (17, 20)])
+SIZES = pytest.mark.parametrize(("side", "channels"), [(2, 8), (3, 1), (5, 3), (7, 20)])
 
 
 def factors(side: int, channels: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
@@ -45,7 +45,7 @@ def test_products_and_their_sum_agree_with_a_loop_over_vertices(side: int, chann
 
 @READS
 @SIZES
-@pytest.mark.parametrize("samples", [0, 1, 63, 2000])
+@pytest.mark.parametrize("samples", [0, 1, 512, 2000])
 def test_the_fast_version_agrees_with_the_reference(read, side: int, channels: int, samples: int):
     unit = 1.2 * torch.rand(samples, 3) - 0.1
     agree(read, [*factors(side, channels), unit], constants=(2,), atol=3e-6)
@@ -79,7 +79,7 @@ def test_positions_have_gradients_where_they_need_them(read, kernels: str):
 
 
 @READS
-@pytest.mark.parametrize("channels", [1, 8, 16])
+@pytest.mark.parametrize("channels", [1, 8, 20])
 def test_any_number_of_threads_gives_the_same(read, channels: int):
     inputs = [*factors(9, channels), torch.rand(3001, 3)]
     one, two = (with_threads(lambda: outcome(read, inputs, (2,)), threads) for threads in (1, 2))

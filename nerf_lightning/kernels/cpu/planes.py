@@ -7,8 +7,8 @@ from nerf_lightning.kernels.cpu.compile import inner, kernel
 from nerf_lightning.kernels.cpu.hashgrid import cell_of
 from nerf_lightning.kernels.cpu.lanes import load, store, total
 
-TILE = 64
-"""Samples worked on together where features [C, N] turn into rows [N, C], or back."""
+TILE = 512
+"""Samples worked on together where features [C, N] turn into rows [N, C], or back: long runs in memory, still in cache."""
 
 
 @inner(inline="always")
