@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf_lightning import kernels
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.model import HashGrid
+from nerf_lightning.model import HashGrid, VectorMatrix, VoxelField
 
 SAMPLES, RAYS = 1 << 15, 1 << 12
 
@@ -64,6 +64,11 @@ def cases() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
     layers = [(net.weight, net.bias) for net in nets]
     table = grid.tables, unit, grid.resolutions, grid.sizes
     volume = density, rgb, t, dt, ray, offsets
+    factors = VectorMatrix(128, 16)
+    voxels = VoxelField(bounds, coarsest=64, finest=64, stages=1)
+    found, view = kernels.locate(voxels.index, unit), harmonics[:, 1:4]
+    found_reference = kernels.locate_reference(voxels.index, unit)
+    run = voxels.log_density, voxels.vertex, voxels.index, 1, len(voxels.vertex)
     return {
         "march": (lambda: kernels.march(*march), lambda: kernels.march_reference(*march)),
         "points": (
@@ -93,6 +98,22 @@ def cases() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
         "spherical_harmonics": (
             lambda: kernels.spherical_harmonics(directions),
             lambda: kernels.spherical_harmonics_reference(directions),
+        ),
+        "plane_line_products + gradient": (
+            with_gradient(lambda: kernels.plane_line_products(factors.planes, factors.lines, unit)),
+            with_gradient(lambda: kernels.plane_line_products_reference(factors.planes, factors.lines, unit)),
+        ),
+        "locate": (
+            lambda: kernels.locate(voxels.index, unit),
+            lambda: kernels.locate_reference(voxels.index, unit),
+        ),
+        "read_voxels + gradient": (
+            with_gradient(lambda: kernels.read_voxels(*voxels.tables, *found, view)[1]),
+            with_gradient(lambda: kernels.read_voxels_reference(*voxels.tables, *found_reference, view)[1]),
+        ),
+        "roughness + gradient": (
+            with_gradient(lambda: kernels.roughness(*run)),
+            with_gradient(lambda: kernels.roughness_reference(*run)),
         ),
         "composite + gradient": (
             with_gradient(lambda: kernels.composite(*volume)[0]),

@@ -3,8 +3,9 @@
 Row 0 stands for all vertices that hold none: its values are constants and get no gradient.
 """
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.kernels.switch import fast
@@ -15,10 +16,10 @@ def side_of(index: Int[Tensor, "cells"]) -> int:
     return round(len(index) ** (1 / 3))
 
 
-def vertices(
-    unit: Float[Tensor, "N 3"], index: Int[Tensor, "cells"]
+def locate_reference(
+    index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
-    """Rows and trilinear weights of the eight vertices around each position (clamped into [0, 1]^3), last axis fastest."""
+    """`locate` in plain torch, for every device and differentiable in the positions."""
     side = side_of(index)
     scaled = unit.clamp(0, 1) * (side - 1)
     cell = scaled.long().clamp(0, side - 2)  # what is not a number becomes the smallest of all
@@ -28,112 +29,171 @@ def vertices(
         for j in (0, 1):
             for k in (0, 1):
                 at = ((cell[:, 0] + i) * side + cell[:, 1] + j) * side + cell[:, 2] + k
-                rows.append(index[at].long())
+                rows.append(index[at])
                 shares = [f if bit else 1 - f for f, bit in zip(fraction.unbind(1), (i, j, k), strict=True)]
                 weights.append(shares[0] * shares[1] * shares[2])
     return torch.stack(rows, 1), torch.stack(weights, 1)
 
 
-def voxel_values_reference(
-    values: Float[Tensor, "V *F"], index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]
+def locate(index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
+    """Rows and trilinear weights of the eight vertices around each position, the last axis fastest.
+
+    Args:
+        index: row of every vertex of a cubic grid over the unit cube, 32-bit, last axis fastest.
+        unit: positions in [0, 1]^3; outside they are clamped.
+    """
+    if not fast(unit) or unit.requires_grad:
+        return locate_reference(index, unit)
+    from nerf_lightning.kernels.cpu import voxels, workers
+
+    places = unit.T.contiguous()
+    rows, weights = torch.empty(len(unit), 8, dtype=torch.int32), torch.empty(len(unit), 8)
+    voxels.locate(index.numpy(), side_of(index) - 1, places.numpy(), rows.numpy(), weights.numpy(), workers())
+    return rows, weights
+
+
+def mark_rows(seen: Int[Tensor, "V"], rows: Int[Tensor, "N 8"], step: Int[Tensor, ""]) -> None:
+    """Notes in `seen` that these rows were read at this step, all 32-bit."""
+    if not fast(seen):
+        seen[rows.flatten().long()] = step
+        return
+    from nerf_lightning.kernels.cpu import voxels, workers
+
+    voxels.mark(seen.numpy(), rows.numpy(), int(step), workers())
+
+
+def interpolate_rows(
+    values: Float[Tensor, "V *F"], rows: Int[Tensor, "N 8"], weights: Float[Tensor, "N 8"]
 ) -> Float[Tensor, "N *F"]:
-    """Values interpolated at positions in [0, 1]^3, in plain torch, for every device; any number of values a vertex."""
-    rows, weights = vertices(unit, index)
+    """Any number of values a vertex, interpolated, in plain torch."""
     values = torch.cat([values[:1].detach(), values[1:]])
-    return torch.einsum("nc,nc...->n...", weights, values[rows])
-
-
-class _Value(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values: Tensor, index: Tensor, unit: Tensor) -> Tensor:
-        from nerf_lightning.kernels.cpu import voxels, workers
-
-        places, out = unit.T.contiguous(), torch.empty(len(unit))
-        voxels.interpolate(
-            values.detach().numpy(), index.numpy(), side_of(index) - 1, places.numpy(), out.numpy(), workers()
-        )
-        ctx.save_for_backward(index, places)
-        ctx.rows = len(values)
-        return out
-
-    @staticmethod
-    def backward(ctx, above: Tensor) -> tuple[Tensor, None, None]:
-        from nerf_lightning.kernels.cpu import voxels, workers
-
-        index, places = ctx.saved_tensors
-        grad = torch.zeros(ctx.rows)
-        arrays = index.numpy(), side_of(index) - 1, places.numpy(), above.contiguous().numpy()
-        voxels.scatter(grad.numpy(), *arrays, workers())
-        return grad, None, None
+    return torch.einsum("nc,nc...->n...", weights, values[rows.long()])
 
 
 def voxel_value(
     values: Float[Tensor, "V"], index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N"]:
-    """One value a vertex, interpolated.
-
-    Args:
-        values: of the vertices that are kept.
-        index: row of every vertex of a cubic grid over the unit cube, last axis fastest.
-        unit: positions in [0, 1]^3; outside they are clamped.
-    """
-    if fast(values, unit) and not unit.requires_grad:
-        return _Value.apply(values, index, unit)
-    return voxel_values_reference(values, index, unit)
-
-
-class _Colour(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values: Tensor, index: Tensor, unit: Tensor, basis: Tensor) -> Tensor:
-        from nerf_lightning.kernels.cpu import voxels, workers
-
-        places, basis, out = unit.T.contiguous(), basis.T.contiguous(), torch.empty(3, len(unit))
-        arrays = values.detach().numpy(), index.numpy(), side_of(index) - 1, places.numpy(), basis.numpy()
-        voxels.interpolate_colour(*arrays, out.numpy(), workers())
-        ctx.save_for_backward(index, places, basis)
-        ctx.shape = tuple(values.shape)
-        return out.T
-
-    @staticmethod
-    def backward(ctx, above: Tensor) -> tuple[Tensor, None, None, None]:
-        from nerf_lightning.kernels.cpu import voxels, workers
-
-        index, places, basis = ctx.saved_tensors
-        grad = torch.zeros(ctx.shape)
-        arrays = index.numpy(), side_of(index) - 1, places.numpy(), basis.numpy(), above.T.contiguous().numpy()
-        voxels.scatter_colour(grad.numpy(), *arrays, workers())
-        return grad, None, None, None
-
-
-def voxel_colour_reference(
-    values: Float[Tensor, "V C"], index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"], basis: Float[Tensor, "N B"]
-) -> Float[Tensor, "N 3"]:
-    """`voxel_colour` in plain torch, for every device."""
-    mixed = voxel_values_reference(values, index, unit).view(len(unit), 3, -1)
-    return torch.einsum("ncb,nb->nc", mixed, basis)
-
-
-def voxel_colour(
-    values: Float[Tensor, "V C"], index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"], basis: Float[Tensor, "N B"]
-) -> Float[Tensor, "N 3"]:
-    """Coefficients interpolated and summed over a basis of directions, without ever storing them a sample.
-
-    Args:
-        values: C = 3 B coefficients a vertex, those of red first.
-        index, unit: see `voxel_value`.
-        basis: the basis functions at each sample's direction, constants.
-    """
-    if fast(values, unit, basis) and not (unit.requires_grad or basis.requires_grad):
-        return _Colour.apply(values, index, unit, basis)
-    return voxel_colour_reference(values, index, unit, basis)
-
-
-def touch_rows(touched: Bool[Tensor, "V"], index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]) -> None:
-    """Marks the rows that interpolation at these positions reads."""
-    if not fast(unit):
-        touched[vertices(unit, index)[0].flatten()] = True
-        return
+    """One value a vertex, interpolated at positions in [0, 1]^3; fast where no gradient is asked, as samplers do."""
+    if not fast(values, unit) or (torch.is_grad_enabled() and (values.requires_grad or unit.requires_grad)):
+        return interpolate_rows(values, *locate_reference(index, unit))
     from nerf_lightning.kernels.cpu import voxels, workers
 
-    places = unit.detach().T.contiguous().numpy()
-    voxels.touch(touched.numpy(), index.numpy(), side_of(index) - 1, places, workers())
+    places, out = unit.detach().T.contiguous(), torch.empty(len(unit))
+    arrays = values.detach().numpy(), index.numpy(), side_of(index) - 1, places.numpy()
+    voxels.interpolate(*arrays, out.numpy(), workers())
+    return out
+
+
+class _Read(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx, density: Tensor, colour: Tensor, views: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        from nerf_lightning.kernels.cpu import voxels, workers
+
+        raw, rgb, basis = torch.empty(len(rows)), torch.empty(3, len(rows)), basis.T.contiguous()
+        found = rows.numpy(), weights.numpy()
+        voxels.read(density.detach().numpy(), colour.detach().numpy(), *found, raw.numpy(), rgb.numpy(), workers())
+        if len(basis):
+            lanes = (0,) * len(basis)
+            voxels.add_views(views.detach().numpy(), *found, basis.numpy(), rgb.numpy(), lanes, workers())
+        ctx.save_for_backward(rows, weights, basis)
+        ctx.table = len(density)
+        return raw, rgb.T
+
+    @staticmethod
+    def backward(ctx, raw: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, Tensor, None, None, None]:
+        from nerf_lightning.kernels.cpu import voxels, workers
+
+        rows, weights, basis = ctx.saved_tensors
+        found, above = (rows.numpy(), weights.numpy()), rgb.T.contiguous().numpy()
+        density, colour, views = (torch.zeros(ctx.table, *width) for width in ((), (3,), (3 * len(basis),)))
+        voxels.scatter(density.numpy(), colour.numpy(), *found, raw.contiguous().numpy(), above, workers())
+        if len(basis):
+            lanes = (0,) * len(basis)
+            voxels.scatter_views(views.numpy(), *found, basis.numpy(), above, lanes, workers())
+        return density, colour, views, None, None, None
+
+
+def read_voxels_reference(
+    density: Float[Tensor, "V"],
+    colour: Float[Tensor, "V 3"],
+    views: Float[Tensor, "V C"],
+    rows: Int[Tensor, "N 8"],
+    weights: Float[Tensor, "N 8"],
+    basis: Float[Tensor, "N B"],
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
+    """`read_voxels` in plain torch, for every device and differentiable in weights and basis too."""
+    mixed = interpolate_rows(views, rows, weights).view(len(rows), 3, basis.shape[1])
+    rgb = interpolate_rows(colour, rows, weights) + torch.einsum("ncb,nb->nc", mixed, basis)
+    return interpolate_rows(density, rows, weights), rgb
+
+
+def read_voxels(
+    density: Float[Tensor, "V"],
+    colour: Float[Tensor, "V 3"],
+    views: Float[Tensor, "V C"],
+    rows: Int[Tensor, "N 8"],
+    weights: Float[Tensor, "N 8"],
+    basis: Float[Tensor, "N B"],
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
+    """One density a vertex, interpolated, and a colour that depends on the direction.
+
+    Args:
+        density, colour: of the vertices that are kept.
+        views: C = 3 B coefficients of what a colour adds by direction, those of red first; they are summed as they are read.
+        rows, weights: of the vertices around each sample, as `locate` gives them.
+        basis: the basis functions at each sample's direction, constants.
+    """
+    if fast(density, colour, views, weights, basis) and not (weights.requires_grad or basis.requires_grad):
+        return _Read.apply(density, colour, views, rows, weights, basis)
+    return read_voxels_reference(density, colour, views, rows, weights, basis)
+
+
+class _Roughness(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values: Tensor, vertex: Tensor, index: Tensor, first: int, last: int) -> Tensor:
+        from nerf_lightning.kernels.cpu import voxels, workers
+
+        slope, sums = torch.empty(last - first), np.zeros(workers())
+        tables = values.detach().numpy(), vertex.numpy(), index.numpy(), side_of(index)
+        voxels.roughness(*tables, first, last, slope.numpy(), sums, workers())
+        ctx.slope, ctx.run, ctx.rows = slope, slice(first, last), len(values)
+        return torch.tensor(sums.sum() / (last - first), dtype=torch.float32)
+
+    @staticmethod
+    def backward(ctx, above: Tensor) -> tuple[Tensor, None, None, None, None]:
+        grad = torch.zeros(ctx.rows)
+        torch.mul(ctx.slope, 2 * above / len(ctx.slope), out=grad[ctx.run])
+        return grad, None, None, None, None
+
+
+def roughness_reference(
+    values: Float[Tensor, "V"], vertex: Int[Tensor, "V"], index: Int[Tensor, "cells"], first: int, last: int
+) -> Float[Tensor, ""]:
+    """`roughness` in plain torch, for every device."""
+    side, at = side_of(index), vertex[first:last].long()
+    squares = torch.zeros_like(values[first:last])
+    for stride in (side * side, side, 1):
+        place = at // stride % side
+        for sign in (-1, 1):
+            inside = (place + sign >= 0) & (place + sign < side)
+            other = torch.where(inside, index[torch.where(inside, at + sign * stride, 0)].long(), 0)
+            squares = squares + torch.where(other > 0, (values[first:last] - values.detach()[other]) ** 2, 0)
+    return squares.mean()
+
+
+def roughness(
+    values: Float[Tensor, "V"], vertex: Int[Tensor, "V"], index: Int[Tensor, "cells"], first: int, last: int
+) -> Float[Tensor, ""]:
+    """Mean over rows `first` to `last` of the squared differences to the six neighbours, summed over those that are kept.
+
+    The neighbours count as constants: over runs that cover all rows, the gradients sum up to that of the whole.
+
+    Args:
+        values: of the vertices that are kept, row 0 that of the others.
+        vertex: number of each row's vertex in the grid; that of row 0 is not read.
+        index: see `locate`.
+    """
+    version = _Roughness.apply if fast(values) else roughness_reference
+    return version(values, vertex, index, first, last)

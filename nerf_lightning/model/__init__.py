@@ -6,7 +6,7 @@ from nerf_lightning.model.field import Field, PictureField
 from nerf_lightning.model.hashgrid import HashGrid, HashGridField
 from nerf_lightning.model.mlp import MLPField
 from nerf_lightning.model.picture import PictureMLP
-from nerf_lightning.model.tensorf import TensoRFField
+from nerf_lightning.model.tensorf import TensoRFField, VectorMatrix
 from nerf_lightning.model.voxels import VoxelField
 
 __all__ = [
@@ -17,8 +17,9 @@ __all__ = [
     "PictureField",
     "PictureMLP",
     "TensoRFField",
+    "VectorMatrix",
+    "VoxelField",
     "density_activation",
     "sinusoidal",
-    "VoxelField",
     "truncated_exp",
 ]

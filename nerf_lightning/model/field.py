@@ -16,7 +16,7 @@ def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
 
 
 class Field(InBounds):
-    """A radiance field in world coordinates. Subclasses define `features` and `colour`.
+    """A radiance field in world coordinates. Subclasses define `features` and `colour`, or `density` and `forward`.
 
     Networks work in units of the bounds' half-size; `forward` and `density` convert to 1 / world unit, so that a scene in
     metres and the same scene in millimetres train alike.

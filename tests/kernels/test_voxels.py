@@ -1,18 +1,22 @@
+import jaxtyping
 import pytest
 import torch
+from agreement import agree, outcome, with_threads
 from torch import Tensor
 
 from nerf_lightning.kernels import (
+    interpolate_rows,
+    locate,
+    mark_rows,
+    read_voxels,
+    roughness,
     spherical_harmonics,
-    touch_rows,
     use_kernels,
-    voxel_colour,
-    voxel_colour_reference,
     voxel_value,
-    voxel_values_reference,
 )
 
 SIDE = 6
+NAN = float("nan")
 
 
 def sparse_index(side: int = SIDE) -> Tensor:
@@ -21,86 +25,201 @@ def sparse_index(side: int = SIDE) -> Tensor:
     return torch.where(kept, kept.cumsum(0), 0).int()
 
 
+def rows_of(index: Tensor) -> int:
+    return int(index.max()) + 1
+
+
+def vertices_of(index: Tensor) -> Tensor:
+    return torch.cat([torch.tensor([-1]), index.nonzero()[:, 0]]).int()
+
+
 def places(count: int) -> Tensor:
     """Positions within the unit cube, on its faces and outside."""
     return torch.cat([torch.rand(count, 3), torch.tensor([[0.0, 0, 0], [1, 1, 1], [-0.5, 0.3, 2]])])
 
 
-def by_hand(values: Tensor, index: Tensor, position: list[float]) -> float:
-    cells, total = SIDE - 1, 0.0
-    scaled = [min(max(p, 0.0), 1.0) * cells for p in position]
-    low = [min(int(s), cells - 1) for s in scaled]
-    for i in (0, 1):
-        for j in (0, 1):
-            for k in (0, 1):
-                weight = 1.0
-                for bit, s, c in zip((i, j, k), scaled, low, strict=True):
-                    weight *= s - c if bit else 1 - (s - c)
-                row = index[((low[0] + i) * SIDE + low[1] + j) * SIDE + low[2] + k]
-                total += weight * float(values[row])
+def tables(index: Tensor, terms: int) -> list[Tensor]:
+    rows = rows_of(index)
+    return [torch.randn(rows), torch.randn(rows, 3), torch.randn(rows, 3 * terms)]
+
+
+def basis_of(count: int, terms: int) -> Tensor:
+    directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=1)
+    return spherical_harmonics(directions)[:, 1 : 1 + terms]
+
+
+def by_hand(values: Tensor, index: Tensor, position: list[float]) -> Tensor:
+    """All vertices, each with the weight of a tent around it."""
+    total = torch.zeros(values.shape[1:], dtype=torch.float64)
+    tents = [[max(0.0, 1 - abs(min(max(p, 0.0), 1.0) * (SIDE - 1) - i)) for i in range(SIDE)] for p in position]
+    for at, row in enumerate(index.tolist()):
+        i, j, k = at // SIDE**2, at // SIDE % SIDE, at % SIDE
+        total += tents[0][i] * tents[1][j] * tents[2][k] * values[row].double()
     return total
 
 
-@pytest.mark.parametrize("choice", ["auto", "reference"])
-def test_value_agrees_with_a_loop_over_vertices(choice):
+def test_interpolation_agrees_with_a_loop_over_vertices(kernels: str):
     index, unit = sparse_index(), places(20)
-    values = torch.randn(int(index.max()) + 1)
-    use_kernels(choice)
-    try:
-        actual = voxel_value(values, index, unit)
-    finally:
-        use_kernels("auto")
-    expected = torch.tensor([by_hand(values, index, position) for position in unit.tolist()])
-    torch.testing.assert_close(actual, expected, atol=1e-5, rtol=1e-5)
+    density, colour, views = tables(index, 3)
+    basis = basis_of(len(unit), 3)
+    raw, rgb = read_voxels(density, colour, views, *locate(index, unit), basis)
+    for n, position in enumerate(unit.tolist()):
+        expected = by_hand(density, index, position)
+        torch.testing.assert_close(raw[n].double(), expected, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(voxel_value(density, index, unit)[n].double(), expected, atol=1e-5, rtol=1e-5)
+        turned = by_hand(views.view(-1, 3, 3), index, position) @ basis[n].double()
+        expected = by_hand(colour, index, position) + turned
+        torch.testing.assert_close(rgb[n].double(), expected, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("count", [0, 1, 500])
-def test_fast_value_agrees_with_the_reference_in_value_and_gradient(count):
+def test_fast_rows_and_weights_agree_with_the_reference(count: int):
+    agree(locate, [sparse_index(), places(count)], constants=(0, 1))
+
+
+@pytest.mark.parametrize("count", [0, 1, 500])
+def test_fast_value_agrees_with_the_reference(count: int):
     index, unit = sparse_index(), places(count)
-    values = torch.randn(int(index.max()) + 1, requires_grad=True)
-    above = torch.randn(len(unit))
-    fast, plain = voxel_value(values, index, unit), voxel_values_reference(values, index, unit)
-    torch.testing.assert_close(fast, plain, atol=1e-5, rtol=1e-5)
-    (ours,) = torch.autograd.grad(fast, values, above)
-    (theirs,) = torch.autograd.grad(plain, values, above)
-    torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-5)
-    assert ours[0] == 0  # the row of all vertices that are not kept is a constant
-    assert ours[1:].any()
+    (values, *_) = tables(index, 0)
+    with torch.no_grad():
+        agree(voxel_value, [values, index, unit], constants=(0, 2))
+    agree(voxel_value, [values, index, unit], constants=(2,))
 
 
-@pytest.mark.parametrize("terms", [1, 4, 9, 16])
-def test_fast_colour_agrees_with_the_reference_in_value_and_gradient(terms):
-    index, unit = sparse_index(), places(300)
-    values = torch.randn(int(index.max()) + 1, 3 * terms, requires_grad=True)
-    directions = torch.nn.functional.normalize(torch.randn(len(unit), 3), dim=1)
-    basis, above = spherical_harmonics(directions)[:, :terms], torch.randn(len(unit), 3)
-    fast, plain = (f(values, index, unit, basis) for f in (voxel_colour, voxel_colour_reference))
-    torch.testing.assert_close(fast, plain, atol=1e-5, rtol=1e-4)
-    (ours,) = torch.autograd.grad(fast, values, above)
-    (theirs,) = torch.autograd.grad(plain, values, above)
-    torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4)
-    assert not ours[0].any()
-    (again,) = torch.autograd.grad(voxel_colour(values, index, unit, basis), values, above)
-    assert torch.equal(ours, again)
+@pytest.mark.parametrize("terms", [0, 3, 8, 15])
+@pytest.mark.parametrize("count", [0, 1, 64, 700])
+def test_fast_reading_agrees_with_the_reference(terms: int, count: int):
+    index, unit = sparse_index(), places(count)
+    rows, weights = locate(index, unit)
+    inputs = [*tables(index, terms), rows, weights, basis_of(len(unit), terms)]
+    agree(read_voxels, inputs, constants=(4, 5), atol=3e-6)
 
 
-def test_what_is_not_a_number_stays_visible():
+def test_any_number_of_threads_gives_the_same():
+    index, unit = sparse_index(9), places(3001)
+    rows, weights = locate(index, unit)
+    inputs = [*tables(index, 3), rows, weights, basis_of(len(unit), 3)]
+    one, two = (with_threads(lambda: outcome(read_voxels, inputs, (4, 5)), threads) for threads in (1, 2))
+    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
+
+
+def test_what_is_not_kept_gets_no_gradient(kernels: str):
+    index, unit = sparse_index(), places(100)
+    free = [table.requires_grad_() for table in tables(index, 3)]
+    raw, rgb = read_voxels(*free, *locate(index, unit), basis_of(len(unit), 3))
+    (raw.sum() + rgb.sum()).backward()
+    for table in free:
+        assert not table.grad[0].any() and table.grad[1:].any()
+
+
+def test_gradients_of_weights_and_basis(kernels: str):
+    index, unit = sparse_index(4), torch.rand(5, 3)
+    rows, weights = locate(index, unit)
+    free = [x.double().requires_grad_() for x in (*tables(index, 3), weights, basis_of(5, 3))]
+    free[0].data[0], free[1].data[0], free[2].data[0] = 0, 0, 0
+
+    def call(density: Tensor, colour: Tensor, views: Tensor, weights: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+        # Row 0 is a constant, whatever its number: a check by differences must not move it.
+        held = [torch.cat([table[:1].detach() * 0, table[1:]]) for table in (density, colour, views)]
+        return read_voxels(*held, rows, weights, basis)
+
+    assert torch.autograd.gradcheck(call, free)
+
+
+def test_positions_have_gradients_where_they_need_them(kernels: str):
+    index, unit = sparse_index(), (torch.randint(0, 5, (9, 3)) + 0.2 + 0.6 * torch.rand(9, 3)) / 5
+    (values, *_) = tables(index, 0)
+    unit.requires_grad_()
+    (got,) = torch.autograd.grad(voxel_value(values, index, unit).sum(), unit)
+    step = 1e-3 * torch.eye(3)
+    with torch.no_grad():
+        slopes = [(voxel_value(values, index, unit + s) - voxel_value(values, index, unit - s)) / 2e-3 for s in step]
+    torch.testing.assert_close(got, torch.stack(slopes, 1), rtol=1e-2, atol=1e-2)
+
+
+def test_what_is_not_a_number_stays_visible(kernels: str):
+    index, unit = torch.arange(1, SIDE**3 + 1, dtype=torch.int32), places(20)
+    unit[3, 0], unit[5, 2], unit[7] = NAN, NAN, NAN
+    free = [table.requires_grad_() for table in tables(index, 3)]
+    raw, rgb = read_voxels(*free, *locate(index, unit), basis_of(len(unit), 3))
+    bad = unit.isnan().any(1)
+    assert raw[bad].isnan().all() and rgb[bad].isnan().all()
+    assert raw[~bad].isfinite().all() and rgb[~bad].isfinite().all()
+    with torch.no_grad():
+        assert torch.equal(voxel_value(free[0], index, unit).isnan(), bad)
+    (raw.sum() + rgb.sum()).backward()
+    assert all(table.grad.isnan().any() for table in free)
+    free[0].data[:] = NAN
+    with torch.no_grad():
+        assert voxel_value(free[0], index, places(3)).isnan().all()
+
+
+def test_marking_notes_the_step_at_the_rows_that_are_read(kernels: str):
     index = torch.arange(1, SIDE**3 + 1, dtype=torch.int32)
-    values = torch.full((SIDE**3 + 1,), float("nan"))
-    assert voxel_value(values, index, places(3)).isnan().all()
-    values, nowhere = torch.ones(SIDE**3 + 1), torch.full((2, 3), float("nan"))
-    assert voxel_value(values, index, nowhere).isnan().all()
-    assert voxel_values_reference(values, index, nowhere).isnan().all()
-
-
-@pytest.mark.parametrize("choice", ["auto", "reference"])
-def test_touching_marks_the_rows_that_are_read(choice):
-    index = torch.arange(1, SIDE**3 + 1, dtype=torch.int32)
-    touched = torch.zeros(SIDE**3 + 1, dtype=torch.bool)
-    use_kernels(choice)
-    try:
-        touch_rows(touched, index, torch.tensor([[0.05, 0.05, 0.05]]))
-    finally:
-        use_kernels("auto")
+    seen = torch.zeros(SIDE**3 + 1, dtype=torch.int32)
+    mark_rows(seen, locate(index, torch.tensor([[0.05, 0.05, 0.05]]))[0], torch.tensor(3, dtype=torch.int32))
+    mark_rows(seen, locate(index, torch.tensor([[0.95, 0.95, 0.95]]))[0], torch.tensor(7, dtype=torch.int32))
     near = [(i * SIDE + j) * SIDE + k + 1 for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    assert touched.nonzero()[:, 0].tolist() == near
+    assert (seen == 3).nonzero()[:, 0].tolist() == near
+    assert (seen == 7).nonzero()[:, 0].tolist() == [SIDE**3 + 1 - row for row in reversed(near)]
+
+
+def test_roughness_is_that_of_a_loop_over_neighbours(kernels: str):
+    index = sparse_index()
+    (values, *_) = tables(index, 0)
+    vertex, rows = vertices_of(index), rows_of(index)
+    grid, squares = index.view(SIDE, SIDE, SIDE), 0.0
+    for at in range(SIDE**3):
+        place = [at // SIDE**2, at // SIDE % SIDE, at % SIDE]
+        for axis in range(3):
+            for sign in (-1, 1):
+                other = list(place)
+                other[axis] += sign
+                if 0 <= other[axis] < SIDE and grid[tuple(place)] > 0 and grid[tuple(other)] > 0:
+                    squares += float(values[grid[tuple(place)]] - values[grid[tuple(other)]]) ** 2
+    assert float(roughness(values, vertex, index, 1, rows)) == pytest.approx(squares / (rows - 1), rel=1e-5)
+
+
+@pytest.mark.parametrize(("first", "last"), [(1, None), (1, 2), (20, 60)])
+def test_fast_roughness_agrees_with_the_reference(first: int, last: int | None):
+    index = sparse_index()
+    (values, *_), last = tables(index, 0), last or rows_of(index)
+    vertex = vertices_of(index)
+
+    def rough(values: Tensor) -> Tensor:
+        return roughness(values, vertex, index, first, last)
+
+    agree(rough, [values], rtol=1e-5)
+
+
+def test_pieces_of_the_roughness_pull_as_the_whole(kernels: str):
+    index = sparse_index()
+    (values, *_) = tables(index, 0)
+    vertex, rows = vertices_of(index), rows_of(index)
+    values.requires_grad_()
+
+    def pull(first: int, last: int) -> Tensor:
+        return (last - first) * torch.autograd.grad(roughness(values, vertex, index, first, last), values)[0]
+
+    torch.testing.assert_close(pull(1, 30) + pull(30, rows), pull(1, rows))
+    smoother = values.detach() - 0.01 * pull(1, rows)
+    assert roughness(smoother, vertex, index, 1, rows) < roughness(values, vertex, index, 1, rows)
+
+
+def test_all_kept_vertices_count_as_rows():
+    """`interpolate_rows` takes any number of values a vertex."""
+    index, unit = sparse_index(), places(30)
+    values = torch.randn(rows_of(index), 2, 4)
+    rows, weights = locate(index, unit)
+    expected = torch.stack([by_hand(values, index, p) for p in unit.tolist()])
+    torch.testing.assert_close(interpolate_rows(values, rows, weights).double(), expected, atol=1e-5, rtol=1e-5)
+
+
+def test_a_wrong_shape_is_refused_in_tests():
+    use_kernels("reference")
+    index, unit = sparse_index(), places(4)
+    density, colour, views = tables(index, 3)
+    rows, weights = locate(index, unit)
+    for wrong in ((density[1:], colour, views), (density, colour[:, :2], views), (density, colour, views[1:])):
+        with pytest.raises(jaxtyping.TypeCheckError):
+            read_voxels(*wrong, rows, weights, basis_of(len(unit), 3))

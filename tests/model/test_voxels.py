@@ -3,6 +3,7 @@ import torch
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import interpolate_rows, locate, roughness, spherical_harmonics
 from nerf_lightning.model import VoxelField
 
 BOX = Bounds(torch.tensor([[-2.0, -1, 0], [2, 3, 4]]))
@@ -10,8 +11,8 @@ BOX = Bounds(torch.tensor([[-2.0, -1, 0], [2, 3, 4]]))
 
 def field(**options) -> VoxelField:
     made = VoxelField(BOX, **{"coarsest": 8, "finest": 16, "stages": 2, "grown": 0.5} | options)
-    made.log_density.data[1:] = torch.randn(len(made.log_density) - 1)
-    made.coefficients.data[1:] = torch.randn(made.coefficients[1:].shape)
+    for table in made.tables:
+        table.data[1:] = torch.randn(table[1:].shape)
     return made
 
 
@@ -23,24 +24,33 @@ def directions(count: int = 200) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.randn(count, 3), dim=1)
 
 
+def see(voxels: VoxelField, low: float = 0.0, high: float = 1.0, count: int = 3000) -> torch.Tensor:
+    """Reads the field, as training does, at places in a part of the box. Returns the places."""
+    at = BOX.to_world(low + (high - low) * torch.rand(count, 3))
+    voxels(at, directions(count))
+    return at
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_short_way_agrees_with_features_and_colour(degree):
-    voxels, x, d = field(degree=degree), positions(), directions()
+def test_density_and_colour_are_what_the_tables_say(degree: int, kernels: str):
+    voxels, x, d = field(degree=degree, density_rate=2.0), positions(), directions()
     density, rgb = voxels(x, d)
-    raw, features = voxels.features(x)
-    torch.testing.assert_close(density, raw / voxels.unit_length)
+    rows, weights = locate(voxels.index, BOX.to_unit(x))
+    raw, colour, views = (interpolate_rows(table, rows, weights) for table in voxels.tables)
+    torch.testing.assert_close(density, torch.exp(voxels.density_rate * raw) / 2)  # half the box is two units long
     torch.testing.assert_close(voxels.density(x), density)
-    torch.testing.assert_close(rgb, voxels.colour(features, d), atol=1e-5, rtol=1e-4)
-    assert (density > 0).all() and (rgb > 0).all() and (rgb < 1).all()
+    terms = (degree + 1) ** 2 - 1
+    turned = torch.einsum("ncb,nb->nc", views.view(200, 3, terms), spherical_harmonics(d)[:, 1 : 1 + terms])
+    torch.testing.assert_close(rgb, torch.sigmoid(colour + turned), atol=1e-5, rtol=1e-4)
 
 
 def test_growing_keeps_the_field_where_everything_was_seen():
     voxels, x, d = field(), positions(), directions()
-    voxels.touched[:] = True
+    see(voxels)
     before = [part.detach() for part in voxels(x, d)]
     assert voxels.grow(0.49) == []
     replaced = voxels.grow(0.5)
-    assert [id(p) for p in replaced] == [id(voxels.log_density), id(voxels.coefficients)]
+    assert [id(p) for p in replaced] == [id(table) for table in voxels.tables]
     assert len(voxels.index) == 17**3 and len(voxels.log_density) == 17**3 + 1
     # Every second vertex of the finer grid is one of the coarser: trilinear interpolation is the same on both.
     for ours, theirs in zip(voxels(x, d), before, strict=True):
@@ -50,17 +60,46 @@ def test_growing_keeps_the_field_where_everything_was_seen():
 
 def test_growing_drops_what_no_sample_has_read():
     voxels = field()
-    low = BOX.to_world(0.2 * torch.rand(50, 3))
-    voxels(low, directions(50))  # only one corner of the box is looked at
+    low = see(voxels, high=0.2)  # only one corner of the box is looked at
     with torch.no_grad():
         voxels(positions(), directions())  # an evaluation is no training
     before = voxels.density(low)
     voxels.grow(1.0)
-    assert len(voxels.log_density) < 0.2 * 17**3
+    assert len(voxels.log_density) < 0.1 * 17**3
     torch.testing.assert_close(voxels.density(low), before, atol=1e-4, rtol=1e-3)
     far = BOX.to_world(0.8 + 0.2 * torch.rand(50, 3))
     assert (voxels.density(far) < 1e-3).all()
     assert voxels.index.min() == 0 and voxels.index.max() == len(voxels.log_density) - 1
+    assert torch.equal(voxels.index[voxels.vertex[1:].long()], torch.arange(1, len(voxels.vertex), dtype=torch.int32))
+
+
+def test_what_was_read_in_the_first_half_of_a_stage_is_forgotten():
+    voxels = field()
+    see(voxels, low=0.8)
+    for _ in range(5):
+        voxels.grow(0.0)
+    late = see(voxels, high=0.2)
+    for _ in range(2):
+        voxels.grow(0.0)
+    before = voxels.density(late)
+    voxels.grow(1.0)
+    torch.testing.assert_close(voxels.density(late), before, atol=1e-4, rtol=1e-3)
+    assert (voxels.density(BOX.to_world(0.9 + 0.1 * torch.rand(50, 3))) < 1e-3).all()
+
+
+def test_a_neighbour_of_what_was_read_stays_too():
+    voxels = field()
+    voxels(BOX.to_world(torch.full((1, 3), 0.51)), directions(1))  # eight vertices, 4 and 5 along each axis
+    voxels.grow(1.0)
+    kept = voxels.index.view(17, 17, 17).nonzero()
+    assert kept.min(0).values.tolist() == [7, 7, 7] and kept.max(0).values.tolist() == [11, 11, 11]
+    assert len(kept) == 5**3
+
+
+def test_growing_before_anything_was_rendered_keeps_everything():
+    voxels = field()
+    voxels.grow(1.0)
+    assert len(voxels.log_density) == 17**3 + 1
 
 
 def test_growing_does_not_mind_a_graph_from_before():
@@ -68,46 +107,62 @@ def test_growing_does_not_mind_a_graph_from_before():
     before = voxels(positions(), directions())
     voxels.grow(1.0)
     density, rgb = voxels(positions(), directions())
-    (density.sum() + rgb.sum()).backward()
-    assert voxels.coefficients.grad.shape == voxels.coefficients.shape
+    (density.sum() + rgb.sum() + voxels.penalty()).backward()
+    assert all(table.grad.shape == table.shape for table in voxels.tables)
     assert before[0].requires_grad
 
 
-def test_what_was_read_in_the_first_half_of_a_stage_is_forgotten():
-    voxels = field()
-    voxels(positions(), directions())
-    voxels.grow(0.24)
-    assert voxels.touched.any()
-    voxels.grow(0.25)
-    assert not voxels.touched.any()
-    voxels(positions(), directions())
-    voxels.grow(0.3)
-    assert voxels.touched.any()
-
-
-def test_a_grown_state_loads_into_a_fresh_field():
-    grown, x, d = field(), positions(), directions()
-    grown(x[:20], d[:20])
-    grown.grow(1.0)
+@pytest.mark.parametrize("grown", [False, True])
+def test_a_state_goes_on_in_a_fresh_field_as_in_its_own(grown: bool):
+    voxels, x, d = field(), positions(), directions()
+    see(voxels, high=0.4)
+    voxels.grow(1.0 if grown else 0.1)
     fresh = VoxelField(BOX, coarsest=8, finest=16, stages=2, grown=0.5)
-    fresh.load_state_dict(grown.state_dict())
-    for ours, theirs in zip(fresh(x, d), grown(x, d), strict=True):
+    fresh.load_state_dict(voxels.state_dict())
+    for _ in range(3):
+        assert len(fresh.grow(0.1)) == len(voxels.grow(0.1)) == 0
+        assert torch.equal(fresh.penalty(), voxels.penalty())
+    for ours, theirs in zip(fresh(x, d), voxels(x, d), strict=True):
         assert torch.equal(ours, theirs)
-    assert fresh.grow(1.0) == []  # the stage came along
+    assert len(fresh.grow(1.0)) == len(voxels.grow(1.0)) == (0 if grown else 3)
+    assert torch.equal(fresh.index, voxels.index) and torch.equal(fresh.log_density, voxels.log_density)
 
 
 def test_the_empty_row_does_not_learn():
     voxels = field()
-    voxels.touched[1:30] = True
+    see(voxels, high=0.3)
     voxels.grow(1.0)
     density, rgb = voxels(positions(), directions())
-    (density.sum() + rgb.sum()).backward()
-    assert voxels.log_density.grad[0] == 0 and not voxels.coefficients.grad[0].any()
+    (density.sum() + rgb.sum() + voxels.penalty()).backward()
+    assert not any(table.grad[0].any() for table in voxels.tables)
+
+
+def test_the_penalty_looks_at_each_piece_in_turn():
+    voxels = field(smoothness=0.5)
+    slopes = []
+    for _ in range(4):
+        voxels.grow(0.0)
+        (slope,) = torch.autograd.grad(voxels.penalty(), voxels.log_density)
+        slopes.append(slope)
+    touched = torch.stack(slopes).bool().sum(0)
+    assert touched[0] == 0 and (touched[1:] == 1).all()
+    rows = len(voxels.vertex)
+    whole = 0.5 * roughness(voxels.log_density, voxels.vertex, voxels.index, 1, rows)
+    (expected,) = torch.autograd.grad(whole, voxels.log_density)
+    torch.testing.assert_close(sum(slopes) / 4, expected, rtol=0.02, atol=1e-5)
+    assert field(smoothness=0.0).penalty() is None
 
 
 @pytest.mark.parametrize(
     ("options", "key"),
-    [({"coarsest": 20}, "model.coarsest"), ({"degree": 4}, "model.degree"), ({"grown": 0.0}, "model.grown")],
+    [
+        ({"coarsest": 20}, "model.coarsest"),
+        ({"degree": 4}, "model.degree"),
+        ({"grown": 0.0}, "model.grown"),
+        ({"density_rate": 0.0}, "model.density_rate"),
+        ({"density_rate": float("nan")}, "model.density_rate"),
+        ({"smoothness": -1.0}, "model.smoothness"),
+    ],
 )
 def test_bad_options_are_named(options, key):
     with pytest.raises(InputError, match=key):

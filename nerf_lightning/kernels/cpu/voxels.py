@@ -1,114 +1,220 @@
 """Trilinear interpolation on a sparse grid of vertices, and its gradient.
 
-Each sample meets eight vertices; `index` says in which row of the table each one's values stand. In gradients a worker owns
-blocks of rows: it visits all samples and adds to its own rows alone. Row 0, of all vertices that are not kept, is constant.
+In gradients a worker owns a run of rows: it visits all samples in order and adds to its own rows alone, so that the sums do
+not depend on the number of workers. Row 0, of all vertices that are not kept, is constant.
 """
 
 import numpy as np
-from numba import float32, int32, int64, prange, uint32
+from numba import float32, int64, prange
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
+from nerf_lightning.kernels.cpu.hashgrid import cell_of
+from nerf_lightning.kernels.cpu.lanes import load, store, total
 
-BLOCK = 6
-"""Rows are dealt out to workers in blocks of 2^6: wide enough not to share cache lines."""
+TILE = 64
+"""Samples whose basis functions are turned from columns into rows together."""
+BINS = 256
+"""Pieces of the table in which a gradient's work is counted before it is shared out."""
 
 
 @inner
-def corners(unit, n, index, resolution, rows, weights):
-    """Rows and weights of the eight vertices around sample n; outside the unit cube it is clamped."""
-    side = resolution + 1
-    x = min(max(unit[0, n], float32(0)), float32(1)) * float32(resolution)
-    y = min(max(unit[1, n], float32(0)), float32(1)) * float32(resolution)
-    z = min(max(unit[2, n], float32(0)), float32(1)) * float32(resolution)
-    # As unsigned numbers: what is not a number then lands in the last cell instead of outside the grid.
-    top = uint32(resolution - 1)
-    i, j, k = min(uint32(int32(x)), top), min(uint32(int32(y)), top), min(uint32(int32(z)), top)
-    fx, fy, fz = x - float32(i), y - float32(j), z - float32(k)
+def corners(unit, n, index, cells):
+    """Rows and weights of the eight vertices around sample n, the last coordinate fastest."""
+    side = int64(cells + 1)
+    i, fx = cell_of(unit[0, n], cells)
+    j, fy = cell_of(unit[1, n], cells)
+    k, fz = cell_of(unit[2, n], cells)
     gx, gy, gz = float32(1) - fx, float32(1) - fy, float32(1) - fz
-    first = (int64(i) * side + int64(j)) * side + int64(k)
-    rows[0], rows[1] = index[first], index[first + 1]
-    rows[2], rows[3] = index[first + side], index[first + side + 1]
-    first += side * side
-    rows[4], rows[5] = index[first], index[first + 1]
-    rows[6], rows[7] = index[first + side], index[first + side + 1]
-    weights[0], weights[1], weights[2], weights[3] = gx * gy * gz, gx * gy * fz, gx * fy * gz, gx * fy * fz
-    weights[4], weights[5], weights[6], weights[7] = fx * gy * gz, fx * gy * fz, fx * fy * gz, fx * fy * fz
+    a = (int64(i) * side + int64(j)) * side + int64(k)
+    b, c, d = a + side, a + side * side, a + side * side + side
+    rows = index[a], index[a + 1], index[b], index[b + 1], index[c], index[c + 1], index[d], index[d + 1]
+    low = gx * gy * gz, gx * gy * fz, gx * fy * gz, gx * fy * fz
+    return rows, (*low, fx * gy * gz, fx * gy * fz, fx * fy * gz, fx * fy * fz)
 
 
 @kernel
-def interpolate(values, index, resolution, unit, out, workers):
+def locate(index, cells, unit, rows, weights, workers):
+    """Fills rows [N, 8] and weights [N, 8] for unit [3, N]."""
+    samples = unit.shape[1]
+    for worker in prange(workers):
+        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
+            r, w = corners(unit, n, index, cells)
+            for c in range(8):
+                rows[n, c], weights[n, c] = r[c], w[c]
+
+
+@kernel
+def mark(seen, rows, step, workers):
+    """seen [V] = step at all rows [N, 8]. Workers may meet in a row: they write the same there."""
+    samples = rows.shape[0]
+    for worker in prange(workers):
+        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
+            for corner in range(8):
+                seen[rows[n, corner]] = step
+
+
+@inner
+def interpolate_run(values, index, cells, unit, out, first, last):
+    for n in range(first, last):
+        r, w = corners(unit, n, index, cells)
+        low = (w[0] * values[r[0]] + w[1] * values[r[1]]) + (w[2] * values[r[2]] + w[3] * values[r[3]])
+        high = (w[4] * values[r[4]] + w[5] * values[r[5]]) + (w[6] * values[r[6]] + w[7] * values[r[7]])
+        out[n] = low + high
+
+
+@kernel
+def interpolate(values, index, cells, unit, out, workers):
     """out [N] from values [V] and unit [3, N]."""
     samples = len(out)
     for worker in prange(workers):
-        rows, weights = np.empty(8, np.int64), np.empty(8, np.float32)
+        first, last = samples * worker // workers, samples * (worker + 1) // workers
+        interpolate_run(values, index, cells, unit, out, first, last)
+
+
+@kernel
+def read(density, colour, rows, weights, raw, rgb, workers):
+    """raw [N] from density [V], and rgb [3, N] from colour [V, 3]."""
+    samples = len(raw)
+    for worker in prange(workers):
         for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            corners(unit, n, index, resolution, rows, weights)
-            total = float32(0)
-            for c in range(8):
-                total += weights[c] * values[rows[c]]
-            out[n] = total
+            s, a, b, c = float32(0), float32(0), float32(0), float32(0)
+            for corner in range(8):
+                row, weight = rows[n, corner], weights[n, corner]
+                s += weight * density[row]
+                a += weight * colour[row, 0]
+                b += weight * colour[row, 1]
+                c += weight * colour[row, 2]
+            raw[n], rgb[0, n], rgb[1, n], rgb[2, n] = s, a, b, c
+
+
+@inner
+def turn(basis, first, count, tile):
+    """tile [TILE, B] from `count` columns of basis [B, N]."""
+    for b in range(tile.shape[1]):
+        for k in range(count):
+            tile[k, b] = basis[b, first + k]
+
+
+@inner
+def add_views_run(views, rows, weights, basis, rgb, lanes, start, end):
+    terms = len(lanes)
+    tile = np.empty((TILE, terms), np.float32)
+    for first in range(start, end, TILE):
+        count = min(TILE, end - first)
+        turn(basis, first, count, tile)
+        for k in range(count):
+            n = first + k
+            row, weight = rows[n, 0], weights[n, 0]
+            a = weight * load(views, row, 0, lanes)
+            b = weight * load(views, row, terms, lanes)
+            c = weight * load(views, row, 2 * terms, lanes)
+            for corner in range(1, 8):
+                row, weight = rows[n, corner], weights[n, corner]
+                a = a + weight * load(views, row, 0, lanes)
+                b = b + weight * load(views, row, terms, lanes)
+                c = c + weight * load(views, row, 2 * terms, lanes)
+            given = load(tile, k, 0, lanes)
+            rgb[0, n] += total(a * given)
+            rgb[1, n] += total(b * given)
+            rgb[2, n] += total(c * given)
 
 
 @kernel
-def scatter(grad, index, resolution, unit, above, workers):
-    """Fills grad [V] from above [N]."""
-    samples = len(above)
+def add_views(views, rows, weights, basis, rgb, lanes, workers):
+    """Adds to rgb [3, N] what views [V, 3 B], interpolated, gives with basis [B, N]; `lanes` is a tuple of length B."""
+    samples = rows.shape[0]
     for worker in prange(workers):
-        rows, weights = np.empty(8, np.int64), np.empty(8, np.float32)
-        for n in range(samples):
-            corners(unit, n, index, resolution, rows, weights)
-            for c in range(8):
-                if rows[c] > 0 and (rows[c] >> BLOCK) % workers == worker:
-                    grad[rows[c]] += weights[c] * above[n]
+        start, end = samples * worker // workers, samples * (worker + 1) // workers
+        add_views_run(views, rows, weights, basis, rgb, lanes, start, end)
+
+
+@inner
+def borders(rows, table, workers):
+    """Rows [workers + 1], from 1 to `table`, between which each worker adds, so that all have about as much to do."""
+    counts, width = np.zeros(BINS, np.int64), table // BINS + 1
+    for n in range(0, len(rows), 4):  # a part of them tells enough
+        for corner in range(0, 8, 3):
+            if rows[n, corner] > 0:
+                counts[rows[n, corner] // width] += 1
+    found = np.full(workers + 1, table)
+    found[0] = 1
+    everything, passed, worker = counts.sum(), 0, 1
+    for b in range(BINS):
+        passed += counts[b]
+        while worker < workers and passed * workers >= everything * worker:
+            found[worker] = min((b + 1) * width, table)
+            worker += 1
+    return found
 
 
 @kernel
-def interpolate_colour(values, index, resolution, unit, basis, out, workers):
-    """out [3, N]: values [V, 3 B] interpolated, each third of them summed with weights basis [B, N]."""
-    samples, terms = unit.shape[1], len(basis)
+def scatter(grad_density, grad_colour, rows, weights, raw, rgb, workers):
+    """Adds to the gradients [V] and [V, 3] from those of raw [N] and rgb [3, N]."""
+    ends = borders(rows, len(grad_density), workers)
     for worker in prange(workers):
-        rows, weights = np.empty(8, np.int64), np.empty(8, np.float32)
-        mixed = np.empty(3 * terms, np.float32)
-        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            corners(unit, n, index, resolution, rows, weights)
-            mixed[:] = float32(0)
-            for c in range(8):
-                weight, row = weights[c], values[rows[c]]
-                for j in range(3 * terms):
-                    mixed[j] += weight * row[j]
-            for channel in range(3):
-                total = float32(0)
-                for b in range(terms):
-                    total += basis[b, n] * mixed[channel * terms + b]
-                out[channel, n] = total
+        first, last = ends[worker], ends[worker + 1]
+        for n in range(len(rows)):
+            s, a, b, c = raw[n], rgb[0, n], rgb[1, n], rgb[2, n]
+            for corner in range(8):
+                row, weight = rows[n, corner], weights[n, corner]
+                if first <= row < last:
+                    grad_density[row] += weight * s
+                    grad_colour[row, 0] += weight * a
+                    grad_colour[row, 1] += weight * b
+                    grad_colour[row, 2] += weight * c
+
+
+@inner
+def scatter_views_run(grad, rows, weights, basis, rgb, lanes, first, last):
+    terms, samples = len(lanes), rows.shape[0]
+    tile = np.empty((TILE, terms), np.float32)
+    for begin in range(0, samples, TILE):
+        count = min(TILE, samples - begin)
+        turn(basis, begin, count, tile)
+        for k in range(count):
+            n = begin + k
+            given = load(tile, k, 0, lanes)
+            a, b, c = rgb[0, n] * given, rgb[1, n] * given, rgb[2, n] * given
+            for corner in range(8):
+                row, weight = rows[n, corner], weights[n, corner]
+                if first <= row < last:
+                    store(grad, row, 0, load(grad, row, 0, lanes) + weight * a)
+                    store(grad, row, terms, load(grad, row, terms, lanes) + weight * b)
+                    store(grad, row, 2 * terms, load(grad, row, 2 * terms, lanes) + weight * c)
 
 
 @kernel
-def scatter_colour(grad, index, resolution, unit, basis, above, workers):
-    """Fills grad [V, 3 B] from above [3, N]."""
-    samples, terms = unit.shape[1], len(basis)
+def scatter_views(grad, rows, weights, basis, rgb, lanes, workers):
+    """Adds to the gradient [V, 3 B] from that of rgb [3, N]."""
+    ends = borders(rows, len(grad), workers)
     for worker in prange(workers):
-        rows, weights = np.empty(8, np.int64), np.empty(8, np.float32)
-        mixed = np.empty(3 * terms, np.float32)
-        for n in range(samples):
-            corners(unit, n, index, resolution, rows, weights)
-            for channel in range(3):
-                for b in range(terms):
-                    mixed[channel * terms + b] = above[channel, n] * basis[b, n]
-            for c in range(8):
-                if rows[c] > 0 and (rows[c] >> BLOCK) % workers == worker:
-                    weight, row = weights[c], grad[rows[c]]
-                    for j in range(3 * terms):
-                        row[j] += weight * mixed[j]
+        scatter_views_run(grad, rows, weights, basis, rgb, lanes, ends[worker], ends[worker + 1])
+
+
+@inner
+def roughness_run(values, vertex, index, side, start, first, last, slope):
+    """Sum of squared differences, and in `slope` of plain ones."""
+    squares = 0.0
+    for row in range(first, last):
+        at = int64(vertex[row])
+        place, stride = (at // (side * side), at // side % side, at % side), (side * side, side, 1)
+        difference = float32(0)
+        for axis in range(3):
+            for sign in (-1, 1):
+                if 0 <= place[axis] + sign < side:
+                    other = index[at + sign * stride[axis]]
+                    if other > 0:
+                        d = values[row] - values[other]
+                        difference += d
+                        squares += d * d
+        slope[row - start] = difference
+    return squares
 
 
 @kernel
-def touch(touched, index, resolution, unit, workers):
-    """Marks the rows that samples read. Workers may meet in a row: they write the same there."""
-    samples = unit.shape[1]
+def roughness(values, vertex, index, side, first, last, slope, sums, workers):
+    """For rows first to last of values [V]: the differences to all neighbours into slope, their squares into sums [workers]."""
+    rows = last - first
     for worker in prange(workers):
-        rows, weights = np.empty(8, np.int64), np.empty(8, np.float32)
-        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            corners(unit, n, index, resolution, rows, weights)
-            for c in range(8):
-                touched[rows[c]] = True
+        a, b = first + rows * worker // workers, first + rows * (worker + 1) // workers
+        sums[worker] = roughness_run(values, vertex, index, side, first, a, b, slope)
