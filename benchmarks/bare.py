@@ -2,27 +2,33 @@
 
 import time
 
+import torch
+
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.seeding import step_generator
 from nerf_lightning.system import NeRF3D
 
 
+def bare_step(
+    system: NeRF3D, data: RayDataModule, optimizer: torch.optim.Optimizer, step: int, progress: float
+) -> float:
+    """One step as NeRF3D does it under a Trainer. Returns its seconds."""
+    start = time.perf_counter()
+    system.progress = progress
+    for group in optimizer.param_groups:
+        group["lr"] = group["initial_lr"] * system.schedule(progress)
+    for parameter in system.field.grow(progress):
+        optimizer.state.pop(parameter, None)
+    batch = data.draw(step)
+    optimizer.zero_grad()
+    loss, stats = system.loss(batch, step_generator(system.seed, 1, step, system.device), step)
+    loss.backward()
+    optimizer.step()
+    data.adapt(stats.samples)
+    return time.perf_counter() - start
+
+
 def bare_loop(system: NeRF3D, data: RayDataModule, steps: int) -> list[float]:
-    """Trains for `steps` steps as NeRF3D does under a Trainer. Returns the seconds of each step."""
+    """Trains for `steps` steps. Returns the seconds of each."""
     optimizer = system.configure_optimizers()
-    seconds = []
-    for step in range(steps):
-        start = time.perf_counter()
-        system.progress = step / steps
-        for group in optimizer.param_groups:
-            group["lr"] = group["initial_lr"] * system.schedule(system.progress)
-        for parameter in system.field.grow(system.progress):
-            optimizer.state.pop(parameter, None)
-        batch = data.draw(step)
-        optimizer.zero_grad()
-        loss, stats = system.loss(batch, step_generator(system.seed, 1, step, system.device), step)
-        loss.backward()
-        optimizer.step()
-        data.adapt(stats.samples)
-        seconds.append(time.perf_counter() - start)
-    return seconds
+    return [bare_step(system, data, optimizer, step, step / steps) for step in range(steps)]

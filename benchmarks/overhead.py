@@ -3,53 +3,69 @@
 import tempfile
 import time
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median, quantiles
 from typing import Any
 
 import lightning as L
+import torch
 
-from benchmarks.bare import bare_loop
+from benchmarks.bare import bare_step
 from benchmarks.setup import built
 from nerf_lightning.build import build_trainer
+from nerf_lightning.dataset import RayDataModule
+from nerf_lightning.system import NeRF3D
 
-STEPS, FROM = 400, 200
-"""Steps of a loop, and the first that counts."""
-
-
-class Stopwatch(L.Callback):
-    """Notes when each step starts."""
-
-    def __init__(self) -> None:
-        self.times: list[float] = []
-
-    def on_train_batch_start(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
-    ) -> None:
-        self.times.append(time.perf_counter())
+BLOCK = 32
+"""Steps in a row of one kind: two rounds of the occupancy grid, short against a machine's moods."""
+BLOCKS, FIRST = 50, 10
+"""Blocks of each kind, and the first that counts."""
 
 
-def measure(overrides: list[str], rounds: int = 5) -> dict[str, float]:
-    """Milliseconds of a step, bare and under a Trainer with all callbacks and the logger: medians of alternating loops.
+class Alternation(L.Callback):
+    """After each block of the Trainer's steps, takes as many without it: same field, same optimiser, same data.
 
-    Measurements and pictures, whose time is no training time, are moved out of the way; the share is the median over the pairs.
+    Of every block the last step is left out, because in the Trainer's it ends in this callback's own work.
     """
-    bare, full = [], []
-    settings = [*overrides, f"budget.steps={STEPS}", "callbacks.heldout.at=[]", "callbacks.snapshots.steps=[]"]
-    for _ in range(rounds):
-        with tempfile.TemporaryDirectory() as folder:
-            _, data, system = built(settings, Path(folder))
-            bare.append(median(bare_loop(system, data, STEPS)[FROM:]))
-            cfg, data, system = built(settings, Path(folder))
-            trainer, watch = build_trainer(cfg, Path(folder)), Stopwatch()
-            trainer.callbacks.insert(0, watch)  # type: ignore[attr-defined]
-            trainer.fit(system, data)
-            times = watch.times[FROM:]
-            full.append(median(b - a for a, b in zip(times, times[1:], strict=False)))
-    shares = [trainer / loop - 1 for trainer, loop in zip(full, bare, strict=True)]
+
+    def __init__(self, data: RayDataModule) -> None:
+        self.data = data
+        self.trainer_blocks: list[float] = []
+        """Mean seconds of a step, one entry a block."""
+        self.bare_blocks: list[float] = []
+        self._starts: list[float] = []
+
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: NeRF3D, batch: Any, batch_idx: int) -> None:
+        step = trainer.global_step
+        if step and step % BLOCK == 0:
+            self.trainer_blocks.append((self._starts[-1] - self._starts[0]) / (BLOCK - 1))
+            optimizer = pl_module.optimizers(use_pl_optimizer=False)
+            assert isinstance(optimizer, torch.optim.Optimizer)
+            steps = range(step - BLOCK, step)
+            times = [bare_step(pl_module, self.data, optimizer, past, pl_module.progress) for past in steps]
+            self.bare_blocks.append(fmean(times[:-1]))
+            self._starts = []
+        self._starts.append(time.perf_counter())
+
+
+def measure(overrides: list[str]) -> dict[str, float]:
+    """Milliseconds of a step, bare and under a Trainer with all callbacks and the logger, in alternating blocks of one run.
+
+    Measurements and pictures, whose time is no training time, are moved out of the way; the share is the median over pairs of
+    neighbouring blocks, with its quartiles.
+    """
+    steps = BLOCKS * BLOCK + 1
+    settings = [*overrides, f"budget.steps={steps}", "callbacks.heldout.at=[]", "callbacks.snapshots.steps=[]"]
+    with tempfile.TemporaryDirectory() as folder:
+        cfg, data, system = built(settings, Path(folder))
+        trainer, alternation = build_trainer(cfg, Path(folder)), Alternation(data)
+        trainer.callbacks.insert(0, alternation)  # type: ignore[attr-defined]
+        trainer.fit(system, data)
+    full, bare = alternation.trainer_blocks[FIRST:], alternation.bare_blocks[FIRST:]
+    lower, middle, upper = quantiles([100 * (a / b - 1) for a, b in zip(full, bare, strict=True)])
     return {
         "bare_ms": 1e3 * median(bare),
         "trainer_ms": 1e3 * median(full),
-        "overhead_percent": 100 * median(shares),
-        "lowest_percent": 100 * min(shares),
-        "highest_percent": 100 * max(shares),
+        "overhead_percent": middle,
+        "lower_quartile": lower,
+        "upper_quartile": upper,
     }

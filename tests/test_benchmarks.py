@@ -40,8 +40,9 @@ def test_the_table_has_a_column_for_every_key():
 def test_one_command_writes_table_and_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     monkeypatch.setattr(kernels, "RAYS", 16)
     monkeypatch.setattr(kernels, "SAMPLES", 64)
-    monkeypatch.setattr(overhead, "STEPS", 6)
-    monkeypatch.setattr(overhead, "FROM", 2)
+    monkeypatch.setattr(overhead, "BLOCKS", 4)
+    monkeypatch.setattr(overhead, "FIRST", 1)
+    monkeypatch.setattr(overhead, "BLOCK", 3)
     monkeypatch.setattr(growth, "STEPS", 2)
     monkeypatch.setattr(growth, "FROM", 0)
     monkeypatch.setattr(growth, "SAMPLES", (64, 128))

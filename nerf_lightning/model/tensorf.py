@@ -88,7 +88,7 @@ class TensoRFField(Field):
         density_components: Count = 16,
         colour_components: Count = 16,
         coarsest: Count = 64,
-        finest: Count = 128,
+        finest: Count = 160,
         stages: Count = 4,
         grown: float = 0.3,
         width: Count = 32,

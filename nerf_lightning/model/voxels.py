@@ -112,9 +112,9 @@ class VoxelField(Field):
         self.views = torch.nn.Parameter(torch.zeros(rows, 3 * self.terms))
 
     @property
-    def tables(self) -> list[torch.nn.Parameter]:
+    def tables(self) -> tuple[torch.nn.Parameter, torch.nn.Parameter, torch.nn.Parameter]:
         """All that vertices hold, one row a vertex."""
-        return [self.log_density, self.colours, self.views]
+        return self.log_density, self.colours, self.views
 
     def per_length(self, raw: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
         """Densities from what the table holds, 1 / world unit."""
@@ -161,7 +161,7 @@ class VoxelField(Field):
         self.seen = torch.zeros(len(new), dtype=torch.int32, device=flat.device)
         self.stage.fill_(wanted)
         self.started.copy_(self.steps)
-        return self.tables
+        return list(self.tables)
 
     def find_vertices(self) -> None:
         """Makes `vertex`, the inverse of `index`: rows stand in the order of their vertices."""
