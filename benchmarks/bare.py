@@ -1,4 +1,4 @@
-"""A training loop without Lightning: what a step costs by itself."""
+"""A training step without Lightning: what it costs by itself."""
 
 import time
 
@@ -26,9 +26,3 @@ def bare_step(
     optimizer.step()
     data.adapt(stats.samples)
     return time.perf_counter() - start
-
-
-def bare_loop(system: NeRF3D, data: RayDataModule, steps: int) -> list[float]:
-    """Trains for `steps` steps. Returns the seconds of each."""
-    optimizer = system.configure_optimizers()
-    return [bare_step(system, data, optimizer, step, step / steps) for step in range(steps)]

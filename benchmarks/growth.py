@@ -3,16 +3,19 @@
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 
 import torch
 
-from benchmarks.bare import bare_loop
+from benchmarks.bare import bare_step
 from benchmarks.setup import built
 from nerf_lightning.dataset import RayDataModule, Views
 from nerf_lightning.dataset.resize import resize_views
 
-STEPS, FROM = 300, 150
+WARMUP, BLOCK, ROUNDS = 300, 32, 10
+"""Steps before the first that counts; steps in a row at one point; how often each point has its turn."""
+PROGRESS = 0.5
+"""The field has its full size from here on."""
 SAMPLES = (8192, 16384, 32768, 65536)
 VIEWS = (10, 100, 1000)
 SIDES = (50, 100, 200)
@@ -20,33 +23,50 @@ DISTINCT = 10
 """Photos that are repeated to make more of them: the content, and with it the work, stays the same."""
 
 
-def step_ms(overrides: list[str], views: int | None = None, side: int | None = None) -> float:
-    """Median milliseconds of a step, of the scene with so many training photos or of so many pixels."""
+def repeated(train: Views, count: int) -> Views:
+    chosen = torch.arange(count) % DISTINCT
+    return Views(train.images[chosen], train.cameras[chosen])
+
+
+def points(data: RayDataModule, seed: int) -> list[tuple[str, int, RayDataModule]]:
+    """Axis, value on it, and the data that stands for it."""
+
+    def variant(train: Views, samples: int | None) -> RayDataModule:
+        return RayDataModule(replace(data.scene, train=train), rays=data.rays, samples=samples, seed=seed)
+
+    train = data.scene.train
+    return [
+        *(("samples a step", n, variant(train, n)) for n in SAMPLES),
+        *(("photos", n, variant(repeated(train, n), data.samples)) for n in VIEWS),
+        *(("pixels along a side", n, variant(resize_views(train, n), data.samples)) for n in SIDES),
+    ]
+
+
+def measure(overrides: list[str]) -> list[dict[str, float | str]]:
+    """Milliseconds of a step along each axis, all measured on one field in training, block after block in turn.
+
+    `ratio` is that to the axis's first point, the median over rounds.
+    """
     with tempfile.TemporaryDirectory() as folder:
         cfg, data, system = built(overrides, Path(folder))
-    train = data.scene.train
-    if side is not None:
-        train = resize_views(train, side)
-    if views is not None:
-        chosen = torch.arange(views) % DISTINCT
-        train = Views(train.images[chosen], train.cameras[chosen])
-    scene = replace(data.scene, train=train)
-    data = RayDataModule(scene, rays=data.rays, samples=data.samples, seed=cfg.seed)
-    return 1e3 * median(bare_loop(system, data, STEPS)[FROM:])
+    optimizer = system.configure_optimizers()
+    everything = points(data, cfg.seed)
 
+    def block(data: RayDataModule, first: int, steps: int) -> float:
+        times = [bare_step(system, data, optimizer, first + i, PROGRESS) for i in range(steps)]
+        return 1e3 * fmean(times[steps // 2 :])  # by then the number of rays has found its level
 
-def measure(overrides: list[str], rounds: int = 3) -> list[dict[str, float | str]]:
-    """Milliseconds of a step along each axis: medians of rounds that alternate between the points."""
-    points: list[tuple[str, int, dict]] = [
-        *(("samples a step", n, {"overrides": [*overrides, f"dataset.samples={n}"]}) for n in SAMPLES),
-        *(("photos", n, {"overrides": overrides, "views": n}) for n in VIEWS),
-        *(("pixels along a side", n, {"overrides": overrides, "side": n}) for n in SIDES),
-    ]
-    times: list[list[float]] = [[] for _ in points]
-    for _ in range(rounds):
-        for collected, (_, _, settings) in zip(times, points, strict=True):
-            collected.append(step_ms(**settings))
+    block(data, 0, WARMUP)
+    for _, _, variant in everything:
+        block(variant, 0, BLOCK)
+    times = [[block(v, BLOCK * r, BLOCK) for _, _, v in everything] for r in range(ROUNDS)]
+    first = {axis: i for i, (axis, _, _) in reversed(list(enumerate(everything)))}
     return [
-        {"axis": axis, "value": value, "step_ms": median(collected)}
-        for collected, (axis, value, _) in zip(times, points, strict=True)
+        {
+            "axis": axis,
+            "value": value,
+            "step_ms": median(row[i] for row in times),
+            "ratio": median(row[i] / row[first[axis]] for row in times),
+        }
+        for i, (axis, value, _) in enumerate(everything)
     ]
