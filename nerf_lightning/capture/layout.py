@@ -1,0 +1,78 @@
+"""TagLayout: which tags there are, how large they are, and where they lie in the world."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+
+from nerf_lightning.errors import InputError
+
+SQUARE = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) / 2
+"""Corners of a tag of side 1 in its own frame, in OpenCV's order: the printed top left first, then clockwise."""
+
+SHEETS = Path(__file__).parent / "sheets"
+"""Layouts that come with the package."""
+
+
+@dataclass(frozen=True)
+class TagLayout:
+    """Tags in the world frame, which is that of one of them or of the sheet they are printed on. Lengths in metres.
+
+    A tag's own frame has its origin in the middle of the black square, x to the printed right, y to the printed top, and z out
+    of the paper toward the reader.
+    """
+
+    dictionary: str
+    """Name of the family of patterns, "DICT_4X4_50"."""
+    size: float
+    """Side of the black square."""
+    poses: dict[int, Float[np.ndarray, "4 4"]]
+    """Tag to world, by the tag's id."""
+
+    def corners(self, tag: int) -> Float[np.ndarray, "4 3"]:
+        """Corners of one tag in the world, in OpenCV's order."""
+        pose = self.poses[tag]
+        return self.size * SQUARE @ pose[:3, :3].T + pose[:3, 3]
+
+
+def flat_pose(x: float, y: float, degrees: float = 0.0) -> Float[np.ndarray, "4 4"]:
+    """A tag lying in the plane z = 0, its middle at (x, y), turned counterclockwise."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)
+
+
+def read_layout(path: Path, dictionary: str, size: float) -> TagLayout:
+    """Reads a flat sheet: `tags: {id: {x: metres, y: metres, turn: degrees}}`, `turn` being optional.
+
+    Args:
+        path: a YAML file, or the name of one that comes with the package ("sheet_2x3").
+        dictionary, size: see `TagLayout`.
+
+    Raises:
+        InputError: a missing file, one that is no YAML, or entries that are not numbers.
+    """
+    shipped = SHEETS / f"{path.name}.yaml"
+    if not path.exists() and path.parent == Path() and shipped.exists():
+        path = shipped
+    try:
+        content: Any = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(path, "", f"no readable YAML ({error})", "a file with tags: {0: {x: 0.0, y: 0.0}}") from error
+    tags = content.get("tags") if isinstance(content, dict) else None
+    if not isinstance(tags, dict) or not tags:
+        raise InputError(path, "tags", repr(tags), "a mapping from each tag's id to its x and y in metres")
+    poses = {}
+    for tag, entry in tags.items():
+        if not isinstance(tag, int) or tag < 0:
+            raise InputError(path, f"tags.{tag}", repr(tag), "a whole number, the tag's id")
+        given = entry if isinstance(entry, dict) else {}
+        unknown = sorted(set(given) - {"x", "y", "turn"})
+        numbers = [given.get("x"), given.get("y"), given.get("turn", 0.0)]
+        plain = [isinstance(n, int | float) and not isinstance(n, bool) and np.isfinite(n) for n in numbers]
+        if unknown or not all(plain):
+            raise InputError(path, f"tags.{tag}", repr(entry), "x and y in metres, and optionally turn in degrees")
+        poses[tag] = flat_pose(*numbers)
+    return TagLayout(dictionary, size, poses)

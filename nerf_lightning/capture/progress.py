@@ -1,0 +1,17 @@
+"""A progress bar for work on photos."""
+
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+T = TypeVar("T")
+
+
+def tracked(items: Iterable[T], total: int, words: str) -> Iterator[T]:
+    """Passes items on while a bar with the time left shows how many have come; on terminals alone."""
+    console = Console(stderr=True)
+    columns = TextColumn(words), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield from bar.track(items, total=total)

@@ -1,0 +1,86 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from capture.views import camera
+
+from nerf_lightning.capture.board import Board, board_detector
+from nerf_lightning.capture.calibrate import calibrate
+from nerf_lightning.capture.detect import Sighting
+from nerf_lightning.capture.geometry import angle_between, inverse, project
+from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.errors import InputError
+
+LENS = Lens(640, 480, 600.0, 600.0, 320.0, 240.0)
+BOARD, TAG, FAMILY = Board(5, 7, 0.03), 0.022, "DICT_4X4_50"
+CELL = 80
+"""Pixels a square in the print."""
+
+
+def printed(board: Board, legacy: bool = False) -> np.ndarray:
+    made = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows), board.square, TAG, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    )
+    made.setLegacyPattern(legacy)
+    return made.generateImage((CELL * board.columns, CELL * board.rows))
+
+
+def photo(print_: np.ndarray, board: Board, c2w: np.ndarray) -> np.ndarray:
+    """The print as a camera sees it, x to the right and y up from its middle, without distortion."""
+    w2c = inverse(c2w)
+    height, width = print_.shape
+    step = board.square / CELL
+    to_world = np.array([[step, 0, -step * width / 2], [0, -step, step * height / 2], [0, 0, 1]])
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are integers
+    H = np.linalg.inv(half) @ LENS.K @ w2c[:3][:, [0, 1, 3]] @ to_world @ half
+    # Drawn large and averaged down, so that edges are smooth.
+    grown = np.diag([4.0, 4.0, 1.0])
+    shift = np.array([[1, 0, 1.5], [0, 1, 1.5], [0, 0, 1]])
+    big = cv2.warpPerspective(print_, shift @ grown @ H, (4 * LENS.width, 4 * LENS.height), borderValue=200)
+    return cv2.resize(big, (LENS.width, LENS.height), interpolation=cv2.INTER_AREA)
+
+
+def eyes(count: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return [
+        camera([0.22 * np.cos(t), 0.22 * np.sin(t), 0.26 + 0.05 * rng.random()], [0, 0, 0], 0.3 * rng.standard_normal())
+        for t in turns
+    ]
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_corners_lie_where_the_board_has_them(legacy: bool):
+    board = Board(5, 6, 0.03)  # with an even number of rows old and new boards differ
+    detect = board_detector(FAMILY, TAG, board)
+    errors = []
+    for c2w in eyes(8):
+        (mark,) = detect(photo(printed(board, legacy), board, c2w)).values()
+        assert len(mark.points) == 4 * 5 and not mark.points[:, 2].any()
+        errors.append(mark.pixels - project(LENS, inverse(c2w), mark.points))
+    flat = np.concatenate(errors)
+    assert np.abs(flat).max() < 0.5 and np.abs(flat.mean(0)).max() < 0.1
+
+
+def test_a_board_calibrates_and_places_like_tags():
+    detect, c2ws = board_detector(FAMILY, TAG, BOARD), eyes(8)
+    photos = [photo(printed(BOARD), BOARD, c2w) for c2w in c2ws]
+    seen = [Sighting(Path(f"{i}.png"), LENS.width, LENS.height, detect(grey)) for i, grey in enumerate(photos)]
+    found = calibrate(Path("board"), seen, None)
+    assert abs(found.lens.fx / LENS.fx - 1) < 0.003 and found.rms < 0.2
+    for i, c2w in enumerate(c2ws):
+        assert angle_between(inverse(found.solved.w2c[i]), c2w) < np.radians(0.5)
+
+
+def test_what_is_no_board_gives_nothing():
+    assert board_detector(FAMILY, TAG, BOARD)(np.full((480, 640), 128, np.uint8)) == {}
+
+
+def test_boards_that_cannot_be():
+    with pytest.raises(InputError, match=r"tags.board.columns: found 2, expected at least 3"):
+        Board(2, 7, 0.03)
+    with pytest.raises(InputError, match=r"tags.board.square: found 0.02, expected more than tags.size"):
+        board_detector(FAMILY, TAG, Board(5, 7, 0.02))
+    with pytest.raises(InputError, match=r"tags.board: found 12 x 12, which takes 72 tags, expected at most the 50"):
+        board_detector(FAMILY, TAG, Board(12, 12, 0.03))

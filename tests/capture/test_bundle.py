@@ -1,0 +1,105 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from capture.views import LENS, SIX, SIZE, cameras, sightings
+
+from nerf_lightning.capture.bundle import LENS_PARAMETERS, Bundle, _Problem, lens_vector, refine, simplified
+from nerf_lightning.capture.detect import Mark
+from nerf_lightning.capture.geometry import angle_between, inverse, move, project, to_matrix
+from nerf_lightning.capture.layout import SQUARE
+
+
+def bundle(photos: int = 8, noise: float = 0.0, off: float = 0.0, seed: int = 0) -> Bundle:
+    """The truth, or a start that is `off` by so many radians and centimetres."""
+    rng = np.random.default_rng(seed)
+    c2w = cameras(photos, seed)
+    seen = sightings(SIX, c2w, noise=noise, seed=seed)
+    nudge = [to_matrix(off * rng.standard_normal(6) * [1, 1, 1, 0.1, 0.1, 0.1]) for _ in range(photos + 6)]
+    w2c = np.stack([n @ inverse(pose) for n, pose in zip(nudge, c2w, strict=False)])
+    tags = [SIX.poses[tag] @ n for tag, n in zip(range(1, 6), nudge[photos:], strict=False)]
+    return Bundle(LENS, w2c, np.stack([SIX.poses[0], *tags]), [s.marks for s in seen], np.zeros(6))
+
+
+def test_derivatives_are_those_of_differences():
+    made = replace(bundle(3, noise=0.5, off=0.05), twists=1e-3 * np.arange(6.0))
+    made = replace(made, lens=replace(LENS, distortion=(-0.2, 0.05, 0.001, -0.002, 0.01), fy=910.0))
+    problem = _Problem(made, np.ones(9, bool), {0}, True)
+    x = (
+        problem.start()
+        + 1e-2
+        * np.random.default_rng(0).standard_normal(problem.unknowns)
+        * np.r_[np.zeros(9), np.ones(problem.unknowns - 9)]
+    )
+    jacobian = problem.evaluate(x)[1].toarray()
+    for i in range(problem.unknowns):
+        step = np.zeros_like(x)
+        step[i] = 1e-6 * max(1.0, abs(x[i]))
+        ahead, behind = (np.concatenate(problem.evaluate(x + s)[0]) for s in (step, -step))
+        slope = (ahead - behind) / (2 * step[i])
+        np.testing.assert_allclose(jacobian[:, i], slope, rtol=1e-4, atol=1e-4 * max(1.0, np.abs(slope).max()))
+
+
+def test_exact_marks_are_explained_exactly():
+    found = refine(bundle(off=0.03), ("focal", "cx", "cy", "k1", "k2"))
+    assert found.total_rms < 1e-4
+    np.testing.assert_allclose(lens_vector(found.bundle.lens), lens_vector(LENS), rtol=1e-5, atol=1e-6)
+    for pose, truth in zip(found.bundle.w2c, bundle().w2c, strict=True):
+        assert angle_between(pose, truth) < 1e-5 and np.abs(pose - truth).max() < 1e-5
+
+
+def test_what_is_not_free_stays():
+    start = bundle(noise=0.2, off=0.01)
+    found = refine(start, (), frozenset(range(6))).bundle
+    assert found.lens == start.lens
+    assert np.array_equal(found.tags, start.tags) and not found.twists.any()
+    assert refine(start).deviations == {}
+
+
+def test_one_wrong_corner_does_not_bend_the_rest():
+    start = bundle(noise=0.05, off=0.01)
+    marks = dict(start.marks[2])
+    wrong = marks[4].pixels + np.array([[40.0, -30.0], [0, 0], [0, 0], [0, 0]])
+    marks[4] = Mark(marks[4].points, wrong)
+    spoilt = replace(start, marks=[*start.marks[:2], marks, *start.marks[3:]])
+    found = refine(spoilt, ("focal", "k1", "k2"))
+    assert abs(found.bundle.lens.fx / LENS.fx - 1) < 0.003
+    assert found.rms.argmax() == 2 and found.rms[2] > 5
+
+
+def test_deviations_tell_the_spread_of_repeated_fits():
+    focals, told = [], []
+    for seed in range(12):
+        start = bundle(6, noise=0.2)
+        seen = sightings(SIX, cameras(6, 0), noise=0.2, seed=100 + seed)
+        found = refine(replace(start, marks=[s.marks for s in seen]), ("focal", "k1"))
+        focals.append(found.bundle.lens.fx)
+        told.append(found.deviations["focal"])
+    assert 0.5 < np.std(focals) / np.mean(told) < 2
+
+
+def test_twisted_paper_is_told_from_flat():
+    twist, c2w = 7e-4, cameras(8, 3)
+    lifted = SIZE * SQUARE + twist * np.array([[0, 0, -1], [0, 0, 1], [0, 0, -1], [0, 0, 1]])
+    rng = np.random.default_rng(0)
+    marks = [
+        {
+            0: Mark(
+                SIZE * SQUARE, project(LENS, inverse(pose), move(np.eye(4), lifted)) + 0.1 * rng.standard_normal((4, 2))
+            )
+        }
+        for pose in c2w
+    ]
+    start = Bundle(LENS, np.stack([inverse(pose) for pose in c2w]), np.eye(4)[None], marks, np.zeros(1))
+    flat, bent = refine(start), refine(start, free_twists=True)
+    assert bent.bic < flat.bic and bent.total_rms < 0.3 * flat.total_rms
+    assert bent.bundle.twists[0] == pytest.approx(twist, rel=0.1)
+
+
+def test_a_simpler_lens_has_plain_values():
+    lens = replace(LENS, fy=910.0, distortion=(-0.2, 0.05, 0.01, 0.02, 0.03))
+    assert simplified(lens, ()) == lens
+    plain = simplified(lens, ("focal", "k1"))
+    assert (plain.fx, plain.fy, plain.cx, plain.cy) == (900.0, 900.0, 512.0, 384.0)
+    assert plain.distortion == (-0.2, 0.0, 0.0, 0.0, 0.0)
+    assert simplified(lens, LENS_PARAMETERS) == lens

@@ -1,0 +1,103 @@
+from dataclasses import replace
+
+import numpy as np
+from capture.views import LENS, ONE, SIX, SIZE, camera, cameras, sightings
+
+from nerf_lightning.capture.detect import Mark
+from nerf_lightning.capture.geometry import (
+    angle_between,
+    folds,
+    inverse,
+    normalised,
+    project,
+    to_matrix,
+    to_vector,
+)
+from nerf_lightning.capture.layout import SQUARE
+from nerf_lightning.capture.pose import mark_poses, photo_poses
+from nerf_lightning.capture.walk import choose
+
+
+def test_motions_go_to_numbers_and_back():
+    rng = np.random.default_rng(0)
+    for vector in rng.standard_normal((20, 6)):
+        matrix = to_matrix(vector)
+        np.testing.assert_allclose(to_vector(matrix), vector, atol=1e-9)
+        np.testing.assert_allclose(inverse(matrix) @ matrix, np.eye(4), atol=1e-12)
+    turned = to_matrix(np.array([0, 0, 1e-6, 1, 2, 3]))
+    np.testing.assert_allclose(angle_between(turned, np.eye(4)), 1e-6, rtol=1e-5)
+    np.testing.assert_allclose(angle_between(to_matrix(np.array([3.0, 0, 0, 0, 0, 0])), np.eye(4)), 3.0, rtol=1e-6)
+
+
+def test_undoing_the_lens_undoes_it():
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 2))
+    pixels = project(LENS, np.eye(4), np.concatenate([points, np.ones((50, 1))], axis=1))
+    np.testing.assert_allclose(normalised(LENS, pixels), points, atol=1e-9)
+
+
+def test_an_exact_tag_gives_its_pose_first():
+    for pose in cameras(20, 1):
+        mark = Mark(SIZE * SQUARE, project(LENS, inverse(pose), SIZE * SQUARE))
+        best, *_ = mark_poses(LENS, mark)
+        assert angle_between(best.pose, inverse(pose)) < 1e-4 and best.squares < 1e-6
+
+
+def test_a_tag_seen_from_afar_has_two_solutions():
+    pose = camera([0.3, 0.1, 1.0], [0, 0, 0])
+    solutions = mark_poses(LENS, Mark(SIZE * SQUARE, project(LENS, inverse(pose), SIZE * SQUARE)))
+    assert len(solutions) == 2
+    assert angle_between(solutions[1].pose, inverse(pose)) > np.radians(15)
+    assert solutions[1].squares < 8 * 0.5**2  # half a pixel of noise would hide the difference
+
+
+def test_all_tags_of_a_photo_settle_its_pose():
+    for seen, pose in zip(sightings(SIX, cameras(10, 2), noise=0.3), cameras(10, 2), strict=True):
+        best, *_ = photo_poses(LENS, seen.marks, SIX.poses)
+        assert angle_between(best.pose, inverse(pose)) < np.radians(0.6)
+    assert photo_poses(LENS, {}, SIX.poses) == []
+    assert photo_poses(LENS, seen.marks, {99: np.eye(4)}) == []
+
+
+def walk(count: int, seed: int, tilt: float = 15.0) -> list[np.ndarray]:
+    """World to camera along a slow random walk in front of a tag, mostly a few degrees off its normal."""
+    rng = np.random.default_rng(seed)
+    kernel = np.exp(-(np.linspace(-3, 3, 40) ** 2))
+    kernel /= np.linalg.norm(kernel)
+    a, b, further, roll = (np.convolve(rng.standard_normal(count + 39), kernel, "valid") for _ in range(4))
+    a, b, distance = np.radians(tilt / 2) * a, np.radians(tilt / 2) * b, 0.5 + 0.1 * further.clip(-2, 2)
+    eyes = distance[:, None] * np.stack([np.sin(a), np.sin(b) * np.cos(a), np.cos(a) * np.cos(b)], axis=1)
+    return [inverse(camera(eye, [0, 0, 0], 0.3 * r)) for eye, r in zip(eyes, roll, strict=True)]
+
+
+def flips(truth: list[np.ndarray], options: list, chosen: list[int]) -> int:
+    """Photos whose chosen solution is farther from the truth than the other one, by more than 5 degrees."""
+    wrong = 0
+    for pose, found, choice in zip(truth, options, chosen, strict=True):
+        errors = [angle_between(pose, hypothesis.pose) for hypothesis in found]
+        wrong += errors[choice] > min(errors) + np.radians(5)
+    return wrong
+
+
+def test_neighbours_tell_a_flipped_tag():
+    truth, rng = walk(200, 1), np.random.default_rng(101)
+    points = ONE.corners(0)
+    seen = [(points, project(LENS, pose, points) + 0.5 * rng.standard_normal((4, 2))) for pose in truth]
+    options = [mark_poses(LENS, Mark(*pair)) for pair in seen]
+    assert flips(truth, options, [0] * 200) >= 4
+    assert flips(truth, options, choose(LENS, options, seen)) == 0
+
+
+def test_photos_without_order_keep_their_best():
+    c2w, rng = cameras(30, 5, tilt=45), np.random.default_rng(7)
+    points = SIX.corners(4)
+    seen = [(points, project(LENS, inverse(pose), points) + 0.1 * rng.standard_normal((4, 2))) for pose in c2w]
+    options = [mark_poses(LENS, Mark(SIZE * SQUARE, pixels)) for _, pixels in seen]
+    world = [(SIZE * SQUARE, pixels) for _, pixels in seen]
+    assert choose(LENS, options, world) == [0] * 30
+
+
+def test_a_lens_that_folds_the_picture_is_told():
+    assert not folds(LENS) and not folds(replace(LENS, distortion=(0.0, 0.0, 0.0, 0.0, 0.0)))
+    assert not folds(replace(LENS, distortion=(-0.3, 0.1, 0.0, 0.0, 0.0)))
+    assert folds(replace(LENS, distortion=(0.16, -1.0, 0.0, 0.0, 0.0)))  # turns back, and never reaches the corner
+    assert folds(replace(LENS, distortion=(-4.0, 0.0, 0.0, 0.0, 30.0)))  # turns back, and comes again

@@ -1,0 +1,109 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture.views import LENS, ONE, SIX, SIZE, cameras, sightings
+
+from nerf_lightning.capture.calibrate import calibrate
+from nerf_lightning.capture.detect import Mark
+from nerf_lightning.capture.geometry import angle_between, inverse
+from nerf_lightning.capture.layout import SQUARE
+from nerf_lightning.capture.solve import arrange, solve
+from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.errors import InputError
+
+FOLDER = Path("calibration")
+
+
+def worst_tag(tags: dict[int, np.ndarray], reference: int) -> float:
+    """Metres between where a tag lies and where it was found, in the frame of the reference tag."""
+    home = inverse(SIX.poses[reference])
+    return max(float(np.linalg.norm((home @ SIX.poses[tag])[:3, 3] - pose[:3, 3])) for tag, pose in tags.items())
+
+
+def test_a_sheet_nobody_measured():
+    c2w = cameras(10)
+    solved = solve(LENS, [s.marks for s in sightings(SIX, c2w)], None)
+    assert sorted(solved.tags) == list(range(6)) and len(solved.w2c) == 10
+    (reference,) = (tag for n, tag in enumerate(solved.tags) if n in solved.fixed)
+    assert np.array_equal(solved.tags[reference], np.eye(4))
+    assert worst_tag(solved.tags, reference) < 3e-4
+    off = [angle_between(w2c, inverse(c2w[i]) @ SIX.poses[reference]) for i, w2c in solved.w2c.items()]
+    assert np.median(off) < np.radians(0.1)
+
+
+def test_a_known_layout_is_the_world():
+    c2w = cameras(6)
+    solved = solve(LENS, [s.marks for s in sightings(SIX, c2w)], SIX.poses)
+    for i, w2c in solved.w2c.items():
+        assert np.abs(inverse(w2c) - c2w[i]).max() < 3e-3
+
+
+def test_photos_without_a_link_are_left_out():
+    seen = [s.marks for s in sightings(SIX, cameras(6))]
+    seen[1] = {}
+    seen[4] = {17: seen[4][0]}  # a tag that no other photo shows
+    solved = solve(LENS, seen, None)
+    assert solved.placed == [0, 2, 3, 5]
+    assert solve(LENS, [{}, {}], None) is None
+
+
+def test_tags_are_linked_by_the_surest_way():
+    step = np.eye(4)
+    step[0, 3] = 1.0
+    wrong = np.eye(4)
+    wrong[1, 3] = 5.0
+    tags = arrange({(0, 1): (step, 9), (1, 2): (step, 7), (0, 2): (wrong, 1), (5, 6): (step, 3)}, 0)
+    assert sorted(tags) == [0, 1, 2]
+    np.testing.assert_allclose(tags[2][:3, 3], [2, 0, 0])
+
+
+def test_calibration_with_one_tag():
+    found = calibrate(FOLDER, sightings(ONE, cameras(30, tilt=45, distance=0.35)), None)
+    assert abs(found.lens.fx / LENS.fx - 1) < 0.015
+    assert set(found.dropped.values()) <= {"no tag found"} and found.rms < 0.2
+
+
+def test_calibration_with_a_sheet_of_unknown_layout():
+    found = calibrate(FOLDER, sightings(SIX, cameras(20)), None)
+    assert abs(found.lens.fx / LENS.fx - 1) < 0.0015
+    assert abs(found.lens.distortion[0] + 0.2) < 0.01
+    assert 0 < found.deviations["focal"] < 3
+    assert found.warnings == []
+
+
+def test_few_photos_get_a_simple_lens():
+    found = calibrate(FOLDER, sightings(SIX, cameras(3)), None)
+    assert found.lens.distortion == (0, 0, 0, 0, 0) and set(found.deviations) == {"focal"}
+    straight = replace(LENS, distortion=(0.0, 0.0, 0.0, 0.0, 0.0), cx=512.0, cy=384.0)
+    many = calibrate(FOLDER, sightings(SIX, cameras(16), straight), None)
+    assert max(abs(k) for k in many.lens.distortion) < 0.02
+
+
+def test_a_photo_that_contradicts_the_others_is_dropped_by_name():
+    seen = sightings(SIX, cameras(12))
+    shifted = {
+        tag: Mark(SIZE * SQUARE, m.pixels + [30 * (tag % 2), 25 * (tag % 3)]) for tag, m in seen[7].marks.items()
+    }
+    seen[7] = replace(seen[7], marks=shifted)
+    seen[3] = replace(seen[3], marks={})
+    found = calibrate(FOLDER, seen, None)
+    assert sorted(found.dropped) == ["003.png", "007.png"]
+    assert "pixels off" in found.dropped["007.png"] and found.dropped["003.png"] == "no tag found"
+    assert abs(found.lens.fx / LENS.fx - 1) < 0.005
+
+
+def test_what_cannot_be_calibrated_says_why():
+    with pytest.raises(InputError, match="2 photos with tags of 5, expected at least 3"):
+        calibrate(
+            FOLDER, [replace(s, marks=s.marks if i < 2 else {}) for i, s in enumerate(sightings(SIX, cameras(5)))], None
+        )
+    with pytest.raises(InputError, match="tilt the camera by 20 to 45 degrees"):
+        calibrate(FOLDER, sightings(SIX, cameras(8, tilt=1.0), noise=0.5), None)
+
+
+def test_a_small_view_is_warned_of():
+    far = Lens(1024, 768, 900.0, 900.0, 512.0, 384.0)
+    found = calibrate(FOLDER, sightings(SIX, cameras(12, distance=1.2), far), None)
+    assert any("of the picture" in text for text in found.warnings)

@@ -1,0 +1,55 @@
+"""Marks as a camera would see them: exact projections of known tags, with noise if wanted."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nerf_lightning.cameras import look_at
+from nerf_lightning.capture.detect import Mark, Sighting
+from nerf_lightning.capture.geometry import inverse, project
+from nerf_lightning.capture.layout import SQUARE, TagLayout, flat_pose
+from nerf_lightning.dataset.lens import Lens
+
+SIZE = 0.06
+LENS = Lens(1024, 768, 900.0, 900.0, 520.0, 380.0, (-0.2, 0.05, 0.0, 0.0, 0.0))
+SMALL = Lens(400, 300, 350.0, 350.0, 203.0, 148.0, (-0.1, 0.02, 0.0, 0.0, 0.0))
+SIX = TagLayout("DICT_4X4_50", SIZE, {3 * r + c: flat_pose(0.09 * c, -0.09 * r) for r in (0, 1) for c in (0, 1, 2)})
+ONE = TagLayout("DICT_4X4_50", SIZE, {0: flat_pose(0.0, 0.0)})
+
+
+def camera(eye: list[float] | np.ndarray, target: list[float] | np.ndarray, roll: float = 0.0) -> np.ndarray:
+    """Camera to world, looking from one point at another; `roll` in radians."""
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    c2w = look_at(torch.tensor(np.array(eye, float)), torch.tensor(np.array(target, float)), up).numpy()
+    c, s = np.cos(roll), np.sin(roll)
+    turn = np.eye(4)
+    turn[:2, :2] = [[c, -s], [s, c]]
+    return c2w @ turn
+
+
+def cameras(count: int, seed: int = 0, tilt: float = 40.0, distance: float = 0.4) -> np.ndarray:
+    """Camera to world, looking at the sheet from angles up to `tilt` degrees off its normal."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for _ in range(count):
+        off, around = np.radians(tilt) * np.sqrt(rng.random()), 2 * np.pi * rng.random()
+        target = np.array([0.09, -0.045, 0]) + 0.03 * rng.standard_normal(3) * [1, 1, 0]
+        way = np.array([np.sin(off) * np.cos(around), np.sin(off) * np.sin(around), np.cos(off)])
+        out.append(camera(target + distance * (0.8 + 0.5 * rng.random()) * way, target, 0.5 * rng.standard_normal()))
+    return np.stack(out)
+
+
+def sightings(
+    layout: TagLayout, c2w: np.ndarray, lens: Lens = LENS, noise: float = 0.1, seed: int = 0, folder: Path = Path("x")
+) -> list[Sighting]:
+    """What photos from these cameras show of a layout, without the tags that are not wholly in the frame."""
+    rng, seen = np.random.default_rng(seed), []
+    for i, pose in enumerate(c2w):
+        marks = {}
+        for tag in layout.poses:
+            pixels = project(lens, inverse(pose), layout.corners(tag)) + noise * rng.standard_normal((4, 2))
+            if (pixels > 4).all() and (pixels < [lens.width - 4, lens.height - 4]).all():
+                marks[tag] = Mark(layout.size * SQUARE, pixels)
+        seen.append(Sighting(folder / f"{i:03d}.png", lens.width, lens.height, marks))
+    return seen
