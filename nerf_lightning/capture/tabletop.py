@@ -1,0 +1,173 @@
+"""What synthetic photos show: a printed sheet of tags on a round table, and the built-in bulldozer standing there."""
+
+from dataclasses import fields
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from nerf_lightning.capture.detect import family
+from nerf_lightning.capture.layout import TagLayout
+from nerf_lightning.dataset.brickmodel import bulldozer
+from nerf_lightning.dataset.brickshade import shade
+from nerf_lightning.dataset.bricksolids import Solids
+from nerf_lightning.dataset.bricktrace import nearest, shadow
+from nerf_lightning.errors import InputError
+
+INK, PAPER, WALL = 0.09, 0.90, 0.75
+"""Shades of grey in sRGB."""
+WOOD, GRAIN = np.array([0.56, 0.44, 0.33]), np.array([0.10, 0.10, 0.09])
+"""sRGB of the table, and how far its texture goes up and down."""
+RIM = 0.3
+"""Metres of table all around the paper."""
+LENGTH = 0.12
+"""Of the bulldozer along the world's y axis, metres."""
+SHADE = 0.65
+"""Share of its sRGB colour that the ground keeps in the bulldozer's shadow."""
+
+
+class Tabletop:
+    """The world z >= 0, in metres: z up, tags in the plane z = 0. Beyond the table's edge there is a grey wall, at infinity.
+
+    The bulldozer stands in the middle of the tags, or beside the paper if it would stand on more than half of them.
+    """
+
+    def __init__(self, layout: TagLayout):
+        for tag, pose in layout.poses.items():
+            if not np.allclose(pose[2], [0, 0, 1, 0]):
+                raise InputError(
+                    "tabletop", f"layout.poses.{tag}", f"{pose[2]}", "a tag lying face up in the plane z = 0"
+                )
+        self.layout = layout
+        corners = {tag: layout.corners(tag)[:, :2] for tag in layout.poses}
+        every = np.concatenate(list(corners.values()))
+        # Twice the white rim of one module that detectors ask for, in the family with the largest modules.
+        margin = layout.size / 3
+        self.paper: Float[np.ndarray, "2 2"] = np.stack([every.min(0) - margin, every.max(0) + margin])
+        self.middle: Float[np.ndarray, "2"] = self.paper.mean(0)
+        self.radius = float(np.linalg.norm(self.paper[1] - self.middle)) + RIM
+        side = family(layout.dictionary).markerSize + 2
+        self._modules = {
+            tag: cv2.aruco.generateImageMarker(family(layout.dictionary), tag, side) > 127 for tag in layout.poses
+        }
+
+        low, high = bulldozer().aabb
+        self.scale = LENGTH / (high[1] - low[1])
+        """Metres a unit of the bulldozer's own frame, which is moved but not turned."""
+        size = self.scale * (high - low)
+        spot = self.middle
+        free = {tag for tag in corners if self._apart(corners[tag], spot, size[:2])}
+        if 2 * len(free) < len(corners):
+            spot = np.array([self.middle[0], self.paper[1, 1] + 0.6 * LENGTH])
+            free = set(corners)
+        self.free_tags: frozenset[int] = frozenset(free)
+        """Those that the bulldozer does not stand on."""
+        self.box: Float[np.ndarray, "2 3"] = np.array([[*(spot - size[:2] / 2), 0], [*(spot + size[:2] / 2), size[2]]])
+        """Lower and upper corner around the bulldozer, world frame."""
+        self.shift = self.box[0] - self.scale * low
+        """World = scale * own frame + shift."""
+
+    @staticmethod
+    def _apart(corners: Float[np.ndarray, "4 2"], spot: Float[np.ndarray, "2"], size: Float[np.ndarray, "2"]) -> bool:
+        """Whether the box around a tag and a box lie apart."""
+        return bool(((corners.min(0) > spot + size / 2) | (corners.max(0) < spot - size / 2)).any())
+
+    def colours(
+        self, eye: Float[np.ndarray, "3"], directions: Float[np.ndarray, "N 3"], with_object: bool
+    ) -> Float[np.ndarray, "N 3"]:
+        """What rays from a point above the table see.
+
+        Args:
+            eye: world frame.
+            directions: unit, world frame.
+            with_object: whether the bulldozer stands there.
+
+        Returns:
+            sRGB in [0, 1].
+        """
+        with np.errstate(divide="ignore"):
+            t = np.where(directions[:, 2] < 0, -eye[2] / directions[:, 2], np.inf)
+        down = np.flatnonzero(np.isfinite(t))
+        points = eye[:2] + t[down, None] * directions[down, :2]
+        near = ((points - self.middle) ** 2).sum(-1) < self.radius**2
+        table = down[near]
+        out = np.full((len(directions), 3), WALL)
+        out[table] = self.ground(points[near])
+        if with_object:
+            out[table] *= np.where(self._shaded(points[near]), SHADE, 1)[:, None]
+            self._add_object(out, eye, directions, t)
+        return out
+
+    def ground(self, points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+        """sRGB of points (x, y) of the plane z = 0."""
+        out = _wood(points)
+        out[((points > self.paper[0]) & (points < self.paper[1])).all(-1)] = PAPER
+        low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(2), np.zeros(2))
+        for tag, modules in self._modules.items():
+            pose, side = self.layout.poses[tag], len(modules)
+            reach = self.layout.size * np.sqrt(0.5)
+            if (pose[:2, 3] + reach < low).any() or (pose[:2, 3] - reach > high).any():
+                continue
+            # In the tag's own frame x is the printed right and y the printed top, so that rows count downward.
+            own = (points - pose[:2, 3]) @ pose[:2, :2] / self.layout.size
+            col, row = np.floor((0.5 + own[:, 0]) * side), np.floor((0.5 - own[:, 1]) * side)
+            inside = np.flatnonzero((col >= 0) & (col < side) & (row >= 0) & (row < side))
+            white = modules[row[inside].astype(int), col[inside].astype(int)]
+            out[inside] = np.where(white, PAPER, INK)[:, None]
+        return out
+
+    def _shaded(self, points: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, "N"]:
+        """Whether points of the plane z = 0 lie in the bulldozer's shadow."""
+        out = np.zeros(len(points), bool)
+        # The lamp stands 56 degrees high: no shadow is longer than the bulldozer.
+        near = np.flatnonzero(((points > self.box[0, :2] - LENGTH) & (points < self.box[1, :2] + LENGTH)).all(-1))
+        own = (np.pad(points[near], ((0, 0), (0, 1))) - self.shift) / self.scale
+        out[near] = ~shadow()(np.full(len(near), -1), own)
+        return out
+
+    def _add_object(
+        self,
+        out: Float[np.ndarray, "N 3"],
+        eye: Float[np.ndarray, "3"],
+        directions: Float[np.ndarray, "N 3"],
+        t: Float[np.ndarray, "N"],
+    ) -> None:
+        """Paints the bulldozer over what lies further than it; `t` is how far that is."""
+        origin = (eye - self.shift) / self.scale
+        some = _in_cone(bulldozer(), origin, directions)
+        if not len(some):
+            return
+        part = Solids(**{f.name: getattr(bulldozer(), f.name)[some] for f in fields(Solids)})
+        # Culled already: testing spheres ray by ray would take longer than it saves.
+        solid, distance = nearest(part, np.broadcast_to(origin, directions.shape), directions, cull=False)
+        hit = np.flatnonzero(self.scale * distance < t)
+        points = origin + distance[hit, None] * directions[hit]
+        out[hit] = shade(bulldozer(), some[solid[hit]], points, directions[hit], shadow())
+
+    def in_front(self, eye: Float[np.ndarray, "3"], points: Float[np.ndarray, "M 3"]) -> Bool[np.ndarray, "M"]:
+        """Whether the box around the bulldozer lies between a viewer and points."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sides = (self.box[:, None] - eye) / (points - eye)
+        return np.maximum(sides.min(0).max(-1), 0) < np.minimum(sides.max(0).min(-1), 1)
+
+
+def _wood(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+    """A smooth grain along x. No wave is shorter than 2 cm, so that pixels of a few millimetres see no aliasing."""
+    x, y = points.T
+    bent = y + 0.018 * np.sin(17 * x + 9 * y) + 0.007 * np.sin(43 * x - 31 * y)
+    wave = 0.5 * np.sin(150 * bent) + 0.3 * np.sin(89 * bent + 7 * x + 1) + 0.2 * np.sin(60 * x + 70 * y + 2)
+    return WOOD + wave[:, None] * GRAIN
+
+
+def _in_cone(
+    solids: Solids, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "N 3"]
+) -> Int[np.ndarray, "P"]:
+    """Numbers of the solids that a bundle of rays may meet: whose bounding sphere reaches into the cone around them."""
+    axis = directions.mean(0)
+    axis /= np.linalg.norm(axis)
+    opening = np.arccos(np.clip((directions @ axis).min(), -1, 1))
+    offset = solids.centre - origin
+    distance = np.linalg.norm(offset, axis=-1)
+    spheres = np.arcsin(np.clip(np.linalg.norm(solids.half, axis=-1) / distance, 0, 1))
+    away = np.arccos(np.clip(offset @ axis / distance, -1, 1))
+    return np.flatnonzero(away <= opening + spheres + 1e-6)

@@ -1,0 +1,168 @@
+"""Where the cameras of a synthetic capture stand: poses that photograph a sheet from everywhere, and walk around an object."""
+
+import itertools
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from nerf_lightning.cameras import look_at
+from nerf_lightning.capture.geometry import inverse, move, normalised, project
+from nerf_lightning.capture.layout import TagLayout
+from nerf_lightning.capture.tabletop import Tabletop
+from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.errors import InputError
+
+GOLDEN = (np.sqrt(5) - 1) / 2
+"""Multiples of it modulo 1 fill [0, 1] evenly, however many are taken."""
+RIM = 0.02
+"""Share of the frame's width that stays free between a tag and the frame's edge."""
+STEEPEST = 45.0
+"""Largest angle between the line of sight and the sheet's normal in calibration photos, degrees."""
+ELEVATIONS = (28.0, 68.0)
+"""Of the cameras around the object, degrees above the table."""
+
+
+def sheet_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Float[np.ndarray, "count 4 4"]:
+    """Poses for calibration: all tags in every photo, and in each photo at another side or corner of the frame.
+
+    Tilts of up to 45 degrees toward all sides, any roll, distances from as near as possible to a third further.
+
+    Args:
+        layout: tags lying in the plane z = 0.
+        lens: through which they must be seen.
+        count: how many.
+        seed: other poses for another one.
+
+    Returns:
+        Camera to world, metres.
+    """
+    rng = np.random.default_rng(seed)
+    # With their white rim, without which no detector finds them.
+    tags = np.concatenate([1.4 * layout.corners(tag) - 0.4 * layout.poses[tag][:3, 3] for tag in layout.poses])
+    centre = (tags.min(0) + tags.max(0)) / 2
+    # The frame's middle, corners and sides, the corners twice as often: there the distortion shows.
+    goals = np.array([(0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1), (0, -1), (0, 1), (-1, -1), (1, 1), (1, -1), (-1, 1)])
+    start, out = rng.random(2), []
+    for i in range(count):
+        tilt = np.radians(STEEPEST) * ((start[0] + i * GOLDEN) % 1)
+        turn, roll = 2 * np.pi * ((start[1] + i * GOLDEN**2) % 1), rng.uniform(-np.pi, np.pi)
+        spread = 1 + 0.3 * rng.random()
+        direction = _direction(turn, np.pi / 2 - tilt)
+        near, far = 0.1 * layout.size, 1e3 * layout.size
+        for _ in range(40):
+            middle = np.sqrt(near * far)
+            fits = in_frame(lens, _placed(centre, middle * direction, roll), tags).all()
+            near, far = (near, middle) if fits else (middle, far)
+        c2w = _placed(centre, spread * far * direction, roll)
+        # As far toward the goal as all tags stay in the frame.
+        goal = (goals[i % len(goals)] + 1) / 2 * (lens.width, lens.height)
+        shares = np.linspace(1, 0, 41)
+        places = (_aimed(lens, c2w, centre, (1 - s) * np.array([lens.cx, lens.cy]) + s * goal) for s in shares)
+        out.append(next((place for place in places if in_frame(lens, place, tags).all()), c2w))
+    return np.array(out)
+
+
+def object_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Float[np.ndarray, "count 4 4"]:
+    """Poses all around the bulldozer, from changing heights and distances, a little tilted, with tags in view.
+
+    All of the bulldozer is in every frame, and so are two tags that it does not hide (one if there is only one).
+
+    Args:
+        layout: tags lying in the plane z = 0.
+        lens: through which they must be seen.
+        count: how many, at even steps around the object.
+        seed: other poses for another one.
+
+    Returns:
+        Camera to world, metres.
+
+    Raises:
+        InputError: where the tags lie so that hardly a place shows the object and two of them.
+    """
+    rng = np.random.default_rng(seed)
+    top = Tabletop(layout)
+    box = np.array(list(itertools.product(*top.box.T)))
+    sheet = np.append(top.middle, 0.0)
+    # Between the object and the sheet; above the sheet's middle where the object stands there.
+    centre = (top.box.mean(0) + sheet) / 2
+    reach = float(np.linalg.norm(box - centre, axis=-1).max())
+    start, out = rng.random(), []
+    for i in range(count):
+        near = 1.0
+        for _ in range(100):
+            turn = 2 * np.pi * (start + (i + rng.uniform(-0.3, 0.3)) / count)
+            height = (start + i * GOLDEN + rng.uniform(-0.1, 0.1)) % 1
+            elevation = np.radians(ELEVATIONS[0] + (ELEVATIONS[1] - ELEVATIONS[0]) * height)
+            distance = near * rng.uniform(1.0, 1.4) * reach * 2 * max(lens.fx, lens.fy) / min(lens.width, lens.height)
+            c2w = _placed(centre, distance * _direction(turn, elevation), np.radians(rng.normal(0, 6)))
+            place = np.array([lens.cx, lens.cy]) + rng.uniform(-0.06, 0.06, 2) * (lens.width, lens.height)
+            c2w = _aimed(lens, c2w, centre, place)
+            if in_frame(lens, c2w, box).all() and len(tags_in_view(top, lens, c2w)) >= min(2, len(layout.poses)):
+                break
+            near *= 1.02  # from further away more is in the frame
+        else:
+            raise InputError(
+                "object_cameras", "layout", "no view of the object and two tags", "tags nearer to each other"
+            )
+        out.append(c2w)
+    return np.array(out)
+
+
+def in_frame(lens: Lens, c2w: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]) -> Bool[np.ndarray, "M"]:
+    """Which points a photo shows, if nothing stands before them, a little inside its edges."""
+    rim = RIM * lens.width
+    local = move(inverse(c2w), points)
+    # Beyond the frame's corners the distortion's polynomial may turn back: what seems to be in the frame is not.
+    corners = np.array(list(itertools.product((0.0, lens.width), (0.0, lens.height))))
+    widest = np.linalg.norm(normalised(lens, corners), axis=-1).max()
+    front = (local[:, 2] > 0) & (np.linalg.norm(local[:, :2], axis=-1) < widest * local[:, 2])
+    out = np.zeros(len(points), bool)
+    if front.any():
+        pixels = project(lens, inverse(c2w), points[front])
+        out[front] = ((pixels > rim) & (pixels < np.array([lens.width, lens.height]) - rim)).all(-1)
+    return out
+
+
+def tags_in_view(top: Tabletop, lens: Lens, c2w: Float[np.ndarray, "4 4"]) -> list[int]:
+    """The tags that a photo of the object shows whole: in the frame, not under the object, not behind it."""
+    seen = []
+    for tag in sorted(top.free_tags):
+        corners = top.layout.corners(tag)
+        if in_frame(lens, c2w, corners).all() and not top.in_front(c2w[:3, 3], corners).any():
+            seen.append(tag)
+    return seen
+
+
+def _direction(turn: float, elevation: float) -> Float[np.ndarray, "3"]:
+    """Unit vector from a subject toward its viewer."""
+    ring = np.cos(elevation)
+    return np.array([ring * np.cos(turn), ring * np.sin(turn), np.sin(elevation)])
+
+
+def _placed(centre: Float[np.ndarray, "3"], offset: Float[np.ndarray, "3"], roll: float) -> Float[np.ndarray, "4 4"]:
+    """A camera at `centre + offset` that looks at `centre`, turned about its own axis."""
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    c2w = look_at(torch.from_numpy(centre + offset), torch.from_numpy(centre), up).numpy()
+    return _turned(c2w, np.array([0.0, 0.0, roll]))
+
+
+def _aimed(
+    lens: Lens, c2w: Float[np.ndarray, "4 4"], point: Float[np.ndarray, "3"], pixel: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "4 4"]:
+    """The camera turned on its spot, by the shortest way, so that it shows a point it looked at in the given pixel."""
+    ray = np.append(normalised(lens, pixel[None])[0], 1.0)
+    ray /= np.linalg.norm(ray)
+    target = c2w[:3, :3].T @ (point - c2w[:3, 3])
+    target /= np.linalg.norm(target)
+    axis = np.cross(ray, target)
+    sine = float(np.linalg.norm(axis))
+    return c2w if sine < 1e-12 else _turned(c2w, axis / sine * np.arctan2(sine, float(ray @ target)))
+
+
+def _turned(c2w: Float[np.ndarray, "4 4"], vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """A camera turned about itself by a rotation vector of its own frame."""
+    turn = np.eye(4)
+    turn[:3, :3] = cv2.Rodrigues(vector)[0]
+    return c2w @ turn
