@@ -53,8 +53,10 @@ def run(config: str, task: Callable[[DictConfig], object]) -> None:
         except InputError as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # the sweep decides what becomes of the other jobs
-            with suppress(OSError):  # a folder in which something stands stays
-                Path(HydraConfig.get().runtime.output_dir).rmdir()
+            folder = Path(HydraConfig.get().runtime.output_dir)
+            if folder.resolve() != Path.cwd():  # where a verb writes nothing of its own
+                with suppress(OSError):  # a folder in which something stands stays
+                    folder.rmdir()
             give_up(error)
 
     try:

@@ -30,7 +30,7 @@ def estimate_bounds(
     First a cube around the point the cameras look at, as wide as they see there. Where silhouettes are known, from alpha
     or from a flat `background` (sRGB in [0, 1]), the visual hull on a coarse grid shrinks it, twice.
     """
-    aabb = _visible_cube(views.cameras)
+    aabb = visible_cube(views.cameras)
     chosen = torch.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().long()
     views = Views(views.images[chosen], views.cameras[chosen])
     masks = silhouettes(views, background)
@@ -62,7 +62,8 @@ def viewing_distance(c2w: Float[Tensor, "V 4 4"], centre: Float[Tensor, "3"]) ->
     return distance if distance > 1e-5 * (1 + float(centre.norm())) else 1.0
 
 
-def _visible_cube(cameras: Cameras) -> Float[np.ndarray, "2 3"]:
+def visible_cube(cameras: Cameras) -> Float[np.ndarray, "2 3"]:
+    """A cube around the point the cameras look at, as wide as they see there, in world units."""
     centre = focus_point(cameras.c2w)
     distance = viewing_distance(cameras.c2w, centre)
     tangent = max(cameras.width / float(cameras.K[:, 0, 0].min()), cameras.height / float(cameras.K[:, 1, 1].min())) / 2

@@ -1,0 +1,61 @@
+"""How the report draws: colours, letters and scales that all its pictures share."""
+
+import functools
+
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont, get_font
+
+BLUE, ORANGE, SKY, VERMILLION, GREY = "#0072B2", "#E69F00", "#56B4E9", "#D55E00", "#6E6E6E"
+"""Told apart by every kind of eye (Okabe and Ito 2008); what was left out is vermillion."""
+FONT = "DejaVu Sans"
+"""Comes with matplotlib."""
+DPI = 100
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """ "#RRGGBB" to bytes."""
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue
+
+
+@functools.lru_cache(maxsize=1)
+def _letters() -> frozenset[int]:
+    return frozenset(get_font(findfont(FONT)).get_charmap())
+
+
+def readable(text: str) -> str:
+    """Text with a question mark for every letter that the font lacks."""
+    return "".join(letter if ord(letter) in _letters() else "?" for letter in text)
+
+
+def shortened(text: str, letters: int) -> str:
+    """Text with its middle left out where it is too long."""
+    if len(text) <= letters:
+        return text
+    head = (letters - 1) // 2
+    return f"{text[:head]}…{text[-(letters - 1 - head) :]}"
+
+
+def magnification(length: float, target: float) -> float:
+    """The largest of 1, 2, 5, 10, 20 ... that makes a length no longer than the target; 1 where it is longer already."""
+    if not 0 < length < target:
+        return 1.0
+    ratio = target / length
+    power = 10.0 ** np.floor(np.log10(ratio))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= ratio * (1 + 1e-9)))
+
+
+def as_picture(axes: Axes, width: int, height: int) -> None:
+    """Lets a chart show the area of a photo: pixels, rows running down."""
+    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="column, pixels", ylabel="row, pixels")
+
+
+def pixels_of(figure: Figure) -> UInt8[np.ndarray, "H W 3"]:
+    """Draws a figure, in memory."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])

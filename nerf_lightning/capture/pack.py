@@ -1,0 +1,96 @@
+"""Placed photos become a scene: undistorted, resized, split, with bounds and an orbit."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from nerf_lightning.cameras import Bounds, Cameras, focus_point, orbit_around
+from nerf_lightning.dataset.decode import read_pixels
+from nerf_lightning.dataset.extent import viewing_distance, visible_cube
+from nerf_lightning.dataset.lens import Lens, Rectification, rectify
+from nerf_lightning.dataset.resize import fit_size
+from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.errors import InputError
+
+NEAR = 0.25
+"""Sampling starts at this share of the nearest camera's distance to the subject: nobody holds a lens closer."""
+FRAMES = 60
+
+
+def pinhole_photo(path: Path, rectification: Rectification, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+    """A photo, upright, its distortion undone, averaged down to a size."""
+    image = rectification.apply(np.ascontiguousarray(read_pixels(path, upright=True)[..., :3]))
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def pack(
+    paths: Sequence[Path],
+    c2w: Float[np.ndarray, "V 4 4"],
+    lens: Lens,
+    name: str,
+    source: str,
+    longest: int | None = 300,
+    holdout: int = 10,
+    orbit: str | None = None,
+) -> Scene:
+    """Makes a scene of photos that have been placed.
+
+    Undistortion zooms in until no pixel lacks a source, so that no black border is ever trained on. The scene's frame is the
+    tags': metres, z out of the paper. Content lies in a cube around what the cameras look at; what is beyond is kept too.
+
+    Args:
+        paths: the photos, all of the lens's size.
+        c2w: camera to world, OpenCV frame, metres.
+        lens: that took them.
+        name, source: see `Scene`.
+        longest: side of the scene's photos in pixels; None keeps their size.
+        holdout: every so-manieth photo is held out.
+        orbit: name of the photo through whose camera the orbit goes; None takes one at a middling height.
+
+    Raises:
+        InputError: fewer than two photos, or no photo of that name.
+    """
+    if len(paths) < 2:
+        raise InputError(source, "", f"{len(paths)} placed photos", "at least 2: one to train on, one to hold out")
+    if orbit is not None and orbit not in [path.name for path in paths]:
+        raise InputError("config", "orbit", orbit, f"a placed photo, such as {paths[0].name}")
+    rectification = rectify(lens)
+    width, height = fit_size(lens.width, lens.height, longest)
+    images = torch.from_numpy(np.stack([pinhole_photo(path, rectification, width, height) for path in paths]))
+    poses = torch.from_numpy(c2w).float()
+    K = torch.from_numpy(rectification.K).float().repeat(len(paths), 1, 1)
+    cameras = Cameras(K, poses, lens.width, lens.height).resized(width, height)
+    held = torch.zeros(len(paths), dtype=torch.bool)
+    held[holdout // 2 :: holdout] = True
+    if not held.any():
+        held[len(paths) // 2] = True
+    train = Views(images[~held], cameras[~held])
+    centre = focus_point(train.cameras.c2w)
+    distances = (train.cameras.centres - centre).norm(dim=1)
+    # The camera nearest to the middle of all in distance and height, unless one is named.
+    middling = (distances - distances.median()).abs() + (poses[~held, 2, 3] - poses[~held, 2, 3].median()).abs()
+    through = train.cameras.centres[middling.argmin()]
+    if orbit is not None:
+        through = poses[[path.name for path in paths].index(orbit), :3, 3]
+    near = NEAR * min(viewing_distance(train.cameras.c2w, centre), float(distances.min()))
+    aabb = torch.from_numpy(visible_cube(train.cameras)).float()
+    return Scene(
+        name=name,
+        source=source,
+        train=train,
+        val=Views(images[held], cameras[held]),
+        orbit=Cameras(train.cameras.K[:1].repeat(FRAMES, 1, 1), _circle(through, centre), width, height),
+        bounds=Bounds(aabb, unbounded=True, near=near),
+    )
+
+
+def _circle(through: Float[torch.Tensor, "3"], centre: Float[torch.Tensor, "3"]) -> Float[torch.Tensor, "F 4 4"]:
+    """A circle around the vertical through the subject, on which a given camera lies; all look at the subject."""
+    offset = through - centre
+    radius = float(offset.norm())
+    elevation = float(torch.asin((offset[2] / max(radius, 1e-9)).clamp(-0.99, 0.99)))
+    return orbit_around(centre, torch.tensor([0.0, 0.0, 1.0]), radius, elevation, FRAMES)

@@ -1,0 +1,177 @@
+"""The whole way from two folders of photos to a scene file, and what stands beside it."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from nerf_lightning.capture.board import Board, board_detector
+from nerf_lightning.capture.calibrate import OUTLIER, OUTLIER_PIXELS, Calibration, calibrate
+from nerf_lightning.capture.detect import Sighting, guess_family, sight, tag_detector
+from nerf_lightning.capture.geometry import inverse
+from nerf_lightning.capture.layout import read_layout
+from nerf_lightning.capture.outputs import Packing, Placed, lens_entry, write_scene
+from nerf_lightning.capture.photos import find_photos, of_one_size
+from nerf_lightning.capture.solve import Solved, solve
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.errors import InputError
+from nerf_lightning.files import atomic
+
+log = logging.getLogger(__name__)
+
+NEAREST, FARTHEST = 0.03, 30.0
+"""Metres between which cameras stand from tags; beyond, a size was given in other units."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Everything found out, for the report."""
+
+    calibration: Calibration
+    sightings: list[Sighting]
+    """Of the photos to be placed, those of the calibrated size."""
+    solved: Solved
+    photos: list[Placed]
+    scene: Scene
+
+
+def capture(
+    calibration: Path,
+    photos: Path,
+    size: float,
+    packing: Packing,
+    dictionary: str = "auto",
+    layout: str = "auto",
+    board: Board | None = None,
+) -> Capture:
+    """Calibrates, places the photos, and writes the scene, `cameras.json` and `calibration.yaml` beside it.
+
+    Args:
+        calibration: folder of photos of the tags.
+        photos: folder of photos of the subject, with tags in view.
+        size: side of a tag's black square, metres.
+        packing: the scene to write.
+        dictionary: of the tags, or "auto".
+        layout: "auto" solves from the photos where the tags lie; else a YAML file that says it (see `read_layout`).
+        board: a ChArUco board instead of tags on their own.
+
+    Raises:
+        InputError: whatever is wrong with the photos, in words.
+    """
+    if not 0 < size < 10:
+        raise InputError("config", "tags.size", f"{size:g}", "the side of a tag's black square in metres, such as 0.06")
+    sheets, views = find_photos(calibration, "calibration"), find_photos(photos, "photos")
+    family = guess_family(sheets) if dictionary == "auto" else dictionary
+    known = None if layout == "auto" or board else read_layout(Path(layout), family, size).poses
+    detector = board_detector(family, size, board) if board else tag_detector(family, size)
+    log.info("%s: looking for tags of %s in %d photos", calibration, family, len(sheets))
+    seen = sight(sheets, detector)
+    wrong = of_one_size(calibration, {s.name: (s.width, s.height) for s in seen})
+    lens_found = calibrate(calibration, [s for s in seen if s.name not in wrong], known)
+    lens_found.dropped.update(wrong)
+    for text in lens_found.warnings:
+        log.warning("calibration: %s", text)
+    for left_out, reason in lens_found.dropped.items():
+        log.warning("%s left out of the calibration: %s", left_out, reason)
+    lens = lens_found.lens
+    log.info("focal length %.1f pixels, reprojection error %.2f pixels", lens.fx, lens_found.rms)
+
+    log.info("%s: looking for tags in %d photos", photos, len(views))
+    sightings = sight(views, detector)
+    turned = of_one_size(photos, {s.name: (s.width, s.height) for s in sightings}, (lens.width, lens.height))
+    usable = [s for s in sightings if s.name not in turned]
+    if not any(s.marks for s in usable):
+        raise InputError(
+            photos,
+            "",
+            f"no tag of {family} in {len(usable)} photos",
+            "photos with at least one whole tag in view",
+            "are the folders swapped, or is tags.dictionary another one?",
+        )
+    solved, reasons = _place(usable, lens_found, known)
+    _plausible(photos, solved, size)
+    results = [_result(s, i, solved, reasons, turned) for i, s in _numbered(sightings, usable)]
+    for photo in results:
+        if photo.status != "placed":
+            log.warning("%s left out: %s", photo.name, photo.reason)
+    scene = write_scene(photos, results, lens, packing)
+    _write_calibration(packing.output.with_name("calibration.yaml"), lens_found, solved, family, size)
+    return Capture(lens_found, usable, solved, results, scene)
+
+
+def _place(
+    usable: Sequence[Sighting], found: Calibration, known: dict[int, np.ndarray] | None
+) -> tuple[Solved, dict[str, str]]:
+    """Places photos, leaving out those that the others contradict."""
+    reasons = {s.name: "no tag found" for s in usable if not s.marks}
+    while True:
+        marks = [{} if s.name in reasons else s.marks for s in usable]
+        solved = solve(found.lens, marks, known)
+        if solved is None:
+            raise InputError(
+                usable[0].path.parent, "", "tags that fit no camera", "photos of flat tags, of the size given"
+            )
+        rms = solved.refined.rms
+        limit = max(OUTLIER * float(np.median(rms)), OUTLIER_PIXELS * max(found.lens.width, found.lens.height) / 1000)
+        bad = {
+            usable[i].name: f"its tags are {error:.1f} pixels off, where {float(np.median(rms)):.2f} are usual"
+            for i, error in zip(solved.placed, rms, strict=True)
+            if error > limit
+        }
+        lost = {
+            s.name: "its tags are not linked to those of the other photos"
+            for i, s in enumerate(usable)
+            if i not in solved.w2c and s.name not in reasons
+        }
+        if not bad:
+            return solved, reasons | lost
+        reasons |= bad
+
+
+def _plausible(folder: Path, solved: Solved, size: float) -> None:
+    """Refuses distances at which nobody photographs tags: a size in millimetres, mostly."""
+    distance = float(np.median([np.linalg.norm(inverse(w2c)[:3, 3]) for w2c in solved.w2c.values()]))
+    if not NEAREST < distance < FARTHEST:
+        raise InputError(
+            "config",
+            "tags.size",
+            f"{size:g}, which puts the cameras of {folder} {distance:.3g} m away from the tags",
+            f"{NEAREST} to {FARTHEST:g} m",
+            "give the side of the black square in metres: 6 cm are 0.06",
+        )
+
+
+def _numbered(sightings: Sequence[Sighting], usable: Sequence[Sighting]) -> list[tuple[int, Sighting]]:
+    """Every sighting with its number among the usable ones, -1 for the others."""
+    number = {s.name: i for i, s in enumerate(usable)}
+    return [(number.get(s.name, -1), s) for s in sightings]
+
+
+def _result(sighting: Sighting, number: int, solved: Solved, reasons: dict[str, str], turned: dict[str, str]) -> Placed:
+    if number in solved.w2c:
+        error = float(solved.refined.rms[solved.placed.index(number)])
+        return Placed(sighting.name, "placed", "", inverse(solved.w2c[number]), error)
+    return Placed(sighting.name, "left out", reasons.get(sighting.name) or turned[sighting.name], None, None)
+
+
+def _write_calibration(path: Path, found: Calibration, solved: Solved, family: str, size: float) -> None:
+    """The lens, how sure it is, and where the tags lay."""
+    content = lens_entry(found.lens) | {
+        "standard_deviations": found.deviations,
+        "reprojection_px": found.rms,
+        "photos_used": [s.name for s in found.used],
+        "photos_left_out": found.dropped,
+        "coverage": found.coverage,
+        "largest_tilt_degrees": float(np.degrees(found.tilt)),
+        "warnings": found.warnings,
+        "tags": {
+            "dictionary": family,
+            "size": size,
+            "to_world": {tag: pose.tolist() for tag, pose in solved.tags.items()},
+        },
+    }
+    with atomic(path) as temporary:
+        temporary.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))

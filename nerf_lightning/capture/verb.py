@@ -1,0 +1,109 @@
+"""The capture verb's configuration -> the work. Heavy imports wait until the configuration is checked."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.options import AtLeast, Count, check_options
+
+if TYPE_CHECKING:
+    from nerf_lightning.capture.board import Board
+    from nerf_lightning.capture.outputs import Placed
+
+NEEDED = {
+    "tags": {"calibration": "FOLDER", "photos": "FOLDER", "tags.size": "0.06"},
+    "colmap": {"photos": "FOLDER"},
+}
+"""By kind of poses: what must be given, and an example."""
+
+
+def options(
+    poses: str,
+    calibration: str | None,
+    photos: str | None,
+    output: str,
+    tags: dict,
+    resize: Count | None,
+    holdout: Annotated[int, AtLeast(2)],
+    orbit: str | None,
+    name: str | None,
+) -> None:
+    """The keys of conf/capture.yaml, for checking."""
+
+
+def tag_options(size: float | None, dictionary: str, layout: str, board: dict) -> None:
+    """The keys of its `tags`."""
+
+
+def board_options(columns: Count | None, rows: Count | None, square: float | None) -> None:
+    """The keys of its `tags.board`."""
+
+
+def capture_from(cfg: DictConfig) -> None:
+    """Does what the configuration says.
+
+    Raises:
+        InputError: a key that is missing or wrong, and whatever is wrong with the photos.
+    """
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(plain, dict)  # a DictConfig gives nothing else
+    given = {str(key): value for key, value in plain.items()}
+    check_options("", options, given)
+    check_options("tags", tag_options, given["tags"])
+    check_options("tags.board", board_options, given["tags"]["board"])
+    if given["poses"] not in NEEDED:
+        raise InputError("config", "poses", given["poses"], "tags or colmap")
+    for key, example in NEEDED[given["poses"]].items():
+        if OmegaConf.select(cfg, key) is None:
+            raise InputError("config", key, "nothing", "a value", f"give {key}={example}")
+    if given["poses"] == "tags" and given["tags"]["layout"] == "charuco":
+        for key, value in given["tags"]["board"].items():
+            if value is None:
+                raise InputError("config", f"tags.board.{key}", "nothing", "a value", "count the board's squares")
+
+    from nerf_lightning.capture.outputs import Packing
+    from nerf_lightning.capture.report import draw_cameras, write_report
+    from nerf_lightning.capture.run import capture
+    from nerf_lightning.capture.structure import capture_without_tags
+
+    packing = Packing(Path(given["output"]), given["resize"], given["holdout"], given["orbit"], given["name"])
+    photos, report = Path(given["photos"]), packing.output.with_name(packing.output.stem + "_report")
+    if given["poses"] == "colmap":
+        placed, scene = capture_without_tags(photos, packing)
+        draw_cameras(placed, scene, report)
+    else:
+        tags = given["tags"]
+        found = capture(
+            Path(given["calibration"]),
+            photos,
+            float(tags["size"]),
+            packing,
+            tags["dictionary"],
+            tags["layout"],
+            _board(tags),
+        )
+        write_report(found, report)
+        placed = found.photos
+    _announce(placed, packing.output, report)
+
+
+def _board(tags: dict[str, Any]) -> "Board | None":
+    """The ChArUco board, where one is meant."""
+    from nerf_lightning.capture.board import Board
+
+    if tags["layout"] != "charuco":
+        return None
+    return Board(tags["board"]["columns"], tags["board"]["rows"], float(tags["board"]["square"]))
+
+
+def _announce(photos: "list[Placed]", output: Path, report: Path) -> None:
+    from rich.console import Console
+
+    placed = sum(photo.status == "placed" for photo in photos)
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(
+        f"{placed} of {len(photos)} photos placed; {output}, with cameras.json and calibration.yaml beside it"
+    )
+    console.print(f"look at {report}, then: python -m nerf_lightning +experiment=capture dataset.path={output}")

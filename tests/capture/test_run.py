@@ -1,0 +1,241 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+import yaml
+from capture.views import LENS, SIX, SIZE, SMALL
+
+from nerf_lightning.capture.calibrate import calibrate
+from nerf_lightning.capture.detect import guess_family, sight, tag_detector
+from nerf_lightning.capture.geometry import angle_between, inverse, project
+from nerf_lightning.capture.layout import TagLayout, flat_pose, read_layout
+from nerf_lightning.capture.outputs import Packing
+from nerf_lightning.capture.photos import find_photos
+from nerf_lightning.capture.run import capture
+from nerf_lightning.capture.synthetic import Truth
+from nerf_lightning.dataset import open_scene
+from nerf_lightning.dataset.lens import rectify
+from nerf_lightning.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def packed(made: tuple[Path, Truth]):
+    folder, _ = made
+    packing = Packing(folder / "out" / "scene.npz", longest=200, holdout=4)
+    return capture(folder / "calibration", folder / "photos", SIZE, packing)
+
+
+def test_a_synthetic_capture_gives_back_its_cameras(made: tuple[Path, Truth], packed):
+    folder, truth = made
+    entries = json.loads((folder / "out" / "cameras.json").read_text())["photos"]
+    assert [entry["name"] for entry in entries] == sorted(truth.photos)
+    assert all(set(entry) == {"name", "status", "reason", "K", "c2w", "reprojection_px"} for entry in entries)
+    placed = [entry for entry in entries if entry["status"] == "placed"]
+    assert len(placed) >= 7
+    (reference,) = (tag for n, tag in enumerate(packed.solved.tags) if n in packed.solved.fixed)
+    home = SIX.poses[reference]
+    off, turned = [], []
+    for entry in placed:
+        pose, found = truth.photos[entry["name"]], home @ np.array(entry["c2w"])
+        off.append(np.linalg.norm(found[:3, 3] - pose[:3, 3]) / np.linalg.norm(pose[:3, 3]))
+        turned.append(angle_between(found, pose))
+    assert np.median(off) < 0.02 and np.median(turned) < np.radians(0.6)
+    assert abs(packed.calibration.lens.fx / SMALL.fx - 1) < 0.02
+
+
+def test_the_scene_trains_like_any_other(made: tuple[Path, Truth], packed):
+    folder, _ = made
+    scene = open_scene(str(folder / "out" / "scene.npz"))
+    assert scene.resolution == (200, 150) and scene.bounds.unbounded
+    assert len(scene.train) + len(scene.val) == len([p for p in packed.photos if p.status == "placed"])
+    assert len(scene.val) == 2
+    assert torch.equal(scene.train.images, packed.scene.train.images)
+    # The subject stands in the box, and the orbit looks at it from as far as the cameras.
+    assert (scene.bounds.aabb[0] < 0).all() and (scene.bounds.aabb[1] > 0).all()
+    heights = scene.orbit.centres[:, 2]
+    assert heights.std() < 1e-4 and heights.min() > 0
+    assert 0 < scene.bounds.near < float((scene.train.cameras.centres - scene.bounds.centre).norm(dim=1).min())
+
+
+def test_calibration_is_written_for_people_and_programs(made: tuple[Path, Truth], packed):
+    folder, _ = made
+    content = yaml.safe_load((folder / "out" / "calibration.yaml").read_text())
+    assert content["fx"] == pytest.approx(packed.calibration.lens.fx)
+    assert content["tags"]["dictionary"] == "DICT_4X4_50"
+    assert len(content["tags"]["to_world"]) >= 3 and set(content["tags"]["to_world"]) <= set(range(6))
+    assert content["photos_used"] and content["standard_deviations"]["focal"] > 0
+
+
+def test_undistorted_points_lie_where_a_pinhole_camera_puts_them():
+    """A grid of world points through the lens, mapped as `rectify` maps pixels, against the K that is written."""
+    rectification = rectify(LENS)
+    rng = np.random.default_rng(0)
+    points = np.c_[rng.uniform(-0.4, 0.4, (400, 2)), np.ones(400)]
+    ideal = points @ rectification.K.T
+    inside = (ideal[:, :2] > 2).all(1) & (ideal[:, 0] < LENS.width - 3) & (ideal[:, 1] < LENS.height - 3)
+    maps = np.stack([rectification.col, rectification.row])
+    col, row = (np.ascontiguousarray(k[:, None], np.float32) for k in (ideal[inside, :2] - 0.5).T)
+    back = np.stack([cv2.remap(m, col, row, cv2.INTER_LINEAR)[:, 0] for m in maps], axis=1) + 0.5
+    seen = project(LENS, np.eye(4), points[inside])
+    assert inside.sum() > 200 and np.abs(back - seen).max() < 0.05
+
+
+def test_no_pixel_of_the_scene_lacks_a_source(tmp_path: Path, made: tuple[Path, Truth], packed):
+    """White photos stay white to the last pixel: undistortion brings no black border."""
+    rectification = rectify(packed.calibration.lens)
+    white = np.full((SMALL.height, SMALL.width, 3), 255, np.uint8)
+    assert rectification.apply(white).min() == 255
+    assert rectification.col.min() > -0.5 and rectification.col.max() < SMALL.width - 0.5
+    assert rectification.row.min() > -0.5 and rectification.row.max() < SMALL.height - 0.5
+
+
+def test_corners_carry_no_offset(made: tuple[Path, Truth]):
+    """Pixel centres at +0.5: the mean of all corner errors vanishes."""
+    folder, truth = made
+    errors = [
+        mark.pixels - project(SMALL, inverse(truth.calibration[s.name]), SIX.corners(tag))
+        for s in sight(find_photos(folder / "calibration", "calibration"), tag_detector("DICT_4X4_50", SIZE))
+        for tag, mark in s.marks.items()
+    ]
+    flat = np.concatenate(errors)
+    assert len(flat) > 100 and np.abs(np.median(flat, axis=0)).max() < 0.05 and np.abs(flat).max() < 2
+
+
+def test_families_are_told_from_the_photos(made: tuple[Path, Truth], tmp_path: Path):
+    assert guess_family(find_photos(made[0] / "calibration", "calibration")) == "DICT_4X4_50"
+    imageio.imwrite(tmp_path / "grey.png", np.full((100, 120, 3), 128, np.uint8))
+    with pytest.raises(InputError, match="no tag of a common family in 1 of 1 photos"):
+        guess_family([tmp_path / "grey.png"])
+    with pytest.raises(InputError, match=r"tags.dictionary: found DICT_9X9"):
+        tag_detector("DICT_9X9", SIZE)
+
+
+def run(made: tuple[Path, Truth], tmp_path: Path, **changes):
+    folder, _ = made
+    packing = Packing(changes.pop("output", tmp_path / "scene.npz"), orbit=changes.pop("orbit", None))
+    options = {"calibration": folder / "calibration", "photos": folder / "photos", "size": SIZE}
+    return capture(**options | {"packing": packing, "dictionary": "DICT_4X4_50"} | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"size": 60.0}, "tags.size: found 60, expected the side .* in metres"),
+        ({"size": 6.0}, "m away from the tags, expected 0.03 to 30 m; give the side"),
+        ({"dictionary": "DICT_7X7_50"}, "0 photos with tags of 8"),
+        ({"output": Path("scene.txt")}, "ends in .npz"),
+        ({"orbit": "999.png"}, "orbit: found 999.png, expected a placed photo"),
+        ({"calibration": Path("nowhere")}, "calibration: found nowhere, which is no folder"),
+    ],
+)
+def test_bad_input_says_what_to_do(made: tuple[Path, Truth], tmp_path: Path, changes: dict, words: str):
+    with pytest.raises(InputError, match=words):
+        run(made, tmp_path, **changes)
+    assert not list(tmp_path.glob("**/*.npz")) and not list(tmp_path.glob("*.json"))
+
+
+def test_folders_of_the_wrong_kind(made: tuple[Path, Truth], tmp_path: Path):
+    (tmp_path / "heic").mkdir()
+    (tmp_path / "heic" / "a.HEIC").write_bytes(b"x")
+    with pytest.raises(InputError, match="only .heic files, expected JPEG, PNG or TIFF photos; convert them first"):
+        run(made, tmp_path, photos=tmp_path / "heic")
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    imageio.imwrite(plain / "a.png", np.full((300, 400, 3), 90, np.uint8))
+    with pytest.raises(InputError, match="no tag of DICT_4X4_50 in 1 photos.*folders swapped"):
+        run(made, tmp_path, photos=plain)
+    imageio.imwrite(plain / "a.png", np.full((400, 300, 3), 90, np.uint8))
+    with pytest.raises(InputError, match="a.png: found 300x400 pixels, held the other way"):
+        run(made, tmp_path, photos=plain)
+    (plain / "a.png").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="a.png"):
+        run(made, tmp_path, photos=plain)
+
+
+def test_photos_in_natural_order(tmp_path: Path):
+    for name in ("IMG_10.jpg", "IMG_9.JPG", "img_2.png", ".hidden.png", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert [p.name for p in find_photos(tmp_path, "photos")] == ["img_2.png", "IMG_9.JPG", "IMG_10.jpg"]
+
+
+def test_a_known_sheet(tmp_path: Path):
+    file = tmp_path / "sheet.yaml"
+    file.write_text("tags: {0: {x: 0.0, y: 0.0}, 3: {x: 0.09, y: -0.02, turn: 90}}")
+    layout = read_layout(file, "DICT_4X4_50", SIZE)
+    np.testing.assert_allclose(layout.corners(0), SIZE / 2 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]))
+    np.testing.assert_allclose(layout.corners(3)[0], [0.09 - SIZE / 2, -0.02 - SIZE / 2, 0], atol=1e-12)
+    assert isinstance(layout, TagLayout) and np.array_equal(flat_pose(0, 0), np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("tags: [1, 2]", "tags: found"),
+        ("tags: {a: {x: 0, y: 0}}", "tags.a: found 'a', expected a whole number"),
+        ("tags: {0: {x: 0}}", "tags.0: found"),
+        ("tags: {0: {x: 0, y: yes}}", "tags.0: found"),
+        ("tags: {0: {x: 0, y: 0, z: 1}}", "tags.0: found"),
+        ("tags: {0: {x: 0, y: .inf}}", "tags.0: found"),
+        ("tags: [", "no readable YAML"),
+    ],
+)
+def test_a_malformed_sheet_is_refused(tmp_path: Path, text: str, words: str):
+    file = tmp_path / "sheet.yaml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_layout(file, "DICT_4X4_50", SIZE)
+    with pytest.raises(InputError, match="no readable YAML"):
+        read_layout(tmp_path / "none.yaml", "DICT_4X4_50", SIZE)
+
+
+@pytest.mark.real_data
+def test_a_real_capture(real_data: Path, tmp_path: Path):
+    """Six tags on a curled page, then an object beside one of them."""
+    folder = real_data / "aruco_capture"
+    found = capture(folder / "calibration", folder / "object", 0.055, Packing(tmp_path / "scene.npz"))
+    assert found.calibration.rms < 2 and not found.calibration.dropped
+    assert [photo.status for photo in found.photos] == ["placed"] * 5
+    assert max(photo.reprojection_px for photo in found.photos) < 2
+    sheet = sight(find_photos(folder / "calibration", ""), tag_detector("DICT_4X4_50", 0.055))
+    again = calibrate(folder, [replace(s, marks=dict(reversed(s.marks.items()))) for s in sheet], None)
+    assert again.lens.fx == pytest.approx(found.calibration.lens.fx, rel=1e-3)  # the order of tags does not matter
+
+
+def test_the_shipped_sheet():
+    layout = read_layout(Path("sheet_2x3"), "DICT_4X4_50", 0.06)
+    assert sorted(layout.poses) == list(range(6))
+    corners = np.concatenate([layout.corners(tag)[:, :2] for tag in layout.poses])
+    assert (np.ptp(corners, axis=0) < [0.21, 0.297]).all()  # fits an A4 page
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff"])
+def test_photos_of_all_kinds_are_read(made: tuple[Path, Truth], tmp_path: Path, suffix: str):
+    photo = imageio.imread(made[0] / "calibration" / "000.png")
+    cv2.imwrite(str(tmp_path / f"a{suffix}"), photo[..., ::-1])
+    (seen,) = sight([tmp_path / f"a{suffix}"], tag_detector("DICT_4X4_50", SIZE))
+    (plain,) = sight([made[0] / "calibration" / "000.png"], tag_detector("DICT_4X4_50", SIZE))
+    assert sorted(seen.marks) == sorted(plain.marks) and plain.marks
+    for tag, mark in seen.marks.items():
+        np.testing.assert_allclose(mark.pixels, plain.marks[tag].pixels, atol=0.1)
+
+
+def test_a_photo_stored_on_its_side_is_turned_upright(made: tuple[Path, Truth], tmp_path: Path):
+    """EXIF orientation 6: turn clockwise by 90 degrees to look at."""
+    photo = imageio.imread(made[0] / "calibration" / "000.png")
+    stored = np.rot90(photo)  # counterclockwise
+    _, jpeg = cv2.imencode(".jpg", stored[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])
+    tiff = b"MM\x00*\x00\x00\x00\x08" + b"\x00\x01" + b"\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00" + bytes(4)
+    exif = b"Exif\x00\x00" + tiff
+    data = jpeg.tobytes()
+    file = tmp_path / "phone.jpg"
+    file.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
+    (seen,) = sight([file], tag_detector("DICT_4X4_50", SIZE))
+    assert (seen.width, seen.height) == (SMALL.width, SMALL.height)
+    (plain,) = sight([made[0] / "calibration" / "000.png"], tag_detector("DICT_4X4_50", SIZE))
+    for tag, mark in seen.marks.items():
+        np.testing.assert_allclose(mark.pixels, plain.marks[tag].pixels, atol=0.1)

@@ -1,0 +1,78 @@
+import importlib.util
+import json
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import yaml
+from capture.views import SIX, SMALL, camera
+
+from nerf_lightning.capture.geometry import to_matrix
+from nerf_lightning.capture.outputs import Packing
+from nerf_lightning.capture.structure import capture_without_tags, upright
+from nerf_lightning.capture.synthetic import Flaws, render_photo
+from nerf_lightning.capture.viewpoints import object_cameras
+from nerf_lightning.dataset import open_scene
+from nerf_lightning.errors import InputError
+
+
+def ring(count: int = 12, height: float = 0.5) -> np.ndarray:
+    """Cameras all around the origin, level, z up."""
+    turn = to_matrix(np.array([np.pi / 2, 0, 0, 0, 0, 0]))  # `camera` takes y as up
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return np.stack([turn @ camera([np.cos(a), height, np.sin(a)], [0, 0, 0]) for a in angles])
+
+
+@pytest.mark.parametrize("some", [slice(None), slice(0, 4)])
+def test_any_frame_is_turned_upright(some: slice):
+    c2w = ring()[some]
+    moved = to_matrix(np.array([0.7, -1.1, 0.4, 5.0, -3.0, 2.0])) @ c2w
+    moved[:, :3, 3] *= 7.0
+    found = upright(moved)
+    distance = np.linalg.norm(c2w[0, :3, 3])
+    np.testing.assert_allclose(found[:, 2, 3], c2w[:, 2, 3] / distance, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(found[:, :3, 3], axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(found[:, 2, 2], c2w[:, 2, 2], atol=1e-5)  # they look down as before
+    np.testing.assert_allclose(np.linalg.det(found[:, :3, :3]), 1)
+
+
+def test_photos_without_tags_give_the_same_outputs(tmp_path: Path):
+    c2ws = object_cameras(SIX, SMALL, 24, seed=0)[:8]  # in small steps around a third of a circle
+    truth = {f"{i}.png": c2w for i, c2w in enumerate(c2ws)}
+    (tmp_path / "photos").mkdir()
+    for name, c2w in truth.items():
+        imageio.imwrite(tmp_path / "photos" / name, render_photo(SIX, SMALL, c2w, True, Flaws(), seed=0))
+    packing = Packing(tmp_path / "scene.npz", longest=200, holdout=4)
+    photos, _ = capture_without_tags(tmp_path / "photos", packing)
+    placed = [photo for photo in photos if photo.c2w is not None]
+    assert len(placed) >= 6 and all(0 < photo.reprojection_px < 3 for photo in placed)
+    # Up to turn, shift and scale, which photos alone do not tell, the cameras stand where they stood.
+    found = np.stack([photo.c2w[:3, 3] for photo in placed])
+    exact = np.stack([truth[photo.name][:3, 3] for photo in placed])
+    a, b = found - found.mean(0), exact - exact.mean(0)
+    u, s, v = np.linalg.svd(b.T @ a)
+    mirror = np.linalg.det(u @ v)
+    fitted = s @ [1, 1, mirror] / (a**2).sum() * a @ (u @ np.diag([1, 1, mirror]) @ v).T
+    assert np.median(np.linalg.norm(fitted - b, axis=1) / np.linalg.norm(exact, axis=1)) < 0.05
+    assert (u @ np.diag([1, 1, mirror]) @ v)[2, 2] > 0.98  # up is up
+    opened = open_scene(str(tmp_path / "scene.npz"))
+    assert opened.resolution == (200, 150) and len(opened.train) + len(opened.val) == len(placed)
+    entries = json.loads((tmp_path / "cameras.json").read_text())["photos"]
+    assert [entry["name"] for entry in entries] == sorted(truth)
+    content = yaml.safe_load((tmp_path / "calibration.yaml").read_text())
+    assert content["fx"] == pytest.approx(SMALL.fx, rel=0.1)
+
+
+def test_photos_that_show_nothing(tmp_path: Path):
+    for i in range(3):
+        imageio.imwrite(tmp_path / f"{i}.png", np.full((120, 160, 3), 100 + i, np.uint8))
+    with pytest.raises(InputError, match="0 of 3 photos that hang together, expected at least 3; take more photos"):
+        capture_without_tags(tmp_path, Packing(tmp_path / "scene.npz"))
+    assert not (tmp_path / "scene.npz").exists()
+
+
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[colmap\]'"):
+        capture_without_tags(tmp_path, Packing(tmp_path / "scene.npz"))

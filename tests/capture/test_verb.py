@@ -1,0 +1,45 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from capture.views import SIZE
+
+from nerf_lightning.capture.synthetic import Truth
+
+
+def capture(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "nerf_lightning.capture", *arguments]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120)
+
+
+def test_one_command_makes_a_scene_with_its_report(made: tuple[Path, Truth], tmp_path: Path):
+    folder, _ = made
+    given = [f"calibration={folder}/calibration", f"photos={folder}/photos", f"tags.size={SIZE}", "resize=120"]
+    done = capture(*given, "output=mine/scene.npz", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "of 8 photos placed" in done.stdout and "+experiment=capture dataset.path=mine/scene.npz" in done.stdout
+    written = sorted(str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file())
+    report = [f"mine/scene_report/{name}.png" for name in ("cameras", "coverage", "errors", "tags")]
+    assert written == ["mine/calibration.yaml", "mine/cameras.json", "mine/scene.npz", *report]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "calibration: found nothing, expected a value; give calibration=FOLDER"),
+        (["calibration=a", "photos=b"], "tags.size: found nothing, expected a value; give tags.size=0.06"),
+        (["poses=guess"], "poses: found guess, expected tags or colmap"),
+        (["poses=colmap"], "photos: found nothing"),
+        (["poses=colmap", "photos=nowhere"], "photos: found nowhere, which is no folder"),
+        (["tags.sise=0.06"], "found tags.sise"),
+        (["tags.size=large"], "tags.size: found 'large', expected"),
+        (["calibration=a", "photos=b", "tags.size=0.02", "tags.layout=charuco"], "tags.board.columns: found nothing"),
+        (["holdout=1"], "holdout: found 1"),
+    ],
+)
+def test_bad_input_is_one_line(arguments: list[str], words: str, tmp_path: Path):
+    done = capture(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1 and words in done.stderr, done.stderr
+    assert tmp_path.is_dir() and not list(tmp_path.iterdir())
