@@ -1,0 +1,185 @@
+"""What a page about a scene draws, as plain arrays: frusta with photos, rays, samples, lines. Knows no viewer."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Generator, Tensor
+
+from nerf_lightning.cameras import Bounds, Cameras, Rays, focus_point
+from nerf_lightning.dataset.extent import viewing_distance
+from nerf_lightning.dataset.resize import area_resize, fit_size
+from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.sampler import UniformSampler
+
+OVERVIEW_FOV = math.radians(50)
+"""Vertical field of view of the browser's camera at first."""
+OVERVIEW_ELEVATION = math.radians(25)
+
+
+@dataclass(frozen=True)
+class Frustum:
+    """A view as a pyramid from the camera's centre to its photo, which stands centred on the optical axis."""
+
+    name: str
+    c2w: Float[np.ndarray, "4 4"]
+    """OpenCV frame, camera to world."""
+    fov: float
+    """Vertical field of view, radians."""
+    aspect: float
+    """Width over height of the pyramid's base."""
+    photo: UInt8[np.ndarray, "h w C"]
+
+
+@dataclass(frozen=True)
+class RayFigure:
+    """N rays, and M samples on those that meet the bounds; world frame."""
+
+    approach: Float[np.ndarray, "N 2 3"]
+    """From each camera to where the ray enters the bounds; a stump for rays that miss them."""
+    inside: Float[np.ndarray, "K 2 3"]
+    """From near to far, for the K rays that meet the bounds."""
+    samples: Float[np.ndarray, "M 3"]
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """Where a viewer's camera stands."""
+
+    position: Float[np.ndarray, "3"]
+    look_at: Float[np.ndarray, "3"]
+    up: Float[np.ndarray, "3"]
+    fov: float
+    """Vertical, radians."""
+
+
+def frusta(views: Views, word: str, photo_side: int) -> Iterator[Frustum]:
+    """A frustum for each view.
+
+    Args:
+        views: the photos and their cameras.
+        word: names are this word and the view's number.
+        photo_side: longest side of the photos in pixels.
+    """
+    for i, (image, K, c2w) in enumerate(zip(views.images, views.cameras.K, views.cameras.c2w, strict=True)):
+        yield _frustum(f"{word} {i}", image.numpy(), K.double().numpy(), c2w.numpy(), photo_side)
+
+
+def _frustum(
+    name: str,
+    image: UInt8[np.ndarray, "H W C"],
+    K: Float[np.ndarray, "3 3"],
+    c2w: Float[np.ndarray, "4 4"],
+    photo_side: int,
+) -> Frustum:
+    height, width = image.shape[:2]
+    w, h = fit_size(width, height, photo_side)
+    photo = area_resize(image, w, h)
+    # Viewers put the optical axis in the picture's middle: where it is not, clear margins bring it there.
+    half_x, half_y = max(K[0, 2], width - K[0, 2]), max(K[1, 2], height - K[1, 2])
+    left, right = ((half_x - side) * w / width for side in (K[0, 2], width - K[0, 2]))
+    above, below = ((half_y - side) * h / height for side in (K[1, 2], height - K[1, 2]))
+    margins = ((round(above), round(below)), (round(left), round(right)), (0, 0))
+    if np.any(margins):
+        opaque = np.full((h, w, 1), 255, np.uint8)
+        photo = np.pad(photo if photo.shape[2] == 4 else np.concatenate([photo, opaque], axis=2), margins)
+    tangent_x, tangent_y = half_x / K[0, 0], half_y / K[1, 1]
+    return Frustum(name, c2w, 2 * math.atan(tangent_y), float(tangent_x / tangent_y), photo)
+
+
+def one_ray_each(cameras: Cameras, generator: Generator) -> Rays:
+    """The ray of a random pixel of every view; R = V."""
+    return _random_pixels(cameras, torch.arange(len(cameras)), generator)
+
+
+def rays_of_one(cameras: Cameras, view: int, count: int, generator: Generator) -> Rays:
+    """The rays of random pixels of one view; R = count."""
+    return _random_pixels(cameras, torch.full((count,), view), generator)
+
+
+def _random_pixels(cameras: Cameras, view: Tensor, generator: Generator) -> Rays:
+    row, col = (torch.randint(size, view.shape, generator=generator) for size in (cameras.height, cameras.width))
+    return cameras.rays(view, row, col)
+
+
+def ray_figure(rays: Rays, bounds: Bounds, samples: int, stump: float, generator: Generator | None) -> RayFigure:
+    """Rays and where the uniform sampler asks along them.
+
+    Args:
+        rays: in the bounds' frame.
+        bounds: where the content is.
+        samples: intervals on each ray that meets the bounds; their midpoints are drawn.
+        stump: how much of a ray that misses the bounds is drawn, world units.
+        generator: jitters the intervals, as in training; None leaves them equal.
+    """
+    sampler = UniformSampler(bounds, samples, stratified=True)
+    positions = sampler(rays, _no_density, generator).positions(rays)
+    near, far = bounds.near_far(rays)
+    hit = far > near
+
+    def along(t: Float[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+        return rays.origins + t[:, None] * rays.directions
+
+    entry = along(torch.where(hit, near, torch.full_like(near, stump)))
+    return RayFigure(
+        torch.stack([rays.origins, entry], dim=1).numpy(),
+        torch.stack([along(near), along(far)], dim=1)[hit].numpy(),
+        positions.numpy(),
+    )
+
+
+def _no_density(positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+    """For samplers that never look at the field."""
+    raise RuntimeError("a uniform sampler asked for density")
+
+
+def box_edges(aabb: Float[Tensor, "2 3"]) -> Float[np.ndarray, "12 2 3"]:
+    """The edges of a box given by its lower and upper corner."""
+    corners = torch.cartesian_prod(*aabb.T).numpy()
+    pairs = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
+    return corners[np.array(pairs)]
+
+
+def path_segments(cameras: Cameras) -> Float[np.ndarray, "N 2 3"]:
+    """The line from view to view, closed where the last is about as near to the first as to the one before."""
+    centres = cameras.centres.numpy()
+    segments = np.stack([centres, np.roll(centres, -1, axis=0)], axis=1)
+    lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
+    closed = len(segments) > 2 and lengths[-1] <= 1.5 * lengths[:-1].max()
+    return segments if closed else segments[:-1]
+
+
+def scene_scale(scene: Scene) -> float:
+    """The cameras' distance to what they look at, in the scene's unit: what sizes on the page derive from."""
+    return viewing_distance(scene.train.cameras.c2w, focus_point(scene.train.cameras.c2w))
+
+
+def overview(scene: Scene) -> Viewpoint:
+    """From where cameras and bounds are all in sight: behind the orbit's start, upright as the orbit's pictures are."""
+    focus = focus_point(scene.train.cameras.c2w)
+    up = torch.nn.functional.normalize(-scene.orbit.c2w[:, :3, 1].mean(0), dim=0)
+    if float(up.norm()) < 0.5:  # a path that rolls over: no direction is up
+        up = torch.tensor([0.0, 0.0, 1.0])
+    offset = scene.orbit.centres[0] - focus
+    side = offset - (offset @ up) * up
+    if float(side.norm()) < 1e-3 * float(offset.norm()):  # it starts right above
+        helper = torch.eye(3)[int(up.abs().argmin())]
+        side = helper - (helper @ up) * up
+    side = torch.nn.functional.normalize(side, dim=0)
+    points = torch.cat([scene.train.cameras.centres, scene.val.cameras.centres, scene.bounds.aabb])
+    reach = max(float((points - focus).norm(dim=1).max()), 1e-6)
+    distance = reach / math.sin(OVERVIEW_FOV / 2)
+    position = focus + distance * (math.cos(OVERVIEW_ELEVATION) * side + math.sin(OVERVIEW_ELEVATION) * up)
+    return Viewpoint(position.numpy(), focus.numpy(), up.numpy(), OVERVIEW_FOV)
+
+
+def through(frustum: Frustum, distance: float, up: Float[np.ndarray, "3"]) -> Viewpoint:
+    """From where the photo was taken, turning about the point `distance` ahead, upright as the photo is."""
+    right, down, ahead, position = frustum.c2w[:3].T
+    level = up - (up @ right) * right  # the scene's up, rolled with the photo, keeps turning level
+    if -level @ down < 0.05:
+        level = -down
+    return Viewpoint(position, position + np.float32(distance) * ahead, level, frustum.fov)
