@@ -1,4 +1,4 @@
-"""python -m benchmarks: what the methods, the kernels and the framework cost on this machine."""
+"""python -m benchmarks: what methods, kernels, framework and capture cost on this machine, and how well they do."""
 
 import argparse
 import os
@@ -10,10 +10,10 @@ from typing import Any
 import torch
 
 import nerf_lightning
-from benchmarks import growth, kernels, methods, overhead
+from benchmarks import capture, growth, kernels, methods, overhead
 from nerf_lightning.files import write_json
 
-PARTS = ("methods", "kernels", "growth", "overhead")
+PARTS = ("methods", "kernels", "growth", "overhead", "capture")
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -63,17 +63,22 @@ def main() -> None:
     }
     text = []
     for part in parts:
-        if part == "methods":
+        tables: dict[str, list[dict[str, Any]]]
+        if part == "capture":
+            tables = capture.measure(seeds, budgets[0], arguments.output)
+        elif part == "methods":
             rows, report["runs"] = methods.measure(experiments, overrides, budgets, seeds, arguments.output)
+            tables = {part: rows}
         elif part == "kernels":
-            rows = kernels.measure()
+            tables = {part: kernels.measure()}
         elif part == "growth":
-            rows = growth.measure([f"+experiment={experiments[0]}", *overrides])
+            tables = {part: growth.measure([f"+experiment={experiments[0]}", *overrides])}
         else:
-            rows = [overhead.measure([f"+experiment={experiments[0]}", *overrides])]
-        report[part] = rows
-        text.append(f"{part}\n\n{table(rows)}\n")
-        print("\n" + text[-1], flush=True)
+            tables = {part: [overhead.measure([f"+experiment={experiments[0]}", *overrides])]}
+        for name, rows in tables.items():
+            report[name] = rows
+            text.append(f"{name}\n\n{table(rows)}\n")
+            print("\n" + text[-1], flush=True)
     arguments.output.mkdir(parents=True, exist_ok=True)
     (arguments.output / "table.txt").write_text("\n".join(text))
     write_json(arguments.output / "benchmarks.json", report)
