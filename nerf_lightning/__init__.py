@@ -4,6 +4,7 @@ The tree is the data flow, seven stages in order:
 
     photos -> cameras -> rays -> samples -> field -> renderer -> pixels
 
+    capture/    before all: photos with printed tags become a scene, with lens and camera poses
     dataset/    photos and poses become a Scene; data modules draw pixels or rays from it
     cameras/    Cameras (K, c2w, size) turn pixel coordinates into Rays; Bounds say where the content is
     sampler/    Rays become Samples: where along each ray the field is asked
@@ -12,6 +13,7 @@ The tree is the data flow, seven stages in order:
     system/     NeRF2D and NeRF3D: LightningModules that hold step, loss, metrics, optimiser
     callbacks/  budget, held-out PSNR, snapshots, orbit, checkpoints, progress, results.json
     build.py    config -> objects, the only place that instantiates
+    view.py     a scene in the browser
     __main__.py the command line: compose -> build -> fit -> test -> results.json
 
 Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples

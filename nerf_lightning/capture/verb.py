@@ -18,8 +18,12 @@ NEEDED = {
 }
 """By kind of poses: what must be given, and an example."""
 
+PRINTED, PRINTED_FAMILY, PRINTED_SIZE = "sheet_2x3", "DICT_4X4_50", 0.06
+"""What is printed where nothing else is said."""
+
 
 def options(
+    print: str | None,
     poses: str,
     calibration: str | None,
     photos: str | None,
@@ -53,6 +57,9 @@ def capture_from(cfg: DictConfig) -> None:
     check_options("", options, given)
     check_options("tags", tag_options, given["tags"])
     check_options("tags.board", board_options, given["tags"]["board"])
+    if given["print"] is not None:
+        _print(given["tags"], Path(given["print"]))
+        return
     if given["poses"] not in NEEDED:
         raise InputError("config", "poses", given["poses"], "tags or colmap")
     for key, example in NEEDED[given["poses"]].items():
@@ -87,6 +94,16 @@ def capture_from(cfg: DictConfig) -> None:
         write_report(found, report)
         placed = found.photos
     _announce(placed, packing.output, report)
+
+
+def _print(tags: dict[str, Any], file: Path) -> None:
+    """Writes the page of a known sheet."""
+    from nerf_lightning.capture.layout import read_layout
+    from nerf_lightning.capture.printout import write_page
+
+    sheet = PRINTED if tags["layout"] == "auto" else tags["layout"]
+    family = PRINTED_FAMILY if tags["dictionary"] == "auto" else tags["dictionary"]
+    write_page(read_layout(Path(sheet), family, float(tags["size"] or PRINTED_SIZE)), file)
 
 
 def _board(tags: dict[str, Any]) -> "Board | None":

@@ -91,9 +91,10 @@ def object_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Floa
     start, out = rng.random(), []
     for i in range(count):
         near = 1.0
-        for _ in range(100):
-            turn = 2 * np.pi * (start + (i + rng.uniform(-0.3, 0.3)) / count)
-            height = (start + i * GOLDEN + rng.uniform(-0.1, 0.1)) % 1
+        for attempt in range(100):
+            # From low down the object hides what is behind it: other heights are tried, and places farther along.
+            turn = 2 * np.pi * (start + (i + rng.uniform(-0.3, 0.3)) / count + 0.002 * attempt * rng.uniform(-1, 1))
+            height = (start + i * GOLDEN + (0.1 + 0.01 * attempt) * rng.uniform(-1, 1)) % 1
             elevation = np.radians(ELEVATIONS[0] + (ELEVATIONS[1] - ELEVATIONS[0]) * height)
             distance = near * rng.uniform(1.0, 1.4) * reach * 2 * max(lens.fx, lens.fy) / min(lens.width, lens.height)
             c2w = _placed(centre, distance * _direction(turn, elevation), np.radians(rng.normal(0, 6)))

@@ -1,0 +1,43 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from nerf_lightning.capture.detect import tag_detector
+from nerf_lightning.capture.ink import pixels_of
+from nerf_lightning.capture.layout import TagLayout, flat_pose, read_layout
+from nerf_lightning.capture.printout import A4, page, write_page
+from nerf_lightning.errors import InputError
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        read_layout(Path("sheet_2x3"), "DICT_4X4_50", 0.06),
+        TagLayout("DICT_6X6_250", 0.05, {7: flat_pose(0, 0, 30), 11: flat_pose(0.08, 0.02, -90)}),
+    ],
+)
+def test_the_page_shows_the_tags_where_they_are_said_to_be(layout: TagLayout):
+    image = cv2.cvtColor(pixels_of(page(layout)), cv2.COLOR_RGB2GRAY)
+    height, width = image.shape
+    assert width / height == pytest.approx(A4[0] / A4[1], rel=0.01)
+    found = tag_detector(layout.dictionary, layout.size)(image)
+    assert sorted(found) == sorted(layout.poses)
+    scale = width / A4[0]
+    corners = {tag: layout.corners(tag)[:, :2] * [1, -1] * scale for tag in layout.poses}
+    every = np.concatenate(list(corners.values()))
+    shift = [width / 2, height / 2] - (every.min(0) + every.max(0)) / 2
+    for tag, mark in found.items():
+        np.testing.assert_allclose(mark.pixels, corners[tag] + shift, atol=1.5)  # edges snap to pixels
+
+
+def test_pages_that_cannot_be(tmp_path: Path):
+    layout = read_layout(Path("sheet_2x3"), "DICT_4X4_50", 0.06)
+    with pytest.raises(InputError, match=r"print: found sheet.png, expected a file name that ends in .pdf"):
+        write_page(layout, Path("sheet.png"))
+    wide = TagLayout("DICT_4X4_50", 0.06, {0: flat_pose(0, 0), 1: flat_pose(0.16, 0)})
+    with pytest.raises(InputError, match="220 x 60 mm of tags"):
+        write_page(wide, tmp_path / "a.pdf")
+    write_page(layout, tmp_path / "b.pdf")
+    assert (tmp_path / "b.pdf").read_bytes()[:5] == b"%PDF-" and len(list(tmp_path.iterdir())) == 1
