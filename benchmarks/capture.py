@@ -121,7 +121,7 @@ def flips(seeds: list[int], count: int = 500, noise: float = 0.5) -> list[dict[s
             options = [mark_poses(lens, Mark(*pair)) for pair in seen]
             errors = [[angle_between(pose, h.pose) for h in found] for pose, found in zip(truth, options, strict=True)]
             flipped = {
-                way: sum(e[i] > min(e) + FLIPPED for e, i in zip(errors, chosen, strict=True))
+                way: sum(bool(e[i] > min(e) + FLIPPED) for e, i in zip(errors, chosen, strict=True))
                 for way, chosen in (("alone", [0] * count), ("in_order", choose(lens, options, seen)))
             }
             rows.append({"walk": f"{tilt:g} degrees, {pace} photos a turn", "seed": seed, "photos": count, **flipped})

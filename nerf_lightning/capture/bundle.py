@@ -54,6 +54,13 @@ class Refined:
         """Root mean square distance in pixels, by photo."""
         return np.array([np.sqrt((r**2).sum(1).mean()) if len(r) else 0.0 for r in self.residuals])
 
+    def mark_rms(self, photo: int) -> dict[int, float]:
+        """Root mean square distance in pixels of each mark of a photo, by the tag's number."""
+        marks = self.bundle.marks[photo]
+        ends = np.cumsum([len(mark.pixels) for mark in marks.values()])[:-1]
+        parts = zip(marks, np.split(self.residuals[photo], ends), strict=True)
+        return {tag: float(np.sqrt((part**2).sum(1).mean())) for tag, part in parts}
+
     @property
     def total_rms(self) -> float:
         """Root mean square distance in pixels over all points."""

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -10,7 +10,7 @@ import numpy as np
 
 from nerf_lightning.capture.bundle import LENS_PARAMETERS
 from nerf_lightning.capture.detect import Mark, Sighting
-from nerf_lightning.capture.solve import Pose, Solved, packed, settle, solve
+from nerf_lightning.capture.solve import Pose, Solved, misfits, packed, settle, solve
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.errors import InputError
 
@@ -36,10 +36,6 @@ ROUNDS = 3
 """Solutions of the poses before the lens model is chosen."""
 FIRST_FOCAL = (0.7, 1.0, 1.5, 2.2)
 """First guesses of the focal length, in longest sides of the photo."""
-OUTLIER = 4.0
-"""A photo whose error is so many times the median is dropped, if it is also above ..."""
-OUTLIER_PIXELS = 1.0
-"""... this at 1000 pixels along the longest side."""
 UNSURE, HOPELESS = 0.01, 0.05
 """Standard deviation of the focal length, as a share of it, beyond which a warning, an error is due."""
 PLAUSIBLE = 0.35, 12.0
@@ -131,17 +127,13 @@ def calibrate(folder: Path, sightings: Sequence[Sighting], layout: dict[int, Pos
     while True:
         solved = _fit(folder, lens, used, layout)
         lens = solved.lens
-        rms = solved.refined.rms
-        limit = max(OUTLIER * float(np.median(rms)), OUTLIER_PIXELS * max(lens.width, lens.height) / 1000)
-        bad = {used[i].name for i, error in zip(solved.placed, rms, strict=True) if error > limit}
-        lost = {used[i].name for i in range(len(used)) if i not in solved.w2c}
-        for name, error in zip([used[i].name for i in solved.placed], rms, strict=True):
-            if name in bad:
-                dropped[name] = f"its tags are {error:.1f} pixels off, where {float(np.median(rms)):.2f} are usual"
-        dropped |= dict.fromkeys(lost, "its tags could not be placed")
-        left = [s for s in used if s.name not in bad | lost]
-        if len(left) == len(used) or len(left) < FEWEST:
+        off = misfits(solved)
+        lost = {i for i in range(len(used)) if i not in solved.w2c}
+        left = [without(s, off.marks.get(i)) for i, s in enumerate(used) if i not in lost | set(off.photos)]
+        if not (off.photos or off.marks or lost) or len(left) < FEWEST:
             break
+        dropped |= {used[i].name: off_by(error, off.usual) for i, error in off.photos.items()}
+        dropped |= {used[i].name: "its tags could not be placed" for i in lost}
         used = left
     refined = solved.refined
     coverage = _coverage(used)
@@ -171,6 +163,21 @@ def calibrate(folder: Path, sightings: Sequence[Sighting], layout: dict[int, Pos
         tilt,
         warnings,
     )
+
+
+def without(sighting: Sighting, tag: int | None) -> Sighting:
+    """A sighting less one tag that is half hidden, bent, or mistaken for another."""
+    if tag is None:
+        return sighting
+    log.warning(
+        "%s: tag %d is ignored: it lies elsewhere than in the other photos, or is half hidden", sighting.name, tag
+    )
+    return replace(sighting, marks={t: mark for t, mark in sighting.marks.items() if t != tag})
+
+
+def off_by(error: float, usual: float) -> str:
+    """Why a photo is left out."""
+    return f"its tag is {error:.1f} pixels off, where {usual:.2f} are usual"
 
 
 def _fit(folder: Path, lens: Lens, used: list[Sighting], layout: dict[int, Pose] | None) -> Solved:

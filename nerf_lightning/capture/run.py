@@ -9,13 +9,13 @@ import numpy as np
 import yaml
 
 from nerf_lightning.capture.board import Board, board_detector
-from nerf_lightning.capture.calibrate import OUTLIER, OUTLIER_PIXELS, Calibration, calibrate
+from nerf_lightning.capture.calibrate import Calibration, calibrate, off_by, without
 from nerf_lightning.capture.detect import Sighting, guess_family, sight, tag_detector
 from nerf_lightning.capture.geometry import inverse
 from nerf_lightning.capture.layout import read_layout
 from nerf_lightning.capture.outputs import Packing, Placed, lens_entry, write_scene
 from nerf_lightning.capture.photos import find_photos, of_one_size
-from nerf_lightning.capture.solve import Solved, solve
+from nerf_lightning.capture.solve import Solved, misfits, solve
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic
@@ -105,30 +105,25 @@ def capture(
 def _place(
     usable: Sequence[Sighting], found: Calibration, known: dict[int, np.ndarray] | None
 ) -> tuple[Solved, dict[str, str]]:
-    """Places photos, leaving out those that the others contradict."""
+    """Places photos, leaving out tags and photos that the others contradict."""
     reasons = {s.name: "no tag found" for s in usable if not s.marks}
+    left = list(usable)
     while True:
-        marks = [{} if s.name in reasons else s.marks for s in usable]
-        solved = solve(found.lens, marks, known)
+        solved = solve(found.lens, [{} if s.name in reasons else s.marks for s in left], known)
         if solved is None:
             raise InputError(
                 usable[0].path.parent, "", "tags that fit no camera", "photos of flat tags, of the size given"
             )
-        rms = solved.refined.rms
-        limit = max(OUTLIER * float(np.median(rms)), OUTLIER_PIXELS * max(found.lens.width, found.lens.height) / 1000)
-        bad = {
-            usable[i].name: f"its tags are {error:.1f} pixels off, where {float(np.median(rms)):.2f} are usual"
-            for i, error in zip(solved.placed, rms, strict=True)
-            if error > limit
-        }
+        off = misfits(solved)
         lost = {
             s.name: "its tags are not linked to those of the other photos"
             for i, s in enumerate(usable)
             if i not in solved.w2c and s.name not in reasons
         }
-        if not bad:
+        if not off.photos and not off.marks:
             return solved, reasons | lost
-        reasons |= bad
+        reasons |= {usable[i].name: off_by(error, off.usual) for i, error in off.photos.items()}
+        left = [without(s, off.marks.get(i)) for i, s in enumerate(left)]
 
 
 def _plausible(folder: Path, solved: Solved, size: float) -> None:

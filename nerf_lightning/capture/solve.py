@@ -19,6 +19,10 @@ AGREE_ANGLE = np.radians(10.0)
 """Two photos say the same of two tags if they differ by less than this angle, and ..."""
 AGREE_SHIFT = 0.25
 """... by less than this share of the tags' distance (or of a tag, where they touch)."""
+OUTLIER = 4.0
+"""A photo is off if its error is so many times the median, and also above ..."""
+OUTLIER_PIXELS = 1.0
+"""... this at 1000 pixels along the longest side."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +149,33 @@ def settle(bundle: Bundle, models: Sequence[tuple[str, ...]], fixed: frozenset[i
     best = min(sound, key=lambda fit: fit.bic)
     twisted = refine(best.bundle, models[fits.index(best)], fixed, free_twists=True)
     return min(best, twisted, key=lambda fit: fit.bic)
+
+
+@dataclass(frozen=True)
+class Misfits:
+    """What the other photos contradict."""
+
+    photos: dict[int, float]
+    """Numbers of photos more than half of whose marks are off, by how many pixels."""
+    marks: dict[int, int]
+    """The worst tag, by the number of the photo, where others are sound."""
+    usual: float
+    """Median over photos, pixels."""
+
+
+def misfits(solved: Solved) -> Misfits:
+    """Photos that are off by far more than the others: a tag half hidden, bent, or mistaken for another."""
+    rms, tags = solved.refined.rms, list(solved.tags)
+    usual, side = float(np.median(rms)), max(solved.lens.width, solved.lens.height)
+    limit = max(OUTLIER * usual, OUTLIER_PIXELS * side / 1000)
+    photos, marks = {}, {}
+    for i in np.flatnonzero(rms > limit).tolist():
+        by_mark = solved.refined.mark_rms(i)
+        if 2 * sum(error > limit for error in by_mark.values()) > len(by_mark):
+            photos[solved.placed[i]] = float(rms[i])
+        else:
+            marks[solved.placed[i]] = tags[max(by_mark.items(), key=lambda pair: pair[1])[0]]
+    return Misfits(photos, marks, usual)
 
 
 def packed(refined: Refined, tags: Sequence[int], placed: Sequence[int], fixed: frozenset[int]) -> Solved:

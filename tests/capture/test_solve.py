@@ -94,6 +94,16 @@ def test_a_photo_that_contradicts_the_others_is_dropped_by_name():
     assert abs(found.lens.fx / LENS.fx - 1) < 0.005
 
 
+def test_a_tag_half_hidden_does_not_cost_the_photo():
+    seen = sightings(SIX, cameras(12))
+    hidden = seen[7].marks[2].pixels + np.array([[30.0, 20.0], [0, 0], [0, 0], [0, 0]])
+    seen[7] = replace(seen[7], marks=seen[7].marks | {2: Mark(SIZE * SQUARE, hidden)})
+    found = calibrate(FOLDER, seen, None)
+    assert found.dropped == {} and len(found.used) == 12
+    assert sorted(found.used[7].marks) == [0, 1, 3, 4, 5]
+    assert found.rms < 0.2
+
+
 def test_what_cannot_be_calibrated_says_why():
     with pytest.raises(InputError, match="2 photos with tags of 5, expected at least 3"):
         calibrate(
