@@ -65,7 +65,7 @@ def main() -> None:
     for part in parts:
         tables: dict[str, list[dict[str, Any]]]
         if part == "capture":
-            tables = capture.measure(seeds, budgets[0], arguments.output)
+            tables = capture.measure(seeds, arguments.output)
         elif part == "methods":
             rows, report["runs"] = methods.measure(experiments, overrides, budgets, seeds, arguments.output)
             tables = {part: rows}

@@ -15,11 +15,15 @@ CHECKS = (2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 15
 Run = dict[str, Any]
 
 
-def train(experiment: str, overrides: list[str], seconds: float, seed: int, folder: Path) -> Run:
+def marks(seconds: float) -> str:
+    """Shares of a budget at which a run is measured."""
+    return ",".join(str(check / seconds) for check in CHECKS if check < seconds)
+
+
+def train(experiment: str, overrides: list[str], seed: int, folder: Path, measured_at: str = "") -> Run:
     """One run; returns its results.json."""
-    marks = ",".join(str(check / seconds) for check in CHECKS if check < seconds)
     command = [sys.executable, "-m", "nerf_lightning", f"+experiment={experiment}", *overrides]
-    command += [f"budget.seconds={seconds}", f"seed={seed}", f"callbacks.heldout.at=[{marks}]"]
+    command += [f"seed={seed}", f"callbacks.heldout.at=[{measured_at}]"]
     command += ["callbacks.snapshots.steps=[]", "callbacks.orbit.frames=0", f"hydra.run.dir='{folder}'"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -74,7 +78,11 @@ def measure(
         by_budget: dict[float, list[Run]] = {}
         for seconds in budgets:
             for seed in seeds:
-                run = train(experiment, overrides, seconds, seed, folder / f"{experiment}_{seconds:g}s_seed{seed}")
+                given, place = (
+                    [*overrides, f"budget.seconds={seconds}"],
+                    folder / f"{experiment}_{seconds:g}s_seed{seed}",
+                )
+                run = train(experiment, given, seed, place, marks(seconds))
                 print(f"{experiment}, {seconds:g} s, seed {seed}: {run['psnr']:.2f} dB", flush=True)
                 by_budget.setdefault(seconds, []).append(run)
                 everything.append({"experiment": experiment, "budget_seconds": seconds, **run})

@@ -97,7 +97,7 @@ def build_system(cfg: DictConfig, scene_frame: "SceneFrame | None") -> System:
     bounds, background = scene_frame
     field = build_field(cfg, Field, "three coordinates", bounds=bounds)
     sampler = make(cfg, "sampler", bounds=bounds)
-    renderer = make(cfg, "renderer", scene_background=background)
+    renderer = make(cfg, "renderer", scene_background=background, half_size=float(bounds.half_size.min()))
     return NeRF3D(field, sampler, renderer, **common)
 
 

@@ -1,10 +1,12 @@
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks import growth, kernels, methods, overhead
+from benchmarks import capture, growth, kernels, methods, overhead
 
 CURVE = [[2.0, 100, 20.0], [8.0, 400, 24.5], [10.5, 500, 26.0], [30.0, 1500, 29.0]]
 
@@ -68,3 +70,19 @@ def test_an_unknown_part_is_refused(monkeypatch: pytest.MonkeyPatch, capsys):
     with pytest.raises(SystemExit) as stopped:
         command.main()
     assert stopped.value.code == 2 and "colonels" in capsys.readouterr().err
+
+
+def test_flipped_poses_are_counted_with_and_without_the_photos_order():
+    rows = capture.flips([1], count=60)
+    assert len(rows) == 3 and all(row["photos"] == 60 for row in rows)
+    assert sum(row["in_order"] for row in rows) < sum(row["alone"] for row in rows)
+
+
+def test_errors_of_a_capture_are_told_in_the_true_frame():
+    layout = capture.SHEETS["six tags"]
+    shifted = {tag: layout.poses[tag].copy() for tag in layout.poses}
+    shifted[4][0, 3] += 1e-3
+    to_first = np.linalg.inv(layout.poses[2])
+    world = {tag: to_first @ pose for tag, pose in shifted.items()}
+    solved = SimpleNamespace(tags=world, fixed=frozenset({2}))
+    assert capture.layout_error(solved, layout) == pytest.approx(1.0)

@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import composite
+from nerf_lightning.renderer.distortion import distortion as spread
 from nerf_lightning.sampler import Samples
 
 FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]]
@@ -28,6 +29,8 @@ class Rendered:
     """In [0, 1]: how much of the background is covered."""
     depth: Float[Tensor, "R"]
     """Expected distance along the ray of what covers it, in the scene's unit; 0 where nothing does."""
+    penalty: Float[Tensor, ""] | None = None
+    """What training adds to its loss, where the renderer asks for that."""
 
 
 class VolumeRenderer(torch.nn.Module):
@@ -37,17 +40,27 @@ class VolumeRenderer(torch.nn.Module):
         background: "scene" (the scene's own), "black", "white", "random" (a new colour for each training ray, the scene's
             own in evaluation; wants images with alpha), or three numbers in [0, 1].
         scene_background: the colour "scene" stands for.
+        distortion: weight of the penalty on fog in training; see `nerf_lightning.renderer.distortion`. 0 does without.
+        half_size: of the scene's box, world units.
 
     Raises:
-        InputError: on any other background.
+        InputError: on any other background, or a negative weight.
     """
 
     colour: Tensor
 
     def __init__(
-        self, background: str | list[float] = "scene", scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self,
+        background: str | list[float] = "scene",
+        scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        distortion: float = 0.0,
+        half_size: float = 1.0,
     ):
         super().__init__()
+        if distortion < 0:
+            raise InputError("renderer.distortion", "", str(distortion), "0 or more")
+        self.distortion = distortion
+        self.half_size = half_size
         self.random = background == "random"
         colour: Sequence[float]
         if background in ("scene", "random"):
@@ -82,4 +95,7 @@ class VolumeRenderer(torch.nn.Module):
         density, rgb = field(samples.positions(rays), samples.directions(rays))
         summed, opacity, depth = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
         colour = summed + (1 - opacity)[:, None] * backgrounds
-        return Rendered(colour, opacity, depth / opacity.clamp_min(1e-6))
+        penalty = None
+        if self.distortion and density.requires_grad:
+            penalty = self.distortion * spread(density, samples, self.half_size)
+        return Rendered(colour, opacity, depth / opacity.clamp_min(1e-6), penalty)

@@ -1,9 +1,10 @@
 """Skip empty space: a coarse grid remembers where the field has density (Instant-NGP, appendix C)."""
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import keep_visible, march, mark_cells
 from nerf_lightning.options import Count
@@ -11,6 +12,18 @@ from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
 
 MAX_ASKED = 1 << 17
 """Positions at which the density is asked together: bounds the memory of one call."""
+MOST_CAMERAS = 128
+"""Cameras, evenly chosen, that tell which cells are in view."""
+
+
+def in_view(camera: Cameras, points: Float[Tensor, "N 3"], near: float) -> Bool[Tensor, "N"]:
+    """Which points of the world one camera has in its picture, farther from it than `near`."""
+    rotation, eye = camera.c2w[0, :3, :3], camera.c2w[0, :3, 3]
+    local = (points - eye) @ rotation
+    pixels = local @ camera.K[0].T
+    size = torch.tensor([camera.width, camera.height])
+    inside = ((pixels[:, :2] > 0) & (pixels[:, :2] < size * pixels[:, 2:])).all(1)
+    return inside & (local[:, 2] > 0) & (local.norm(dim=1) > near)
 
 
 class OccupancySampler(Sampler):
@@ -31,12 +44,15 @@ class OccupancySampler(Sampler):
         update_every: training steps between updates.
         warmup: steps during which every update looks at every cell; afterwards at a quarter of them.
         memory: updates after which a cell that light no longer reached is left out.
+        seen_by: cells that fewer training cameras have in view are left empty: what one camera alone sees can be anything, such
+            as fog before its lens.
         transparent: transmittance below which a ray has ended, above 0.
         thin: opacity of a step below which training drops it; never more than half the mean, so that a fog trains too.
     """
 
     thickness: Tensor
     occupied: Tensor
+    allowed: Tensor
     reached: Tensor
     lit: Tensor
 
@@ -50,6 +66,7 @@ class OccupancySampler(Sampler):
         update_every: Count = 16,
         warmup: int = 256,
         memory: Count = 8,
+        seen_by: int = 3,
         transparent: float = 1e-4,
         thin: float = 5e-3,
     ):
@@ -65,11 +82,13 @@ class OccupancySampler(Sampler):
         self.update_every = update_every
         self.warmup = warmup
         self.memory = memory
+        self.seen_by = seen_by
         self.transparent = transparent
         self.thin = thin
         cells = resolution**3
         self.register_buffer("thickness", torch.zeros(cells))
         self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
+        self.register_buffer("allowed", torch.ones(cells, dtype=torch.bool))
         self.register_buffer("reached", torch.zeros(cells, dtype=torch.int32))
         self.register_buffer("lit", torch.ones(cells, dtype=torch.bool))
         self.updates = 0
@@ -104,6 +123,25 @@ class OccupancySampler(Sampler):
         return samples
 
     @torch.no_grad()
+    def look_through(self, cameras: Cameras) -> None:
+        """Leaves cells empty for good whose middle fewer than `seen_by` cameras have in view."""
+        chosen = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS)).round().long()
+        n = self.resolution
+        cells = torch.arange(n**3)
+        unit = (torch.stack([cells // (n * n), cells // n % n, cells % n], dim=1) + 0.5) / n
+        bounds = self.bounds.to("cpu")
+        centres, near = bounds.to_world(unit), self.bounds.near or 0.0
+        count = torch.zeros(len(cells), dtype=torch.int32)
+        wanted = min(self.seen_by, len(chosen))
+        for camera in chosen:
+            open_ones = (count < wanted).nonzero()[:, 0]  # what is in view often enough needs no more looks
+            count[open_ones] += in_view(cameras[camera : camera + 1].to("cpu"), centres[open_ones], near).int()
+        allowed = count >= wanted
+        self.allowed.copy_(allowed if allowed.any() else torch.ones_like(allowed))
+        self.occupied &= self.allowed
+        self.lit &= self.allowed
+
+    @torch.no_grad()
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         self.updates, phase = divmod(step, self.update_every)
         self.look_everywhere = not phase
@@ -122,7 +160,7 @@ class OccupancySampler(Sampler):
         unit = ((corner + torch.rand(corner.shape, generator=generator, device=device)) / n).T
         found = torch.cat([density(part) for part in self.bounds.to_world(unit).split(MAX_ASKED)]) * self.step_length
         self.thickness[cells] = torch.maximum(self.thickness[cells] * self.decay, found)
-        occupied = self.thickness > min(self.threshold, 0.5 * float(self.thickness.mean()))
+        occupied = self.allowed & (self.thickness > min(self.threshold, 0.5 * float(self.thickness.mean())))
         # With no density anywhere there would be no samples, hence no gradient, for ever: look everywhere again.
-        self.occupied = occupied if occupied.any() else torch.ones_like(occupied)
+        self.occupied = occupied if occupied.any() else self.allowed.clone()
         self.lit = self.occupied & (self.reached >= self.updates - self.memory)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import InBounds, Rays
+from nerf_lightning.cameras import Cameras, InBounds, Rays
 from nerf_lightning.kernels import pack_intervals, points
 
 DensityFn = Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N"]]
@@ -65,6 +65,9 @@ class Sampler(InBounds):
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         raise TypeError(f"{type(self).__name__} must define forward(rays, density, generator) -> Samples")
+
+    def look_through(self, cameras: Cameras) -> None:
+        """Called before training with the cameras of the photos; samplers that leave out what none has in view do so here."""
 
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         """Called before each training step; samplers that learn where content is do so here."""

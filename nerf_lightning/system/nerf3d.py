@@ -39,6 +39,9 @@ class NeRF3D(System):
         self.sampler = sampler
         self.renderer = renderer
 
+    def on_fit_start(self) -> None:
+        self.sampler.look_through(self.trainer.datamodule.scene.train.cameras)  # type: ignore[attr-defined]
+
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
         replaced = self.field.grow(self.progress)
@@ -57,8 +60,9 @@ class NeRF3D(System):
         rendered = self.renderer(batch.rays, samples, self.field, backgrounds)
         loss = torch.nn.functional.mse_loss(rendered.rgb, batch.target(backgrounds))
         stats = StepStats(loss.detach().item(), len(batch.rays), len(samples))
-        penalty = self.field.penalty()
-        return loss if penalty is None else loss + penalty, stats
+        for penalty in (self.field.penalty(), rendered.penalty):
+            loss = loss if penalty is None else loss + penalty
+        return loss, stats
 
     def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
         generator = step_generator(self.seed, 1, self.global_step, self.device)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at
 from nerf_lightning.kernels import cell_index
 from nerf_lightning.sampler import OccupancySampler
 
@@ -186,3 +186,35 @@ def test_a_restored_sampler_goes_on_as_the_unbroken_one(stop: int):
             s(toward_the_cube(60, step), lambda x, to=asked: (to.append(x), solid(x))[1], seeded(step))
             taken.append(torch.cat(asked))
         assert torch.equal(taken[0], taken[-1]), step
+
+
+def test_what_too_few_cameras_have_in_view_stays_empty():
+    """Three cameras look along x from -4; a fourth, alone, looks along y: only what three see may hold anything."""
+    eyes = torch.tensor([[-4.0, -0.1, 0], [-4, 0, 0], [-4, 0.1, 0], [0, -4, 0]])
+    targets = torch.tensor([[0.0, -0.1, 0], [0, 0, 0], [0, 0.1, 0], [0, 0, 0]])
+    c2w = look_at(eyes, targets, torch.tensor([0.0, 0, 1]))
+    K = torch.tensor([[80.0, 0, 8], [0, 80, 8], [0, 0, 1]]).repeat(4, 1, 1)  # a beam of 0.4 at a distance of 4
+    sampler = OccupancySampler(CUBE, samples=100, resolution=16, seen_by=3)
+    sampler.look_through(Cameras(K, c2w, 16, 16))
+    sampler.update(0, lambda x: torch.full((len(x),), 10.0), seeded())
+    grid = sampler.occupied.view(16, 16, 16)
+    assert grid[:, 8, 8].all() and grid[2, 8, 8] and not grid[8, 0, 8] and not grid[8, 8, 0]
+    assert torch.equal(grid, sampler.allowed.view(16, 16, 16)) and sampler.lit.sum() <= grid.sum()
+    # Through the lone camera's beam nothing is found but where the others look too.
+    along_y = Rays(torch.tensor([[0.0, -4, 0]]), torch.tensor([[0.0, 1, 0]]))
+    found = sampler(along_y, lambda x: torch.full((len(x),), 1e-3)).positions(along_y)
+    assert len(found) and found[:, 1].abs().max() < 0.7
+    near = OccupancySampler(replace(CUBE, near=4.0), samples=100, resolution=16, seen_by=3)
+    near.look_through(Cameras(K, c2w, 16, 16))
+    assert not near.allowed.view(16, 16, 16)[2, 8, 8], "nearer than rays begin"
+
+
+def test_few_cameras_allow_what_all_of_them_see():
+    K = torch.tensor([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])[None]
+    c2w = look_at(torch.tensor([[-4.0, 0, 0]]), torch.zeros(1, 3), torch.tensor([0.0, 0, 1]))
+    sampler = OccupancySampler(CUBE, resolution=8, seen_by=3)
+    sampler.look_through(Cameras(K, c2w, 16, 16))
+    assert sampler.allowed.all()
+    away = look_at(torch.tensor([[-4.0, 0, 0]]), torch.tensor([[-9.0, 0, 0]]), torch.tensor([0.0, 0, 1]))
+    sampler.look_through(Cameras(K, away, 16, 16))
+    assert sampler.allowed.all(), "a view of nothing must not leave nothing to train"

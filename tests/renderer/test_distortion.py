@@ -1,0 +1,48 @@
+import pytest
+import torch
+
+from nerf_lightning.renderer.distortion import distortion
+from nerf_lightning.sampler import Samples
+
+
+def packed(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, Samples]:
+    """Densities of rays with so many samples each, in double precision."""
+    generator = torch.Generator().manual_seed(seed)
+    edges = [0.2 + torch.rand(n + 1, generator=generator, dtype=torch.float64).cumsum(0) for n in counts]
+    t = torch.cat([(e[1:] + e[:-1]) / 2 for e in edges])
+    dt = torch.cat([e.diff() for e in edges])
+    ray = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
+    offsets = torch.tensor([0, *counts]).cumsum(0)
+    return torch.rand(len(t), generator=generator, dtype=torch.float64), Samples(t, dt, ray, offsets)
+
+
+def by_pairs(density: torch.Tensor, samples: Samples, scale: float) -> torch.Tensor:
+    """The formula as it stands in the paper, ray by ray and pair by pair."""
+    total = torch.zeros((), dtype=torch.float64)
+    for first, last in zip(samples.offsets[:-1].tolist(), samples.offsets[1:].tolist(), strict=True):
+        t, dt, thickness = (x[first:last] for x in (samples.t, samples.dt, density * samples.dt))
+        through = torch.exp(-torch.cat([thickness.new_zeros(1), thickness.cumsum(0)]))[: last - first]
+        w, s, width = through * (1 - torch.exp(-thickness)), t / (t + scale), dt * scale / (t + scale) ** 2
+        total = total + (w[:, None] * w * (s[:, None] - s).abs()).sum() + (w**2 * width).sum() / 3
+    return total / (len(samples.offsets) - 1)
+
+
+@pytest.mark.parametrize("counts", [[5, 1, 7], [0, 4, 0, 3, 0], [6]])
+def test_the_fast_sum_is_the_sum_over_pairs(counts: list[int]):
+    density, samples = packed(counts)
+    density.requires_grad_()
+    fast, slow = distortion(density, samples, 0.7), by_pairs(density, samples, 0.7)
+    torch.testing.assert_close(fast, slow)
+    torch.testing.assert_close(torch.autograd.grad(fast, density), torch.autograd.grad(slow, density))
+
+
+def test_gathered_weight_costs_less_than_fog():
+    _, samples = packed([40])
+    fog, wall = torch.full((40,), 0.1, dtype=torch.float64), torch.zeros(40, dtype=torch.float64)
+    wall[20] = 100.0
+    assert distortion(wall, samples, 1.0) < 0.1 * distortion(fog, samples, 1.0)
+
+
+def test_no_samples_cost_nothing():
+    density, samples = packed([0, 0])
+    assert distortion(density, samples, 1.0) == 0
