@@ -1,6 +1,7 @@
 """From configuration to objects. Nothing else in the package instantiates from a config."""
 
 import inspect
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,34 +80,52 @@ def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> A
     found = target_of(cfg, "model") if cfg.get("model") is not None else None
     if not (inspect.isclass(found) and issubclass(found, kind)):
         name = getattr(found, "__name__", "nothing")
-        advice = "model=hashgrid or model=mlp" if kind is Field else "model=picture_mlp"
+        advice = "model=hashgrid or model=mlp" if kind is Field else "model=hashgrid2d or model=picture_mlp"
         raise InputError("config", "model", name, f"a field of {dimensions} for this dataset", f"choose {advice}")
     return make(cfg, "model", **extra)
 
 
-def build_system(cfg: DictConfig, scene_frame: "SceneFrame | None") -> System:
-    """The LightningModule: NeRF3D for a scene's frame, NeRF2D for a picture (None)."""
+def build_system(cfg: DictConfig, frame: "Frame") -> System:
+    """The LightningModule: NeRF3D for a scene's frame, NeRF2D for a picture's."""
     optimizer = make(cfg, "optimizer")
     try:
         optimizer([torch.zeros(1)])  # a rate below zero is told now, not when training starts
     except (ValueError, TypeError, RuntimeError) as error:
         raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
     common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed}
-    if scene_frame is None:
-        return NeRF2D(build_field(cfg, PictureField, "two coordinates"), **common)
-    bounds, background = scene_frame
-    field = build_field(cfg, Field, "three coordinates", bounds=bounds)
-    sampler = make(cfg, "sampler", bounds=bounds)
-    renderer = make(cfg, "renderer", scene_background=background, half_size=float(bounds.half_size.min()))
+    if isinstance(frame, PictureFrame):
+        return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
+    field = build_field(cfg, Field, "three coordinates", bounds=frame.bounds)
+    sampler = make(cfg, "sampler", bounds=frame.bounds)
+    half_size = float(frame.bounds.half_size.min())
+    renderer = make(cfg, "renderer", scene_background=frame.background, half_size=half_size)
     return NeRF3D(field, sampler, renderer, **common)
 
 
-SceneFrame = tuple[Bounds, tuple[float, float, float]]
-"""What a 3D system takes from its scene: where it is, and the colour behind it."""
+@dataclass(frozen=True)
+class SceneFrame:
+    """What a 3D system takes from its scene: where it is, and the colour behind it."""
+
+    bounds: Bounds
+    background: tuple[float, float, float]
 
 
-def frame_of(data: RayDataModule | PixelDataModule) -> SceneFrame | None:
-    return None if isinstance(data, PixelDataModule) else (data.scene.bounds, data.scene.background)
+@dataclass(frozen=True)
+class PictureFrame:
+    """What a 2D system takes from its picture: pixels along each side."""
+
+    width: int
+    height: int
+
+
+Frame = SceneFrame | PictureFrame
+
+
+def frame_of(data: RayDataModule | PixelDataModule) -> Frame:
+    """What a system takes from the data."""
+    if isinstance(data, PixelDataModule):
+        return PictureFrame(*data.scene.size)
+    return SceneFrame(data.scene.bounds, data.scene.background)
 
 
 def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, system: System) -> None:

@@ -19,7 +19,7 @@ import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.build import build_system, resolved
+from nerf_lightning.build import Frame, PictureFrame, SceneFrame, build_system, resolved
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
@@ -141,10 +141,13 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
     path = folder / "scene.json"
     try:
         scene = json.loads(path.read_text())
-        frame, orbit = None, None
-        if "aabb" in scene:
+        frame: Frame
+        if "aabb" not in scene:
+            frame, orbit = PictureFrame(*map(int, scene["resolution"])), None
+        else:
             bounds = Bounds(torch.tensor(scene["aabb"]), scene["unbounded"], scene["near"], scene["far"])
-            frame = (bounds, tuple(scene["background"]))
+            red, green, blue = map(float, scene["background"])
+            frame = SceneFrame(bounds, (red, green, blue))
             view = scene["orbit"]
             orbit = Cameras(torch.tensor(view["K"]), torch.tensor(view["c2w"]), view["width"], view["height"])
     except FileNotFoundError as error:

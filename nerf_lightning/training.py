@@ -23,7 +23,7 @@ from nerf_lightning.kernels import use_kernels
 from nerf_lightning.options import AtLeast, Count, check_options
 from nerf_lightning.run_folder import load_config, read_checkpoint, save_config, save_scene
 from nerf_lightning.seeding import step_generator
-from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.system import NeRF2D, NeRF3D, System
 
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
@@ -85,12 +85,14 @@ def prepare_process(seed: Annotated[int, AtLeast(0)], threads: Count | None, ker
 
 def warm_up(system: System, data: RayDataModule | PixelDataModule) -> None:
     """Runs a small step on a copy, so that kernels are compiled before the clock starts (half a minute the first time)."""
-    if not isinstance(system, NeRF3D) or isinstance(data, PixelDataModule):
-        return
     with Console().status("getting the kernels ready (the first time they are compiled: half a minute)"):
         trial = copy.deepcopy(system)
-        batch = draw_rays(data.scene.train, 64, step_generator(0, 0, 0))
-        trial.loss(batch, step_generator(0, 1, 0), 1)[0].backward()  # step 1: without a look at the whole grid
+        if isinstance(trial, NeRF3D):
+            assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
+            batch = draw_rays(data.scene.train, 64, step_generator(0, 0, 0))
+            trial.loss(batch, step_generator(0, 1, 0), 1)[0].backward()  # step 1: without a look at the whole grid
+        elif isinstance(trial, NeRF2D):
+            trial.field(torch.rand(64, 2, generator=step_generator(0, 0, 0))).sum().backward()
 
 
 def written(trainer: L.Trainer) -> dict[str, Any]:

@@ -30,7 +30,7 @@ def a_scene_for(small_scene: tuple[Path, Scene], tmp_path_factory: pytest.TempPa
     path, _ = small_scene
 
     def overrides(experiment: str) -> list[str]:
-        if experiment in ("picture", "smoke_2d"):
+        if experiment.startswith("picture") or experiment == "smoke_2d":
             return ["dataset.max_side=24"]
         if experiment == "smoke_3d":
             return ["dataset.size=24"]
@@ -52,7 +52,7 @@ def test_the_courses_recipe(tmp_path: Path):
     }  # fmt: skip
     assert (cfg.optimizer._target_, cfg.optimizer.lr) == ("torch.optim.Adam", 5e-4)
     assert (cfg.dataset.rays, cfg.dataset.samples, cfg.sampler.samples) == (4096, None, 64)
-    cfg = composed(["+experiment=picture"], tmp_path)
+    cfg = composed(["+experiment=picture_mlp"], tmp_path)
     assert (cfg.dataset.pixels, cfg.optimizer.lr, cfg.model.frequencies, cfg.model.width) == (10_000, 1e-2, 10, 256)
 
 
@@ -70,10 +70,11 @@ def test_experiment(experiment: str, a_scene_for, tmp_path: Path):
     [(group, path.stem) for group in GROUPS for path in sorted((cli.conf_dir() / group).glob("*.yaml"))],
 )
 def test_every_option_of_every_group_runs(group: str, option: str, tmp_path: Path):
-    experiment = "smoke_2d" if option == "picture_mlp" else "smoke_3d"
+    flat = option in ("picture_mlp", "hashgrid2d", "fourier", "siren")
+    experiment = "picture" if flat else "smoke_3d"
     chosen = f"{group}={option}"
-    small = ["dataset.max_side=24"] if experiment == "smoke_2d" else ["dataset.size=24"]
-    if group == "model" and option not in ("hashgrid", "picture_mlp"):
+    small = ["dataset.max_side=24"] if flat else ["dataset.size=24"]
+    if group == "model" and option != "hashgrid" and not flat:
         # The experiment's own deltas speak of the hash grid. Few cells and pictures: the original network is slow.
         few = ["sampler.resolution=16", "dataset.size=24", "dataset.train_views=4", "dataset.val_views=1"]
         cfg = composed([chosen, *few, "callbacks.orbit.frames=2"], tmp_path)

@@ -4,7 +4,7 @@ from typing import TypeVar
 
 import lightning as L
 
-from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.dataset import Picture, PixelDataModule, RayDataModule
 
 Kind = TypeVar("Kind", bound=L.Callback)
 
@@ -17,3 +17,10 @@ def attached(trainer: L.Trainer, kind: type[Kind]) -> Kind | None:
 def data_of(trainer: L.Trainer) -> RayDataModule | PixelDataModule:
     """The data module of the run."""
     return trainer.datamodule  # type: ignore[attr-defined]
+
+
+def picture_of(trainer: L.Trainer) -> Picture:
+    """What a 2D run is fitted to."""
+    scene = data_of(trainer).scene
+    assert isinstance(scene, Picture)  # NeRF2D trains on nothing else
+    return scene

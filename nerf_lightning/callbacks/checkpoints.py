@@ -9,6 +9,7 @@ from typing import Any
 import lightning as L
 
 from nerf_lightning.callbacks.attached import attached
+from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut, evenly
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic
@@ -36,7 +37,8 @@ class Checkpoints(L.Callback):
         self._tested: list[float] = []
 
     def save(self, trainer: L.Trainer, name: str) -> None:
-        with atomic(Path(trainer.default_root_dir) / self.folder / name) as temporary:
+        path = Path(trainer.default_root_dir) / self.folder / name
+        with Budget.of(trainer).paused(), atomic(path) as temporary:
             trainer.save_checkpoint(temporary)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:

@@ -81,8 +81,9 @@ class Results(L.Callback):
         if broken:
             self.write(trainer, pl_module, "collapsed", f"{broken[0]} is no longer finite")
         elif quality < plain + NO_BETTER:
+            found = pl_module.diagnose(data_of(trainer).held_out(0).to(pl_module.device))
             diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
-            self.write(trainer, pl_module, "collapsed", diagnosis)
+            self.write(trainer, pl_module, "collapsed", f"{diagnosis}: {found}" if found else diagnosis)
         else:
             self.write(trainer, pl_module, stopped, "")
         if trainer.logger is not None:

@@ -7,9 +7,12 @@ import lightning as L
 
 from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.panels import result_panel, write_png
+from nerf_lightning.callbacks.panels import narrowed, result_panel, to_bytes, write_png
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
+
+LOGGED_WIDTH = 640
+"""Most pixels across in TensorBoard, which takes a tenth of a second a megabyte."""
 
 
 def log_spaced(step: int) -> bool:
@@ -21,17 +24,23 @@ def log_spaced(step: int) -> bool:
 class Snapshots(L.Callback):
     """Writes truth, render and depth of one held-out view as PNG and to TensorBoard, and once more at the end.
 
+    The latest render alone stands in `final`.
+
     Args:
         folder: where the PNGs go, below the run folder.
         steps: after which steps; None means 10, 20, 50, 100, 200, 500, ...
         view: index of the held-out view.
+        final: the latest render, below the run folder.
 
     Raises:
         InputError: at the start of training, where there is no such view.
     """
 
-    def __init__(self, folder: str = "snapshots", steps: list[int] | None = None, view: int = 0):
+    def __init__(
+        self, folder: str = "snapshots", steps: list[int] | None = None, view: int = 0, final: str = "final.png"
+    ):
         self.folder = folder
+        self.final = final
         self.steps = None if steps is None else frozenset(steps)
         self.view = view
 
@@ -50,8 +59,12 @@ class Snapshots(L.Callback):
             caption = f"{data.scene.name}, step {step}, {Budget.of(trainer).seconds:.0f} s, {result.psnr:.2f} dB"
             picture = result_panel(result, caption)
             write_png(Path(trainer.default_root_dir) / self.folder / f"step_{step:07d}.png", picture)
+            write_png(Path(trainer.default_root_dir) / self.final, to_bytes(result.rgb))
             if isinstance(trainer.logger, L.pytorch.loggers.TensorBoardLogger):
-                trainer.logger.experiment.add_image("snapshot", picture, step, dataformats="HWC")
+                trainer.logger.experiment.add_image(
+                    "snapshot", narrowed(picture, LOGGED_WIDTH), step, dataformats="HWC"
+                )
+                trainer.logger.experiment.flush()  # in the pause: TensorBoard's own thread would take its time from training
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int

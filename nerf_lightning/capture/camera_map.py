@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nerf_lightning.capture.geometry import move
-from nerf_lightning.capture.ink import BLUE, DPI, GREY, ORANGE, VERMILLION
 from nerf_lightning.capture.outputs import Placed
 from nerf_lightning.capture.run import Capture
 from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.ink import BLUE, DPI, GREY, ORANGE, VERMILLION
 
 FRUSTUM = 0.06
 """Height of a camera's pyramid as a share of the map's width."""

@@ -12,9 +12,9 @@ from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 
 from nerf_lightning.capture.detect import THREADS
-from nerf_lightning.capture.ink import DPI, FONT, ORANGE, SKY, VERMILLION, readable, rgb
 from nerf_lightning.capture.outcome import Outcome, thinned
 from nerf_lightning.dataset.decode import read_pixels
+from nerf_lightning.ink import DPI, FONT, ORANGE, SKY, VERMILLION, readable, rgb
 
 WIDTH = 2400
 """Of a sheet, pixels."""

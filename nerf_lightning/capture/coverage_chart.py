@@ -10,8 +10,8 @@ from matplotlib.patches import Polygon
 from nerf_lightning.capture.bundle import LENS_PARAMETERS, lens_vector
 from nerf_lightning.capture.calibrate import Calibration
 from nerf_lightning.capture.geometry import project
-from nerf_lightning.capture.ink import BLUE, DPI, GREY, SKY, as_picture, magnification
 from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.ink import BLUE, DPI, GREY, SKY, as_picture, magnification
 
 UNITS = {"focal": "px", "cx": "px", "cy": "px"}
 

@@ -7,7 +7,9 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from nerf_lightning.capture.ink import (
+from nerf_lightning.capture.outcome import Outcome, thinned
+from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.ink import (
     BLUE,
     DPI,
     FONT,
@@ -18,8 +20,6 @@ from nerf_lightning.capture.ink import (
     readable,
     shortened,
 )
-from nerf_lightning.capture.outcome import Outcome, thinned
-from nerf_lightning.dataset.lens import Lens
 
 NAMES = 60
 """Photos whose names fit below the bars."""

@@ -9,12 +9,12 @@ from nerf_lightning.capture.camera_map import camera_map, tag_corners
 from nerf_lightning.capture.contact_sheet import contact_sheet
 from nerf_lightning.capture.coverage_chart import coverage_chart
 from nerf_lightning.capture.error_chart import error_chart
-from nerf_lightning.capture.ink import pixels_of
 from nerf_lightning.capture.outcome import calibration_outcomes, photo_outcomes
 from nerf_lightning.capture.outputs import Placed
 from nerf_lightning.capture.run import Capture
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.files import atomic
+from nerf_lightning.ink import pixels_of
 
 
 def write_report(capture: Capture, folder: Path) -> list[Path]:

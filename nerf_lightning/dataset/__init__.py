@@ -6,7 +6,7 @@ from nerf_lightning.dataset.nerfstudio import load_nerfstudio
 from nerf_lightning.dataset.npz import load_npz, save_npz
 from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
-from nerf_lightning.dataset.pixels import Picture, PictureBatch, PixelBatch, PixelDataModule
+from nerf_lightning.dataset.pixels import Picture, PictureBatch, PixelBatch, PixelDataModule, pixel_grid
 from nerf_lightning.dataset.rays import RayBatch, RayDataModule, ViewBatch, draw_rays
 from nerf_lightning.dataset.scene import Scene, Views
 from nerf_lightning.dataset.sources import from_bricks, from_download, from_photos, from_picture
@@ -32,6 +32,7 @@ __all__ = [
     "load_nerfstudio",
     "load_npz",
     "load_picture",
+    "pixel_grid",
     "open_scene",
     "save_npz",
 ]

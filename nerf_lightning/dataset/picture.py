@@ -8,18 +8,13 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.dataset.decode import read_pixels
-from nerf_lightning.dataset.resize import area_resize, fit_size
 
 SUN = (0.66, 0.30)
 """Where the built-in picture's sun stands, as a share of its width and height."""
 
 
-def load_picture(path: Path, max_side: int | None = None) -> UInt8[Tensor, "H W 3"]:
+def load_picture(path: Path) -> UInt8[Tensor, "H W 3"]:
     """Reads a PNG, JPEG or TIFF as 8-bit sRGB: EXIF rotation applied, 16 bits halved, grey spread, alpha over white.
-
-    Args:
-        path: the file.
-        max_side: longest side in pixels after averaging, if smaller than the picture.
 
     Raises:
         InputError: missing, truncated, not a picture, or of floating-point pixels.
@@ -28,8 +23,7 @@ def load_picture(path: Path, max_side: int | None = None) -> UInt8[Tensor, "H W 
     if pixels.shape[2] == 4:
         alpha = pixels[..., 3:].astype(np.float32) / 255
         pixels = np.rint(pixels[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
-    height, width = pixels.shape[:2]
-    return torch.from_numpy(area_resize(pixels, *fit_size(width, height, max_side)))
+    return torch.from_numpy(pixels)
 
 
 def builtin_picture(size: int = 256) -> UInt8[Tensor, "size size 3"]:

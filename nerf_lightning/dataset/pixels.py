@@ -1,6 +1,7 @@
 """PixelDataModule: places in a picture and their colours."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import lightning as L
@@ -13,6 +14,10 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.seeding import step_generator
 
 
+def unknown(width: int, height: int) -> None:
+    """For pictures of which there is nothing larger."""
+
+
 @dataclass(frozen=True)
 class Picture:
     """One picture to fit."""
@@ -21,6 +26,14 @@ class Picture:
     source: str
     image: UInt8[Tensor, "H W 3"]
     """sRGB."""
+    at: Callable[[int, int], UInt8[Tensor, "h w 3"] | None] = unknown
+    """Width, height -> what the picture truly looks like at that size, None where it is not known."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        height, width, _ = self.image.shape
+        return width, height
 
     def sha256(self) -> str:
         """A fingerprint of the pixels."""
@@ -28,13 +41,12 @@ class Picture:
 
     def describe(self) -> dict[str, object]:
         """Which picture this is, for results.json."""
-        height, width, _ = self.image.shape
         return {
             "name": self.name,
             "source": self.source,
             "sha256": self.sha256(),
             "views": {"train": 1, "val": 1},
-            "resolution": [width, height],
+            "resolution": list(self.size),
         }
 
 
@@ -61,11 +73,20 @@ class PictureBatch(PixelBatch):
         return PictureBatch(self.uv.to(device), self.rgb.to(device), self.height, self.width)
 
 
+def centres(height: int, width: int, index: Int[Tensor, "N"]) -> Float[Tensor, "N 2"]:
+    """The centres of pixels with the given row-major indices, see `PixelBatch`."""
+    return torch.stack([(index % width + 0.5) / width, (index // width + 0.5) / height], dim=-1)
+
+
+def pixel_grid(height: int, width: int) -> Float[Tensor, "N 2"]:
+    """The centres of all pixels, row by row."""
+    return centres(height, width, torch.arange(height * width))
+
+
 def pixels_at(image: UInt8[Tensor, "H W 3"], index: Int[Tensor, "N"]) -> PixelBatch:
     """The pixels with the given row-major indices."""
     height, width, _ = image.shape
-    uv = torch.stack([(index % width + 0.5) / width, (index // width + 0.5) / height], dim=-1)
-    return PixelBatch(uv, image.view(-1, 3)[index].float() / 255)
+    return PixelBatch(centres(height, width, index), image.view(-1, 3)[index].float() / 255)
 
 
 class PixelDataModule(L.LightningDataModule):

@@ -4,13 +4,19 @@ import logging
 import os
 import shutil
 import urllib.request
+from functools import partial
 from pathlib import Path
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
 
 from nerf_lightning.dataset.bricks import bricks
 from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PixelDataModule
 from nerf_lightning.dataset.rays import RayDataModule
+from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.files import atomic
 from nerf_lightning.options import Count
 
@@ -98,10 +104,29 @@ def _download(url: str, target: Path) -> None:
 def from_picture(
     path: str | None = None, max_side: Count | None = None, pixels: Count = 10_000, seed: int = 0
 ) -> PixelDataModule:
-    """A picture from a file, or the built-in one, see `load_picture` and `PixelDataModule`."""
+    """A picture from a file, or the built-in one, see `load_picture` and `PixelDataModule`.
+
+    Args:
+        path: the file, or None.
+        max_side: longest side in pixels after averaging, if smaller than the picture; the built-in one is made at this size.
+        pixels, seed: see `PixelDataModule`.
+    """
     if path is None:
-        picture = Picture("sunset", "built-in", builtin_picture(max_side or 256))
+        # Square, and drawn from formulas: it is known at any size.
+        picture = Picture(
+            "sunset", "built-in", builtin_picture(max_side or 256), lambda width, _: builtin_picture(width)
+        )
     else:
         source = Path(path)
-        picture = Picture(source.stem.lower(), os.fspath(source), load_picture(source, max_side))
+        original = load_picture(source)
+        height, width = original.shape[:2]
+        image = torch.from_numpy(area_resize(original.numpy(), *fit_size(width, height, max_side)))
+        picture = Picture(source.stem.lower(), os.fspath(source), image, partial(no_larger_than, original))
     return PixelDataModule(picture, pixels, seed)
+
+
+def no_larger_than(original: UInt8[Tensor, "H W 3"], width: int, height: int) -> UInt8[Tensor, "h w 3"] | None:
+    """A picture averaged to a size, None where it has fewer pixels itself."""
+    if width > original.shape[1] or height > original.shape[0]:
+        return None
+    return torch.from_numpy(area_resize(original.numpy(), width, height))

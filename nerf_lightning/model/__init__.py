@@ -4,18 +4,22 @@ from nerf_lightning.model.activation import density_activation, truncated_exp
 from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import Field, PictureField
 from nerf_lightning.model.hashgrid import HashGrid, HashGridField
+from nerf_lightning.model.hashgrid2d import HashGrid2DField
 from nerf_lightning.model.mlp import MLPField
-from nerf_lightning.model.picture import PictureMLP
+from nerf_lightning.model.picture import FourierField, PictureMLP, SirenField
 from nerf_lightning.model.tensorf import TensoRFField, VectorMatrix
 from nerf_lightning.model.voxels import VoxelField
 
 __all__ = [
     "Field",
+    "FourierField",
     "HashGrid",
+    "HashGrid2DField",
     "HashGridField",
     "MLPField",
     "PictureField",
     "PictureMLP",
+    "SirenField",
     "TensoRFField",
     "VectorMatrix",
     "VoxelField",

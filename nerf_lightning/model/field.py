@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, InBounds
+from nerf_lightning.errors import InputError
 
 
 def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
@@ -59,8 +60,32 @@ class Field(InBounds):
 
 
 class PictureField(torch.nn.Module):
-    """A picture as a function of place: subclasses define `forward`."""
+    """A picture as a function of place: subclasses define `forward`.
+
+    Args:
+        size: width and height of the picture in pixels, from which a field takes how fine it must be.
+        rate: factor on the learning rate, so that one rate serves fields of every kind.
+
+    Raises:
+        InputError: where rate is not above 0.
+    """
+
+    def __init__(self, size: tuple[int, int], rate: float = 1.0):
+        super().__init__()
+        if not rate > 0:
+            raise InputError("model.rate", "", str(rate), "above 0")
+        self.size = size
+        self.rate = rate
+
+    @property
+    def nyquist(self) -> float:
+        """The highest frequency that the pixels can show, in cycles over the picture's longer side."""
+        return max(self.size) / 2
+
+    def centred(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:
+        """Places with the picture's centre at the origin and its longer side from -1 to 1: pixels stay square."""
+        return (2 * uv - 1) * uv.new_tensor([side / max(self.size) for side in self.size])
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-        """Places in [0, 1]^2 (x right, y down) -> rgb in [0, 1]."""
+        """Places in [0, 1]^2 (x right, y down) -> rgb, in [0, 1] or near it."""
         raise TypeError(f"{type(self).__name__} must define forward(uv)")

@@ -1,31 +1,125 @@
-"""A picture as a small network of encoded coordinates."""
+"""Pictures as networks of encoded coordinates: sinusoids of every octave, random sinusoids, or sinusoidal layers."""
+
+import math
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import PictureField
 from nerf_lightning.options import Count
+
+
+def rectified(sizes: list[int]) -> torch.nn.Sequential:
+    """Fully connected layers of the given widths with rectifiers between them."""
+    parts: list[torch.nn.Module] = [torch.nn.Linear(sizes[0], sizes[1])]
+    for inputs, outputs in zip(sizes[1:-1], sizes[2:], strict=True):
+        parts += [torch.nn.ReLU(), torch.nn.Linear(inputs, outputs)]
+    return torch.nn.Sequential(*parts)
 
 
 class PictureMLP(PictureField):
     """Sinusoidal encoding, then a plain network (the course's NeRF2D).
 
     Args:
-        frequencies: octaves L of the encoding; 0 feeds the bare coordinates.
+        size: see `PictureField`.
+        frequencies: octaves L of the encoding; 0 feeds the bare coordinates; None takes the octaves up to the picture's own
+            limit, one cycle in two pixels.
         width: neurons of each hidden layer.
         depth: hidden layers.
     """
 
-    def __init__(self, frequencies: int = 10, width: Count = 256, depth: Count = 3):
-        super().__init__()
+    def __init__(self, size: tuple[int, int], frequencies: int | None = 10, width: Count = 256, depth: Count = 3):
+        super().__init__(size)
+        if frequencies is None:
+            # The last octave has 2^(L-1) / 2 cycles over the picture, and `nyquist` is the most that its pixels can show.
+            frequencies = 1 + max(0, round(math.log2(2 * self.nyquist)))
+        if frequencies < 0:
+            raise InputError(
+                "model.frequencies", "", str(frequencies), "0 or more, or null to take them from the picture"
+            )
         self.frequencies = frequencies
-        sizes = [2 * (1 + 2 * frequencies)] + [width] * depth
-        hidden = [
-            m for a, b in zip(sizes[:-1], sizes[1:], strict=True) for m in (torch.nn.Linear(a, b), torch.nn.ReLU())
-        ]
-        self.net = torch.nn.Sequential(*hidden, torch.nn.Linear(sizes[-1], 3))
+        self.net = rectified([2 * (1 + 2 * frequencies), *[width] * depth, 3])
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         return torch.sigmoid(self.net(sinusoidal(uv, self.frequencies)))
+
+
+class FourierField(PictureField):
+    """Sinusoids of random frequency and direction, then a plain network (Tancik et al. 2020, section 4 and 6.1).
+
+    Args:
+        size: see `PictureField`.
+        features: how many random frequencies; each gives a sine and a cosine.
+        spread: standard deviation of the frequencies, as a share of the highest one the picture's pixels can show.
+        width: neurons of each hidden layer.
+        depth: hidden layers.
+        rate: factor on the learning rate.
+
+    Raises:
+        InputError: where spread or rate are not above 0.
+    """
+
+    def __init__(
+        self,
+        size: tuple[int, int],
+        features: Count = 256,
+        spread: float = 0.1,
+        width: Count = 256,
+        depth: Count = 3,
+        rate: float = 1.0,
+    ):
+        super().__init__(size, rate)
+        if not spread > 0:
+            raise InputError("model.spread", "", str(spread), "above 0")
+        self.cycles: Tensor
+        """[2, features], over the picture's longer side; the seed decides them, and checkpoints keep them."""
+        self.register_buffer("cycles", torch.randn(2, features) * spread * self.nyquist)
+        self.net = rectified([2 * features, *[width] * depth, 3])
+
+    def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+        angles = math.pi * self.centred(uv) @ self.cycles  # the longer side is 2 units long
+        return torch.sigmoid(self.net(torch.cat([angles.sin(), angles.cos()], dim=1)))
+
+
+class SirenField(PictureField):
+    """A network with sines for activations (SIREN, Sitzmann et al. 2020, section 3.2 and supplement 1.5).
+
+    Args:
+        size: see `PictureField`.
+        width: neurons of each hidden layer.
+        depth: hidden layers.
+        reach: angular frequency of the first layer as a share of the highest one the pixels can show; 0.075 gives the paper's
+            30 for a picture of 256 pixels.
+        rate: factor on the learning rate.
+
+    Raises:
+        InputError: where reach or rate are not above 0.
+    """
+
+    HIDDEN_FREQUENCY = 30.0  # omega_0 of the later layers, which the paper keeps whatever the signal
+
+    def __init__(
+        self, size: tuple[int, int], width: Count = 256, depth: Count = 3, reach: float = 0.15, rate: float = 0.1
+    ):
+        super().__init__(size, rate)
+        if not reach > 0:
+            raise InputError("model.reach", "", str(reach), "above 0")
+        # In radians a unit, and the longer side is 2 units long: at most pi * nyquist.
+        self.first_frequency = reach * math.pi * self.nyquist
+        widths = [2, *[width] * depth]
+        self.hidden = torch.nn.ModuleList(torch.nn.Linear(i, o) for i, o in zip(widths[:-1], widths[1:], strict=True))
+        self.last = torch.nn.Linear(width, 3)
+        with torch.no_grad():
+            for index, layer in enumerate([*self.hidden, self.last]):
+                inputs = layer.weight.shape[1]
+                bound = 1 / inputs if index == 0 else math.sqrt(6 / inputs) / self.HIDDEN_FREQUENCY
+                layer.weight.uniform_(-bound, bound)
+
+    def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+        h = self.centred(uv)
+        for index, layer in enumerate(self.hidden):
+            h = torch.sin((self.first_frequency if index == 0 else self.HIDDEN_FREQUENCY) * layer(h))
+        return 0.5 + 0.5 * self.last(h)  # the paper's outputs lie around 0; what leaves [0, 1] is cut where it is shown

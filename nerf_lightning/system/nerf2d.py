@@ -1,6 +1,7 @@
 """NeRF2D: fit a picture with a coordinate network."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.dataset import PictureBatch, PixelBatch
@@ -23,6 +24,12 @@ class NeRF2D(System):
         super().__init__(optimizer, schedule, seed)
         self.field = field
 
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        optimizer = super().configure_optimizers()
+        for group in optimizer.param_groups:
+            group["initial_lr"] = group["lr"] = group["lr"] * self.field.rate
+        return optimizer
+
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
         loss = torch.nn.functional.mse_loss(self.field(batch.uv), batch.rgb)
         self.stats = StepStats(loss.detach().item(), len(batch.uv), len(batch.uv))
@@ -32,4 +39,33 @@ class NeRF2D(System):
         return view.rgb
 
     def show(self, view: PictureBatch) -> tuple[Tensor, None, None]:
-        return torch.cat([self.field(part) for part in view.uv.split(RENDER_CHUNK)]), None, None
+        return self.colours(view.uv), None, None
+
+    @torch.no_grad()
+    def colours(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+        """The field's colours at any places, a chunk at a time, cut to [0, 1]."""
+        return torch.cat([self.field(part).clamp(0, 1) for part in uv.split(RENDER_CHUNK)])
+
+    def diagnose(self, view: PictureBatch) -> str:
+        rgb = self.colours(view.uv)
+        if (rgb.amax(0) - rgb.amin(0)).max() > 1 / 255:
+            return ""
+        dead = dead_rectifiers(self.field, view.uv)
+        if not dead:
+            return "every place gets the same colour"
+        return (
+            f"every place gets the same colour; {max(dead):.0%} of a layer's rectifiers are off wherever one looks, so no "
+            f"gradient reaches them; a lower learning rate keeps them alive"
+        )
+
+
+@torch.no_grad()
+def dead_rectifiers(field: PictureField, uv: Float[Tensor, "N 2"]) -> list[float]:
+    """For each layer of rectifiers of a field, the share that is off at every place."""
+    alive: list[Tensor] = []
+    layers = [module for module in field.modules() if isinstance(module, torch.nn.ReLU)]
+    hooks = [layer.register_forward_hook(lambda _, __, out: alive.append((out > 0).any(0))) for layer in layers]
+    field(uv[:: max(1, len(uv) // RENDER_CHUNK)])
+    for hook in hooks:
+        hook.remove()
+    return [1 - float(units.float().mean()) for units in alive]

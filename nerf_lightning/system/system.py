@@ -85,6 +85,10 @@ class System(L.LightningModule):
         """The colours the field gives a whole-view batch, with depth and opacity where it has them."""
         raise TypeError(f"{type(self).__name__} must define show(view)")
 
+    def diagnose(self, view: Any) -> str:
+        """What is wrong with a field that has learned nothing, in words; "" where nothing is known."""
+        return ""
+
     @torch.no_grad()
     def evaluate(self, view: Any) -> ViewResult:
         """Renders a whole view and judges it."""

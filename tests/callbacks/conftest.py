@@ -35,7 +35,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 class Grey(PictureField):
     def __init__(self):
-        super().__init__()
+        super().__init__((16, 12))
         self.level = torch.nn.Parameter(torch.tensor(0.5))
 
     def forward(self, uv: torch.Tensor) -> torch.Tensor:

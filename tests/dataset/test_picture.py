@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.dataset import builtin_picture, load_picture
+from nerf_lightning.dataset import builtin_picture, from_picture, load_picture
 from nerf_lightning.dataset.decode import read_pixels
 from nerf_lightning.errors import InputError
 
@@ -113,9 +113,10 @@ def test_kinds_of_png(kind: str, tmp_path: Path):
 def test_max_side_averages(tmp_path: Path):
     stripes = np.zeros((20, 40, 3), np.uint8)
     stripes[:, ::2] = 200
-    picture = load_picture(write_rgb(tmp_path / "a.png", stripes), max_side=20)
+    path = str(write_rgb(tmp_path / "a.png", stripes))
+    picture = from_picture(path, max_side=20).scene.image
     assert picture.shape == (10, 20, 3) and (picture == 100).all()
-    assert load_picture(tmp_path / "a.png", max_side=99).shape == (20, 40, 3)
+    assert from_picture(path, max_side=99).scene.image.shape == (20, 40, 3)
 
 
 def test_truncated_jpeg_with_a_whole_thumbnail(red_then_blue: np.ndarray, tmp_path: Path):

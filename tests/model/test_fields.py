@@ -116,7 +116,7 @@ def test_an_unknown_density_is_refused(make):
 
 @pytest.mark.parametrize(("frequencies", "depth"), [(0, 1), (4, 3)])
 def test_a_picture_field_gives_colours(frequencies: int, depth: int):
-    field = PictureMLP(frequencies, width=16, depth=depth)
+    field = PictureMLP((64, 48), frequencies, width=16, depth=depth)
     rgb = field(torch.rand(30, 2))
     assert rgb.shape == (30, 3) and (rgb > 0).all() and (rgb < 1).all() and rgb.std(0).min() > 0
     layers = [m for m in field.net if isinstance(m, torch.nn.Linear)]

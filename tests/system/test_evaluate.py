@@ -33,7 +33,7 @@ def picture_view(height: int, width: int, error: float) -> PictureBatch:
 @pytest.mark.parametrize("chunk", [7, 10_000])
 def test_a_picture_is_judged_as_it_is_shown(error, expected, chunk, monkeypatch):
     monkeypatch.setattr(nerf2d, "RENDER_CHUNK", chunk)
-    result = NeRF2D(Ramp(), ADAM, constant).evaluate(picture_view(12, 15, error))
+    result = NeRF2D(Ramp((15, 12)), ADAM, constant).evaluate(picture_view(12, 15, error))
     assert result.psnr == pytest.approx(expected, abs=1e-3)
     assert result.rgb.shape == result.truth.shape == (12, 15, 3)
     assert result.rgb.max() <= 1 and (result.rgb[..., 2] == 1).all()
@@ -44,7 +44,7 @@ def test_a_picture_is_judged_as_it_is_shown(error, expected, chunk, monkeypatch)
 
 
 def test_the_test_step_reports_what_evaluate_finds():
-    outcome = NeRF2D(Ramp(), ADAM, constant).test_step(picture_view(4, 5, 0.1), 0)
+    outcome = NeRF2D(Ramp((15, 12)), ADAM, constant).test_step(picture_view(4, 5, 0.1), 0)
     assert outcome["psnr"] == pytest.approx(20, abs=1e-3) and math.isnan(outcome["ssim"])
 
 
@@ -111,7 +111,7 @@ def test_rendering_leaves_no_gradient(slab: NeRF3D):
 
 
 def test_the_learning_rate_starts_from_the_optimisers_own():
-    system = NeRF2D(Ramp(), functools.partial(torch.optim.SGD, lr=0.25), constant)
+    system = NeRF2D(Ramp((15, 12)), functools.partial(torch.optim.SGD, lr=0.25), constant)
     system.field.weight = torch.nn.Parameter(torch.ones(2))
     (group,) = system.configure_optimizers().param_groups
     assert group["initial_lr"] == group["lr"] == 0.25

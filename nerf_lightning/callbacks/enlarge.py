@@ -1,0 +1,68 @@
+"""Enlarge: the field on a finer grid than it was trained on, beside bicubic interpolation."""
+
+from pathlib import Path
+
+import cv2
+import lightning as L
+import numpy as np
+
+from nerf_lightning.callbacks.attached import picture_of
+from nerf_lightning.callbacks.baselines import quality_of
+from nerf_lightning.callbacks.panels import panel, to_bytes, write_png
+from nerf_lightning.dataset import pixel_grid
+from nerf_lightning.errors import InputError
+from nerf_lightning.files import write_json
+from nerf_lightning.system import NeRF2D
+
+
+class Enlarge(L.Callback):
+    """Renders a 2D field at another scale after the test: enlarged.png alone, enlarged_panel.png beside bicubic.
+
+    Where the picture was shrunk for training (`dataset.max_side`), or is the built-in one, the true larger picture is known
+    and both are judged by it: printed, and in enlarged.json.
+
+    Args:
+        scale: times the picture's width and height; None makes nothing.
+
+    Raises:
+        InputError: where scale is not above 0, or makes a picture beyond 2^28 pixels.
+    """
+
+    MOST = 1 << 28
+
+    def __init__(self, scale: float | None = None):
+        if scale is not None and not scale > 0:
+            raise InputError("render.scale", "", str(scale), "above 0, or null for none")
+        self.scale = scale
+
+    def setup(self, trainer: L.Trainer, pl_module: NeRF2D, stage: str) -> None:
+        width, height = picture_of(trainer).size
+        if self.scale is not None and self.scale**2 * width * height > self.MOST:
+            raise InputError("render.scale", "", str(self.scale), f"a picture of at most {self.MOST} pixels")
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: NeRF2D) -> None:
+        if self.scale is None or not trainer.is_global_zero:
+            return
+        scene, folder = picture_of(trainer), Path(trainer.default_root_dir)
+        width, height = (max(1, round(side * self.scale)) for side in scene.size)
+        rgb = pl_module.colours(pixel_grid(height, width).to(pl_module.device)).cpu()
+        made = to_bytes(rgb.view(height, width, 3))
+        method = cv2.INTER_CUBIC if self.scale > 1 else cv2.INTER_AREA  # bicubic alone would skip pixels when shrinking
+        bicubic = cv2.resize(scene.image.numpy(), (width, height), interpolation=method)
+        truth = scene.at(width, height)
+        scores = {"scale": self.scale, "width": width, "height": height, "field": None, "bicubic": None}
+        names, shown = "bicubic | field", [bicubic, made]
+        if truth is not None:
+            scores |= {"field": quality_of(made, truth.numpy()), "bicubic": quality_of(bicubic, truth.numpy())}
+            names, shown = "bicubic | field | truth", [*shown, truth.numpy()]
+        write_png(folder / "enlarged.png", made)
+        write_png(
+            folder / "enlarged_panel.png",
+            panel([np.ascontiguousarray(x) for x in shown], f"{names}    {width}x{height}"),
+        )
+        write_json(folder / "enlarged.json", scores)
+        if truth is None:
+            told = "no larger original to judge by (dataset.max_side=... shrinks a picture for training and keeps it)"
+        else:
+            told = f"field {scores['field']:.2f} dB, bicubic {scores['bicubic']:.2f} dB"
+        print(f"{self.scale:g} times as large ({width}x{height}): {told}")

@@ -1,0 +1,70 @@
+"""A picture as features on nested hash grids and one small network (Instant-NGP, Müller et al. 2022, section 5.1)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import hash_interpolate_2d, mlp
+from nerf_lightning.model.field import PictureField
+from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
+from nerf_lightning.options import Count
+
+SHARE = 0.5
+"""Numbers of the grids for each number of the picture, unless the table size is given."""
+
+
+def level_sizes(resolutions: list[tuple[int, int]], entries: int) -> list[int]:
+    """Entries of each level's table: all its corners where they fit."""
+    return [min((across + 1) * (down + 1), entries) for across, down in resolutions]
+
+
+class HashGrid2DField(PictureField):
+    """Hash-grid features of a place, and a network that turns them into a colour.
+
+    The finest level has a vertex at the centre of every pixel: finer ones would hold nothing that the picture tells.
+
+    Args:
+        size: see `PictureField`.
+        levels: how many grids.
+        log2_entries: each level keeps at most 2^log2_entries entries; finer levels than fit share them by hashing. None takes
+            the most with which all levels together hold half as many numbers as the picture.
+        features: numbers an entry.
+        coarsest: cells along the longer side of the first level; a smaller picture has as many as pixels.
+        width: neurons of the hidden layer.
+        rate: factor on the learning rate.
+    """
+
+    def __init__(
+        self,
+        size: tuple[int, int],
+        levels: Count = 8,
+        log2_entries: Count | None = None,
+        features: Count = 2,
+        coarsest: Count = 16,
+        width: Count = 64,
+        rate: float = 1.0,
+    ):
+        super().__init__(size, rate)
+        cells = [max(side - 1, 1) for side in size]
+        finest = max(cells)
+        self.resolutions = [
+            (max(1, round(cells[0] * r / finest)), max(1, round(cells[1] * r / finest)))
+            for r in level_resolutions(levels, min(coarsest, finest), finest)
+        ]
+        if log2_entries is None:
+            numbers = SHARE * 3 * size[0] * size[1]
+            fitting = [e for e in range(4, 25) if sum(level_sizes(self.resolutions, 2**e)) * features <= numbers]
+            log2_entries = max(fitting, default=4)
+        if log2_entries > 24:
+            raise InputError("model.log2_entries", "", str(log2_entries), "at most 24")
+        self.sizes = level_sizes(self.resolutions, 2**log2_entries)
+        self.tables = torch.nn.Parameter(torch.empty(sum(self.sizes), features).uniform_(-1e-4, 1e-4))
+        self.net = layers(levels * features, width, 3)
+
+    def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+        width, height = self.size
+        pixels = uv * uv.new_tensor([width, height]) - 0.5
+        unit = pixels / uv.new_tensor([max(width - 1, 1), max(height - 1, 1)])
+        features = hash_interpolate_2d(self.tables, unit, self.resolutions, self.sizes)
+        return torch.sigmoid(mlp(features, weights(self.net)))
