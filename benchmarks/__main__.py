@@ -1,4 +1,4 @@
-"""python -m benchmarks: what methods, kernels, framework and capture cost on this machine, and how well they do."""
+"""python -m benchmarks: what methods, kernels, framework, capture and 2D fields cost on this machine, and how well they do."""
 
 import argparse
 import os
@@ -10,10 +10,10 @@ from typing import Any
 import torch
 
 import nerf_lightning
-from benchmarks import capture, growth, kernels, methods, overhead
+from benchmarks import capture, growth, kernels, methods, overhead, pictures
 from nerf_lightning.files import write_json
 
-PARTS = ("methods", "kernels", "growth", "overhead", "capture")
+PARTS = ("methods", "kernels", "growth", "overhead", "capture", "pictures")
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -66,6 +66,8 @@ def main() -> None:
         tables: dict[str, list[dict[str, Any]]]
         if part == "capture":
             tables = capture.measure(seeds, arguments.output)
+        elif part == "pictures":
+            tables = pictures.measure(overrides, seeds, arguments.output)
         elif part == "methods":
             rows, report["runs"] = methods.measure(experiments, overrides, budgets, seeds, arguments.output)
             tables = {part: rows}

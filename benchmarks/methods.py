@@ -24,7 +24,9 @@ def train(experiment: str, overrides: list[str], seed: int, folder: Path, measur
     """One run; returns its results.json."""
     command = [sys.executable, "-m", "nerf_lightning", f"+experiment={experiment}", *overrides]
     command += [f"seed={seed}", f"callbacks.heldout.at=[{measured_at}]"]
-    command += ["callbacks.snapshots.steps=[]", "callbacks.orbit.frames=0", f"hydra.run.dir='{folder}'"]
+    command += ["callbacks.snapshots.steps=[]", f"hydra.run.dir='{folder}'"]
+    if not experiment.startswith("picture"):
+        command += ["callbacks.orbit.frames=0"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"benchmarks: {experiment} failed: {done.stderr.strip().splitlines()[-1:]}")

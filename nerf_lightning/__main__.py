@@ -4,14 +4,21 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+
 from nerf_lightning import cli
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 
-def train(cfg: "DictConfig") -> float:
-    """One run. Returns the held-out PSNR in dB, which is what a sweep optimises."""
+def train(cfg: "DictConfig") -> float | None:
+    """One run. Returns the held-out PSNR in dB, which is what a sweep optimises; None for a sweep's job that failed."""
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        from nerf_lightning.sweep import job
+
+        return job(cfg)
     from nerf_lightning.training import train
 
     return train(cfg)

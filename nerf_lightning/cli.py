@@ -14,9 +14,10 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from nerf_lightning import names  # noqa: F401  (conf/ uses its resolvers)
 from nerf_lightning.errors import InputError
 
 TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
@@ -29,18 +30,12 @@ def conf_dir() -> Path:
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
-def slug(text: str) -> str:
-    """A config override as part of a folder name."""
-    return "".join(c if c.isalnum() or c in "=.,_-+" else "-" for c in str(text))[:120]
-
-
 def run(config: str, task: Callable[[DictConfig], object]) -> None:
     """Composes `conf/<config>.yaml` with the command line and calls `task`; exits with 2 on bad input.
 
     Bad input is anything the user can mend: it gets one line. Everything else is a defect and keeps its traceback.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
-    OmegaConf.register_new_resolver("slug", slug, replace=True)
 
     started = False
 
@@ -76,5 +71,7 @@ def give_up(error: Exception) -> NoReturn:
     unknown = re.match(r"Could not override '([^']+)'", line)
     if unknown:
         line = f"command line: found {unknown[1]}, expected a key or group that --cfg job or --help lists"
+    if re.search(r"hydra/(launcher|sweeper)", line):
+        line += "; joblib, submitit_local, submitit_slurm and optuna come with pip install 'nerf_lightning[sweeps]'"
     print(f"nerf_lightning: {line} ({TRACEBACK}=1 shows the traceback)", file=sys.stderr)
     sys.exit(2)

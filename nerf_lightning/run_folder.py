@@ -37,14 +37,19 @@ LIBRARY_TARGETS = {
 }
 
 
-def save_config(cfg: DictConfig, folder: Path) -> None:
-    """Writes the resolved configuration; a relative dataset path becomes absolute, so that it holds from anywhere."""
+def plain_config(cfg: DictConfig) -> dict[str, Any]:
+    """The resolved configuration; a relative dataset path becomes absolute, so that it holds from anywhere."""
     plain = resolved(cfg)
     path = plain["dataset"].get("path")
     if path is not None:
         plain["dataset"]["path"] = os.path.abspath(path)
+    return plain
+
+
+def save_config(cfg: DictConfig, folder: Path) -> None:
+    """Writes the resolved configuration."""
     with atomic(folder / "config.yaml") as temporary:
-        temporary.write_text(yaml.safe_dump(plain, sort_keys=False))
+        temporary.write_text(yaml.safe_dump(plain_config(cfg), sort_keys=False))
 
 
 def load_config(folder: Path) -> DictConfig:

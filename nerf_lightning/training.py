@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import lightning as L
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
@@ -20,6 +21,7 @@ from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, draw_rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
+from nerf_lightning.model import Field
 from nerf_lightning.options import AtLeast, Count, check_options
 from nerf_lightning.run_folder import load_config, read_checkpoint, save_config, save_scene
 from nerf_lightning.seeding import step_generator
@@ -28,14 +30,17 @@ from nerf_lightning.system import NeRF2D, NeRF3D, System
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
-def train(cfg: DictConfig) -> float:
+def train(cfg: DictConfig, checkpoint: Path | None = None) -> float:
     """Builds, fits, tests, writes. Returns the held-out PSNR in dB.
+
+    Args:
+        cfg: the configuration; with `resume`, that of the run resumed takes its place.
+        checkpoint: state of a run with the same configuration, to go on from.
 
     Raises:
         InputError: on bad input, most of it before anything is written into the run's folder.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
-    checkpoint = None
     if cfg.resume is not None:
         cfg, checkpoint = resume(cfg, folder)
     quiet()
@@ -46,15 +51,18 @@ def train(cfg: DictConfig) -> float:
     system = build_system(cfg, frame_of(data))
     check_background(cfg, data, system)
     trainer = build_trainer(cfg, folder)
-    save_config(cfg, folder)
-    save_scene(data, folder)
+    check_processes(trainer, system)
+    if trainer.is_global_zero:
+        save_config(cfg, folder)
+        save_scene(data, folder)
     warm_up(system, data)
     trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(system, data, verbose=False)
     results = written(trainer)
-    if trainer.logger is not None:
-        log_hyperparameters(trainer.logger, cfg, results)
-    report(results, folder)
+    if trainer.is_global_zero:
+        if trainer.logger is not None:
+            log_hyperparameters(trainer.logger, cfg, results)
+        report(results, folder)
     return results["psnr"]
 
 
@@ -81,6 +89,27 @@ def prepare_process(seed: Annotated[int, AtLeast(0)], threads: Count | None, ker
     keep_freed_memory()
     torch.set_flush_denormal(True)  # dying weights otherwise slow the CPU down many times over
     L.seed_everything(seed, verbose=False)
+
+
+def check_processes(trainer: L.Trainer, system: System) -> None:
+    """Refuses what several processes cannot do together.
+
+    Raises:
+        InputError: for a field that changes its size, and for a sweep whose jobs would start processes of their own.
+    """
+    if trainer.world_size == 1:
+        return
+    if isinstance(system, NeRF3D) and type(system.field).grow is not Field.grow:
+        name = type(system.field).__name__
+        raise InputError(
+            "config", "model", f"{name}, which grows", "a field of fixed size for several processes", "hashgrid"
+        )
+    cluster = getattr(trainer.strategy, "cluster_environment", None)
+    if HydraConfig.get().mode == RunMode.MULTIRUN and not getattr(cluster, "creates_processes_externally", False):
+        expected = "one process a job in a sweep"
+        raise InputError(
+            "config", "trainer.devices", str(trainer.world_size), expected, "or a launcher that starts them"
+        )
 
 
 def warm_up(system: System, data: RayDataModule | PixelDataModule) -> None:

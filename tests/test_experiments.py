@@ -30,7 +30,7 @@ def a_scene_for(small_scene: tuple[Path, Scene], tmp_path_factory: pytest.TempPa
     path, _ = small_scene
 
     def overrides(experiment: str) -> list[str]:
-        if experiment.startswith("picture") or experiment == "smoke_2d":
+        if experiment.startswith(("picture", "study_", "tune_")) or experiment == "smoke_2d":
             return ["dataset.max_side=24"]
         if experiment == "smoke_3d":
             return ["dataset.size=24"]

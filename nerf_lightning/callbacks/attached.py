@@ -7,6 +7,7 @@ import lightning as L
 from nerf_lightning.dataset import Picture, PixelDataModule, RayDataModule
 
 Kind = TypeVar("Kind", bound=L.Callback)
+Value = TypeVar("Value")
 
 
 def attached(trainer: L.Trainer, kind: type[Kind]) -> Kind | None:
@@ -17,6 +18,11 @@ def attached(trainer: L.Trainer, kind: type[Kind]) -> Kind | None:
 def data_of(trainer: L.Trainer) -> RayDataModule | PixelDataModule:
     """The data module of the run."""
     return trainer.datamodule  # type: ignore[attr-defined]
+
+
+def agreed(trainer: L.Trainer, value: Value) -> Value:
+    """What the first of several processes says; clocks differ, and all must decide alike."""
+    return trainer.strategy.broadcast(value) if trainer.world_size > 1 else value
 
 
 def picture_of(trainer: L.Trainer) -> Picture:

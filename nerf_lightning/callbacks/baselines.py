@@ -74,6 +74,11 @@ def shrunk(image: Image, limit: int) -> dict[str, Any]:
     return {"width": small[0], "height": small[1], "bytes": less.nbytes, "psnr": quality_of(back, image)}
 
 
+def size_of(count: int) -> str:
+    """Bytes in words."""
+    return f"{count / 1e6:.2f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
+
+
 def words(psnr_db: float | None) -> str:
     return "without loss" if psnr_db is None else f"{psnr_db:.2f} dB"
 
@@ -105,8 +110,8 @@ class Baselines(L.Callback):
         }
         write_json(Path(trainer.default_root_dir) / self.path, found)
         coded = "none so small" if same is None else words(same["psnr"])
-        told = f"in {size / 1e6:.2f} MB (the picture's pixels have {image.nbytes / 1e6:.2f}): JPEG {coded}"
+        told = f"in {size_of(size)} (the picture's pixels have {size_of(image.nbytes)}): JPEG {coded}"
         told += f"; shrunk and enlarged by bicubic interpolation {words(small['psnr'])}"
         if found["jpeg_as_good"] is not None:
-            told += f"; a JPEG as good as the field has {found['jpeg_as_good']['bytes'] / 1e6:.2f} MB"
+            told += f"; a JPEG as good as the field has {size_of(found['jpeg_as_good']['bytes'])}"
         print(told)

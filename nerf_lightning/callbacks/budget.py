@@ -7,7 +7,7 @@ from typing import Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import attached
+from nerf_lightning.callbacks.attached import agreed, attached
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 
@@ -68,17 +68,22 @@ class Budget(L.Callback):
             if running:
                 self._since = time.perf_counter()
 
+    def shared_progress(self, trainer: L.Trainer) -> float:
+        """`progress`, the same in all processes of a run."""
+        progress = self.progress(trainer.global_step)
+        return progress if self.limit_seconds is None else agreed(trainer, progress)
+
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        trainer.should_stop = self.progress(trainer.global_step) >= 1.0  # a finished run resumed has nothing left
+        trainer.should_stop = self.shared_progress(trainer) >= 1.0  # a finished run resumed has nothing left
         self._since = time.perf_counter()
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
-        pl_module.progress = self.progress(trainer.global_step)
+        pl_module.progress = self.shared_progress(trainer)
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        pl_module.progress = self.progress(trainer.global_step)
+        pl_module.progress = self.shared_progress(trainer)
         if pl_module.progress >= 1.0:
             trainer.should_stop = True
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import attached
+from nerf_lightning.callbacks.attached import agreed, attached
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut, evenly
 from nerf_lightning.errors import InputError
@@ -34,12 +34,17 @@ class Checkpoints(L.Callback):
         self.every_seconds = every_seconds
         self.best: float | None = None
         self._saved = 0.0
+        self._judged = 0  # measurements looked at
         self._tested: list[float] = []
 
     def save(self, trainer: L.Trainer, name: str) -> None:
         path = Path(trainer.default_root_dir) / self.folder / name
-        with Budget.of(trainer).paused(), atomic(path) as temporary:
-            trainer.save_checkpoint(temporary)
+        with Budget.of(trainer).paused():
+            if not trainer.is_global_zero:
+                trainer.save_checkpoint(path)  # writes nothing here, but the first process waits for all
+                return
+            with atomic(path) as temporary:
+                trainer.save_checkpoint(temporary)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._saved = time.monotonic()
@@ -47,12 +52,15 @@ class Checkpoints(L.Callback):
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if time.monotonic() - self._saved >= self.every_seconds:
+        if agreed(trainer, time.monotonic() - self._saved >= self.every_seconds):
             self.save(trainer, "last.ckpt")
             self._saved = time.monotonic()
         held_out = attached(trainer, HeldOut)
         quality = held_out.latest if held_out is not None else None
-        if quality is not None and (self.best is None or quality > self.best):
+        if held_out is None or quality is None or len(held_out.curve) == self._judged:
+            return
+        self._judged = len(held_out.curve)
+        if agreed(trainer, self.best is None or quality > self.best):
             self.best = quality
             self.save(trainer, "best.ckpt")
 
@@ -69,6 +77,8 @@ class Checkpoints(L.Callback):
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         """The final state is a candidate too, judged on the views that the earlier ones were judged on."""
+        if not trainer.is_global_zero:
+            return
         folder = Path(trainer.default_root_dir) / self.folder
         last = folder / "last.ckpt"
         held_out = attached(trainer, HeldOut)

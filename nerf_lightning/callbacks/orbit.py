@@ -43,7 +43,7 @@ class Orbit(L.Callback):
             progress.later_views += self.frames
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF3D) -> None:
-        if self.frames == 0:
+        if self.frames == 0 or not trainer.is_global_zero:
             return
         scene = data_of(trainer).scene
         assert isinstance(scene, Scene)  # NeRF3D trains on nothing else

@@ -77,8 +77,11 @@ class Progress(L.Callback):
             parts.append(f"left {clock(training + self.rendering_left(trainer))}")
         return "  ".join(parts)
 
+    def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
+        self.console.quiet = not trainer.is_global_zero  # of several processes, one speaks
+
     def open(self, name: str) -> None:
-        if self.bar is None and self.console.is_terminal:
+        if self.bar is None and self.console.is_terminal and not self.console.quiet:
             columns = (
                 TextColumn("{task.description}"),
                 BarColumn(),
@@ -113,7 +116,7 @@ class Progress(L.Callback):
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        self._rays += pl_module.stats.rays
+        self._rays += pl_module.stats.rays * trainer.world_size
         if self.due():
             self.show(pl_module.progress, self.status(trainer, pl_module))
 

@@ -137,4 +137,5 @@ class Results(L.Callback):
             "status": status,
             "diagnosis": diagnosis,
         }
-        write_json(Path(trainer.default_root_dir) / self.path, self.summary)
+        if trainer.is_global_zero:
+            write_json(Path(trainer.default_root_dir) / self.path, self.summary)

@@ -53,6 +53,8 @@ class Snapshots(L.Callback):
             raise InputError("callbacks.snapshots.view", "", str(self.view), f"a held-out view from 0 to {views - 1}")
 
     def take(self, trainer: L.Trainer, pl_module: System) -> None:
+        if not trainer.is_global_zero:
+            return
         with Budget.of(trainer).paused():
             data, step = data_of(trainer), trainer.global_step
             result = pl_module.evaluate(data.held_out(self.view))

@@ -35,8 +35,8 @@ class Throughput(L.Callback):
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         stats, step = pl_module.stats, trainer.global_step
-        self.rays += stats.rays
-        self._samples += stats.samples
+        self.rays += stats.rays * trainer.world_size
+        self._samples += stats.samples * trainer.world_size
         if step % self.every:
             return
         seconds = Budget.of(trainer).seconds

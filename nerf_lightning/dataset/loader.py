@@ -3,10 +3,17 @@
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
+import lightning as L
+
 Batch = TypeVar("Batch")
 
 ENDLESS = 2**31 - 1
 """Reported length. Lightning reads one batch ahead of a loader without length, which would break exact resuming."""
+
+
+def share(trainer: L.Trainer | None) -> slice:
+    """Which entries of a step's draw are this process's, where several share a run: all together make the whole draw."""
+    return slice(None) if trainer is None else slice(trainer.global_rank, None, trainer.world_size)
 
 
 class StepLoader:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader
+from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader, share
 from nerf_lightning.errors import InputError
 from nerf_lightning.seeding import step_generator
 
@@ -94,7 +94,7 @@ class PixelDataModule(L.LightningDataModule):
 
     Args:
         scene: the picture.
-        pixels: pixels a step, drawn with replacement.
+        pixels: pixels a step, drawn with replacement; several processes share them.
         seed: of the draw.
 
     Raises:
@@ -114,7 +114,7 @@ class PixelDataModule(L.LightningDataModule):
     def draw(self, step: int) -> PixelBatch:
         image = self.scene.image
         index = torch.randint(image[..., 0].numel(), (self.pixels,), generator=step_generator(self.seed, 0, step))
-        return pixels_at(image, index)
+        return pixels_at(image, index[share(self.trainer)])
 
     def train_dataloader(self) -> StepLoader:
         return StepLoader(self.draw, lambda: self.trainer.global_step if self.trainer else 0)

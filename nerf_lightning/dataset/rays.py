@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader
+from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader, share
 from nerf_lightning.dataset.scene import Scene, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.seeding import step_generator
@@ -44,13 +44,13 @@ class ViewBatch(RayBatch):
         return ViewBatch(self.rays.to(device), self.pixels.to(device), self.height, self.width)
 
 
-def draw_rays(views: Views, count: int, generator: torch.Generator) -> RayBatch:
-    """`count` pixels with replacement, each as likely as any other of all views.
+def draw_rays(views: Views, count: int, generator: torch.Generator, part: slice = slice(None)) -> RayBatch:  # noqa: B008
+    """`count` pixels with replacement, each as likely as any other of all views, and of these a part.
 
     Photos stay as bytes and rays are made for the drawn pixels alone, so the cost does not depend on how many there are.
     """
     height, width = views.cameras.height, views.cameras.width
-    flat = torch.randint(len(views) * height * width, (count,), generator=generator)
+    flat = torch.randint(len(views) * height * width, (count,), generator=generator)[part]
     view, pixel = flat // (height * width), flat % (height * width)
     row, col = pixel // width, pixel % width
     return RayBatch(views.cameras.rays(view, row, col), views.images[view, row, col])
@@ -61,7 +61,7 @@ class RayDataModule(L.LightningDataModule):
 
     Args:
         scene: the photos and cameras.
-        rays: rays a step; with `samples`, only of the first.
+        rays: rays a step, which several processes share; with `samples`, only of the first.
         samples: aim for this many samples a step by adapting the number of rays; None keeps `rays`.
         seed: of the draw.
 
@@ -92,7 +92,7 @@ class RayDataModule(L.LightningDataModule):
         self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
 
     def draw(self, step: int) -> RayBatch:
-        return draw_rays(self.scene.train, self.rays, step_generator(self.seed, 0, step))
+        return draw_rays(self.scene.train, self.rays, step_generator(self.seed, 0, step), share(self.trainer))
 
     def train_dataloader(self) -> StepLoader:
         return StepLoader(self.draw, lambda: self.trainer.global_step if self.trainer else 0)

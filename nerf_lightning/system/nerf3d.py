@@ -67,7 +67,10 @@ class NeRF3D(System):
     def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
         generator = step_generator(self.seed, 1, self.global_step, self.device)
         loss, self.stats = self.loss(batch, generator, self.global_step)
-        self.trainer.datamodule.adapt(self.stats.samples)  # type: ignore[attr-defined]
+        drawn = self.stats.samples
+        if self.trainer.world_size > 1:  # all processes draw from one stream, so they must adapt alike
+            drawn = int(self.trainer.strategy.reduce(torch.tensor(drawn, device=self.device), reduce_op="sum"))
+        self.trainer.datamodule.adapt(drawn)  # type: ignore[attr-defined]
         return loss
 
     @torch.no_grad()

@@ -1,0 +1,128 @@
+"""Run folders as tables and charts read them: tolerant of broken ones, and never executing what they hold."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from nerf_lightning.errors import InputError
+
+FINISHED = ("finished", "collapsed")
+"""Status of runs that came to their end."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is known of one run."""
+
+    folder: Path
+    config: dict[str, Any]
+    """As it was resolved; empty where it cannot be read."""
+    results: dict[str, Any]
+    """results.json; empty where it is missing or broken."""
+    status: str
+    """That of results.json, or "unfinished" without one, or "unreadable"."""
+    diagnosis: str
+
+    def option(self, key: str) -> Any:
+        """What stands at a dotted key of the configuration; None where nothing does."""
+        node: Any = self.config
+        for part in key.split("."):
+            node = node.get(part) if isinstance(node, dict) else None
+        return node
+
+    @property
+    def psnr(self) -> float | None:
+        value = self.results.get("psnr")
+        return float(value) if isinstance(value, int | float) else None
+
+    @property
+    def curve(self) -> list[tuple[float, float, float]]:
+        """(training seconds, step, PSNR), as far as they are numbers."""
+        points = self.results.get("curve")
+        whole = [p for p in points if isinstance(p, list) and len(p) == 3] if isinstance(points, list) else []
+        return [(p[0], p[1], p[2]) for p in whole if all(isinstance(x, int | float) for x in p)]
+
+
+def read_run(folder: Path) -> Run:
+    """Reads one folder; what is missing or broken becomes the run's status and diagnosis."""
+    config: Any = None
+    try:
+        config = yaml.safe_load((folder / "config.yaml").read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        config = {}
+    plain = config if isinstance(config, dict) else {}
+    try:
+        results = json.loads((folder / "results.json").read_text())
+    except FileNotFoundError:
+        return Run(folder, plain, {}, "unfinished", "no results.json yet")
+    except (OSError, ValueError) as error:
+        return Run(folder, plain, {}, "unreadable", f"results.json: {' '.join(str(error).split())}")
+    if not isinstance(results, dict):
+        return Run(folder, plain, {}, "unreadable", f"results.json: a {type(results).__name__}, not a mapping")
+    status, diagnosis = results.get("status"), results.get("diagnosis")
+    return Run(folder, plain, results, str(status or "unreadable"), str(diagnosis or ""))
+
+
+def find_runs(root: Path) -> list[Run]:
+    """All runs in a folder and below it, in the order of their names.
+
+    Raises:
+        InputError: where there is no such folder, or no run in it.
+    """
+    if not root.is_dir():
+        raise InputError(root, "", "no such folder", "a folder of runs", "look below outputs/")
+    folders = {path.parent for name in ("results.json", "config.yaml") for path in root.rglob(name)}
+    if not folders:
+        raise InputError(root, "", "no run in it", "folders with a config.yaml and a results.json")
+    return [read_run(folder) for folder in sorted(folders, key=_in_order)]
+
+
+def _in_order(folder: Path) -> list[tuple[bool, float, str]]:
+    """Sorts =2 before =10."""
+    words = re.split(r"(?<==)([-+.\de]+)(?=,|$)", str(folder))
+    return [(not _number(word), float(word) if _number(word) else 0.0, word) for word in words]
+
+
+def _number(word: str) -> bool:
+    return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", word) is not None
+
+
+def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A nested configuration with dotted keys; lists stay whole."""
+    pairs: dict[str, Any] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        pairs |= flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return pairs
+
+
+def varied(runs: Sequence[Run]) -> list[str]:
+    """The options in which runs differ, as dotted keys; `method` alone stands for the kind of model and what only it has."""
+    options = [flat(run.config) for run in runs if run.config]
+    common = [key for key in (options[0] if options else {}) if all(key in other for other in options)]
+    keys = [key for key in common if any(other[key] != options[0][key] for other in options)]
+    if "method" in keys:
+        keys = [key for key in keys if not key.startswith("model.")]
+    kept: dict[tuple[str, str], str] = {}
+    for key in sorted(keys, key=lambda key: key.count(".")):  # dataset.seed only repeats seed
+        kept.setdefault((key.rsplit(".", 1)[-1], str([other[key] for other in options])), key)
+    return [key for key in keys if key in kept.values() and not key.endswith("_target_")]
+
+
+FIGURES = (
+    "scene", "method", "seed", "device", "threads", "versions", "parameters", "artifact_bytes", "train_seconds", "steps",
+    "rays_per_second", "psnr", "ssim", "psnr_worst_view", "render_seconds_per_view", "peak_memory_bytes", "curve", "status",
+    "diagnosis",
+)  # fmt: skip
+"""What stands in every results.json."""
+
+
+def failed_results(method: Any, seed: Any, diagnosis: str) -> dict[str, Any]:
+    """A results.json for a run that failed before it could write its own: nothing was measured."""
+    nothing: dict[str, Any] = dict.fromkeys(FIGURES)
+    return nothing | {"method": method, "seed": seed, "curve": [], "status": "failed", "diagnosis": diagnosis}
