@@ -1,6 +1,8 @@
 """Fixtures that all tests share."""
 
+import logging
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,6 +64,27 @@ def kernels(request: pytest.FixtureRequest, fast_kernels: None) -> str:
     """Runs a test with the fast kernels, and again with the reference."""
     use_kernels(request.param)
     return request.param
+
+
+@pytest.fixture
+def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+    """Runs a command line in this process, in an empty folder; returns exit code, output and errors."""
+    from nerf_lightning.__main__ import main
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("NERF_LIGHTNING_TRACEBACK", raising=False)
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["nerf_lightning", *arguments])
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        return code, *capfd.readouterr()
+
+    yield run
+    logging.getLogger().handlers.clear()  # they write to what was captured
 
 
 @pytest.fixture(scope="session")

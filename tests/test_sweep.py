@@ -2,31 +2,12 @@
 
 import csv
 import json
-import sys
 from pathlib import Path
 
 import pytest
-
-from nerf_lightning.__main__ import main
+from test_cli import command
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3"]
-
-
-@pytest.fixture
-def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
-    """Runs a command line in this process; returns exit code, output and errors."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["nerf_lightning", *arguments])
-        code = 0
-        try:
-            main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        return code, *capfd.readouterr()
-
-    return run
 
 
 def table(root: Path) -> dict[str, dict[str, str]]:
@@ -34,9 +15,9 @@ def table(root: Path) -> dict[str, dict[str, str]]:
         return {row["job"]: row for row in csv.DictReader(file)}
 
 
-def test_a_sweep_leaves_table_and_figure_and_is_done_once(sweep, tmp_path: Path):
+def test_a_sweep_leaves_table_and_figure_and_is_done_once(inside, tmp_path: Path):
     command = ["-m", *SMALL, "model.width=8,16", "seed=0,1"]
-    code, out, err = sweep(*command)
+    code, out, err = inside(*command)
     root = tmp_path / "outputs" / "smoke_2d" / "sweep_budget.steps=3_dataset.max_side=16_model.width=8,16_seed=0,1"
     assert code == 0, err
     names = {f"model.width={width},seed={seed}" for width in (8, 16) for seed in (0, 1)}
@@ -47,13 +28,13 @@ def test_a_sweep_leaves_table_and_figure_and_is_done_once(sweep, tmp_path: Path)
     assert float(rows["model.width=8,seed=1"]["psnr"]) > 3
     assert (root / "gallery.png").stat().st_size > 1000
     results = {name: (root / name / "results.json").stat().st_mtime_ns for name in names}
-    code, out, err = sweep(*command)
+    code, out, err = inside(*command)
     assert code == 0 and out.count("done before") == 4 and ": starts" not in out
     assert {name: (root / name / "results.json").stat().st_mtime_ns for name in names} == results
 
 
-def test_a_job_that_raises_is_named_and_the_others_go_on(sweep, tmp_path: Path):
-    code, out, err = sweep("-m", *SMALL, "model.width=8,-1,16,9")
+def test_a_job_that_raises_is_named_and_the_others_go_on(inside, tmp_path: Path):
+    code, out, err = inside("-m", *SMALL, "model.width=8,-1,16,9")
     (root,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
     assert code == 1
     assert err.strip().splitlines()[-1] == "nerf_lightning: 1 of 4 jobs failed: model.width=-1"
@@ -62,17 +43,17 @@ def test_a_job_that_raises_is_named_and_the_others_go_on(sweep, tmp_path: Path):
     assert sum(row["status"] != "failed" for row in table(root).values()) == 3
     assert "Traceback" in (root / "model.width=-1" / "error.txt").read_text()
     assert json.loads((root / "model.width=-1" / "results.json").read_text())["seed"] == 0
-    code, out, err = sweep("-m", *SMALL, "model.width=8,-1,16,9")
+    code, out, err = inside("-m", *SMALL, "model.width=8,-1,16,9")
     assert code == 1 and out.count("done before") == 3, "what failed is tried again"
 
 
-def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(sweep, tmp_path: Path, monkeypatch):
+def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(inside, tmp_path: Path, monkeypatch):
     import torch
 
     from nerf_lightning.callbacks import Checkpoints
 
     small = ["-m", "+experiment=smoke_2d", "dataset.max_side=16", "model.width=8", "seed=0,1"]
-    assert sweep(*small, "budget.steps=20", "name=whole")[0] == 0
+    assert inside(*small, "budget.steps=20", "name=whole")[0] == 0
     save = Checkpoints.save
 
     def saved_and_broken(self, trainer, name):
@@ -82,10 +63,10 @@ def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(
 
     monkeypatch.setattr(Checkpoints, "save", saved_and_broken)
     steps = "callbacks.checkpoints.every_seconds=1e-6"
-    code, out, err = sweep(*small, "budget.steps=20", "name=broken", steps)
+    code, out, err = inside(*small, "budget.steps=20", "name=broken", steps)
     assert code == 1 and "no space left" in err
     monkeypatch.setattr(Checkpoints, "save", save)
-    code, out, err = sweep(*small, "budget.steps=20", "name=broken", steps)
+    code, out, err = inside(*small, "budget.steps=20", "name=broken", steps)
     assert code == 0 and out.count("goes on from its last checkpoint") == 2
     whole, broken = (next((tmp_path / "outputs" / name).glob("sweep_*")) / "seed=1" for name in ("whole", "broken"))
     first, second = (torch.load(path / "checkpoints" / "last.ckpt", weights_only=True) for path in (whole, broken))
@@ -93,12 +74,12 @@ def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(
     assert all(torch.equal(first["state_dict"][key], second["state_dict"][key]) for key in first["state_dict"])
     text = (broken / "config.yaml").read_text()
     (broken / "config.yaml").write_text(text.replace("lr: 0.01", "lr: 0.02"))
-    code, out, err = sweep(*small, "budget.steps=20", "name=broken", steps)
+    code, out, err = inside(*small, "budget.steps=20", "name=broken", steps)
     assert "seed=0: done before" in out and "seed=1: starts" in out
 
 
-def test_a_study_is_one_command(sweep, tmp_path: Path):
-    code, out, err = sweep("+experiment=study_rate", "dataset.max_side=16", "budget.steps=2", "model.width=8")
+def test_a_study_is_one_command(inside, tmp_path: Path):
+    code, out, err = inside("+experiment=study_rate", "dataset.max_side=16", "budget.steps=2", "model.width=8")
     assert code == 0, err
     (root,) = (tmp_path / "outputs" / "study_rate").iterdir()
     assert len(table(root)) == 7 and (root / "gallery.png").is_file()
@@ -106,8 +87,6 @@ def test_a_study_is_one_command(sweep, tmp_path: Path):
 
 
 def test_optuna_proposes_the_same_trials_again_and_failing_ones_are_recorded(tmp_path: Path):
-    from test_cli import command
-
     line = ["+experiment=tune_picture", "dataset.max_side=16", "budget.steps=2", "hydra.sweeper.n_trials=2"]
     first, second = (command(*line, cwd=tmp_path) for _ in range(2))
     assert first.returncode == second.returncode == 0, first.stderr + second.stderr
@@ -120,8 +99,6 @@ def test_optuna_proposes_the_same_trials_again_and_failing_ones_are_recorded(tmp
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_other_launchers(launcher: str, tmp_path: Path):
     """In processes of their own, whose way back to this package must work."""
-    from test_cli import command
-
     settings = {"joblib": ["hydra.launcher.n_jobs=2"], "submitit_local": ["threads=1"]}[launcher]
     done = command("-m", *SMALL, "model.width=8,-1", f"hydra/launcher={launcher}", *settings, cwd=tmp_path)
     assert done.returncode == 1, done.stderr
@@ -132,8 +109,6 @@ def test_other_launchers(launcher: str, tmp_path: Path):
 
 
 def test_two_processes_share_a_run_and_leave_one_folder(tmp_path: Path):
-    from test_cli import command
-
     options = ["+experiment=picture", "dataset.max_side=32", "budget.steps=150", "trainer.accelerator=cpu", "threads=1"]
     results = []
     for name, trainer in (("one", "default"), ("two", "ddp")):
@@ -150,6 +125,6 @@ def test_two_processes_share_a_run_and_leave_one_folder(tmp_path: Path):
     assert (two["steps"], two["status"]) == (150, "finished")
 
 
-def test_a_missing_launcher_says_what_to_install(sweep, monkeypatch):
-    code, out, err = sweep("-m", *SMALL, "seed=0,1", "hydra/launcher=submitit_lunar")
+def test_a_missing_launcher_says_what_to_install(inside, monkeypatch):
+    code, out, err = inside("-m", *SMALL, "seed=0,1", "hydra/launcher=submitit_lunar")
     assert code == 2 and "nerf_lightning[sweeps]" in err and err.count("\n") == 1

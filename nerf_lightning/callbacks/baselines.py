@@ -68,7 +68,9 @@ def shrunk(image: Image, limit: int) -> dict[str, Any]:
     """The picture averaged to as many pixels as `limit` bytes hold (three a pixel), enlarged again by bicubic interpolation."""
     height, width = image.shape[:2]
     scale = min(1.0, (limit / image.nbytes) ** 0.5)
-    small = (max(1, int(width * scale)), max(1, int(height * scale)))
+    down = max(1, int(height * scale))
+    across = max(1, min(int(width * scale), limit // (3 * down)))
+    small = (across, max(1, min(down, limit // (3 * across))))
     less = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
     back = cv2.resize(less, (width, height), interpolation=cv2.INTER_CUBIC)
     return {"width": small[0], "height": small[1], "bytes": less.nbytes, "psnr": quality_of(back, image)}

@@ -7,7 +7,7 @@ import lightning as L
 import numpy as np
 
 from nerf_lightning.callbacks.attached import picture_of
-from nerf_lightning.callbacks.baselines import quality_of
+from nerf_lightning.callbacks.baselines import quality_of, words
 from nerf_lightning.callbacks.panels import panel, to_bytes, write_png
 from nerf_lightning.dataset import pixel_grid
 from nerf_lightning.errors import InputError
@@ -64,5 +64,5 @@ class Enlarge(L.Callback):
         if truth is None:
             told = "no larger original to judge by (dataset.max_side=... shrinks a picture for training and keeps it)"
         else:
-            told = f"field {scores['field']:.2f} dB, bicubic {scores['bicubic']:.2f} dB"
+            told = f"field {words(scores['field'])}, bicubic {words(scores['bicubic'])}"
         print(f"{self.scale:g} times as large ({width}x{height}): {told}")

@@ -126,7 +126,7 @@ def from_picture(
 
 
 def no_larger_than(original: UInt8[Tensor, "H W 3"], width: int, height: int) -> UInt8[Tensor, "h w 3"] | None:
-    """A picture averaged to a size, None where it has fewer pixels itself."""
-    if width > original.shape[1] or height > original.shape[0]:
+    """A picture averaged to a size, None where it has fewer pixels itself (but for one, by rounding)."""
+    if width > original.shape[1] + 1 or height > original.shape[0] + 1:
         return None
     return torch.from_numpy(area_resize(original.numpy(), width, height))

@@ -51,7 +51,7 @@ class NeRF2D(System):
         if (rgb.amax(0) - rgb.amin(0)).max() > 1 / 255:
             return ""
         dead = dead_rectifiers(self.field, view.uv)
-        if not dead:
+        if max(dead, default=0.0) < 0.5:
             return "every place gets the same colour"
         return (
             f"every place gets the same colour; {max(dead):.0%} of a layer's rectifiers are off wherever one looks, so no "

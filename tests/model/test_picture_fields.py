@@ -1,0 +1,264 @@
+import functools
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from agreement import with_threads
+from torch import Tensor
+
+from nerf_lightning.dataset import Picture, PixelDataModule, pixel_grid
+from nerf_lightning.errors import InputError
+from nerf_lightning.model import FourierField, HashGrid2DField, PictureField, PictureMLP, SirenField
+from nerf_lightning.system import NeRF2D, constant, psnr
+
+SIZES = pytest.mark.parametrize("size", [(64, 64), (40, 25), (25, 40), (1, 1), (1, 30), (30, 1), (2, 1), (3, 2)])
+MAKERS: dict[str, Callable[[tuple[int, int]], PictureField]] = {
+    "hash grid": HashGrid2DField,
+    "octaves": lambda size: PictureMLP(size, None, width=64),
+    "random sinusoids": lambda size: FourierField(size, features=32, spread=0.2, width=64),
+    "sines": lambda size: SirenField(size, width=64, reach=0.3),
+}
+FIELDS = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+
+
+def numbers(field: HashGrid2DField) -> int:
+    """What the tables of all levels hold."""
+    return field.tables.numel()
+
+
+def corners(resolution: tuple[int, int]) -> int:
+    return (resolution[0] + 1) * (resolution[1] + 1)
+
+
+@FIELDS
+@SIZES
+def test_a_picture_of_any_size_has_a_field(make, size: tuple[int, int]):
+    field = make(size)
+    for uv in (torch.rand(0, 2), torch.rand(1, 2), pixel_grid(size[1], size[0]), torch.rand(30, 2)):
+        rgb = field(uv)
+        assert rgb.shape == (len(uv), 3) and rgb.isfinite().all()
+    rgb.square().sum().backward()
+    for name, parameter in field.named_parameters():
+        assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
+
+
+@FIELDS
+def test_a_field_learns_a_picture(make):
+    """100 steps on a smooth picture leave less than a twentieth of the squared error of the best plain colour."""
+    x, y = pixel_grid(48, 64).T
+    smooth = torch.stack([0.5 + 0.4 * torch.sin(5 * x), 0.5 + 0.4 * torch.cos(4 * y + 2 * x), 0.2 + 0.6 * x * y], dim=1)
+    image = (255 * smooth).round().byte().view(48, 64, 3)
+    data = PixelDataModule(Picture("smooth", "test", image), pixels=512)
+    system = NeRF2D(make((64, 48)), functools.partial(torch.optim.Adam, lr=1e-2), constant)
+
+    def train() -> list[Tensor]:
+        optimizer = system.configure_optimizers()
+        for step in range(100):
+            optimizer.zero_grad()
+            system.training_step(data.draw(step), step).backward()
+            optimizer.step()
+        return [system.colours(view.uv)]
+
+    view = data.held_out(0)
+    (learned,) = with_threads(train, 1)  # steps so small are slower with two, and far slower on a busy machine
+    assert psnr(learned, view.rgb) > psnr(view.rgb.mean(0).expand_as(view.rgb), view.rgb) + 13
+
+
+# What follows from the picture's size
+
+
+@pytest.mark.parametrize("size", [(16, 12), (12, 16), (33, 7)])
+def test_the_finest_level_has_a_vertex_at_each_pixels_centre(size: tuple[int, int]):
+    width, height = size
+    field = HashGrid2DField(size, levels=3, log2_entries=8, coarsest=4)
+    assert field.resolutions[-1] == (width - 1, height - 1)
+    finest = sum(field.sizes[:-1])
+    before = field(pixel_grid(height, width))
+    for column, row in [(0, 0), (width - 1, height - 1), (3, 5), (10, 2)]:
+        pixel = column + row * width
+        changed = HashGrid2DField(size, levels=3, log2_entries=8, coarsest=4)
+        changed.load_state_dict(field.state_dict())
+        with torch.no_grad():
+            changed.tables[finest + pixel] += 10
+        moved = (changed(pixel_grid(height, width)) - before).abs().amax(1)
+        assert moved[pixel] > 0.1
+        moved[pixel] = 0
+        assert moved.max() < 1e-3, "and no other pixel's"
+
+
+@pytest.mark.parametrize("size", [(256, 256), (640, 360), (97, 1400), (40, 30), (1, 1000)])
+@pytest.mark.parametrize("features", [1, 2])
+def test_tables_hold_up_to_half_as_many_numbers_as_the_picture(size: tuple[int, int], features: int):
+    field = HashGrid2DField(size, features=features)
+    values = 3 * size[0] * size[1]
+    most = math.log2(max(field.sizes))
+    everything = features * sum(corners(r) for r in field.resolutions)
+    assert numbers(field) <= values / 2 and (numbers(field) > values / 4 or numbers(field) == everything)
+    for resolution, entries in zip(field.resolutions, field.sizes, strict=True):
+        assert entries == corners(resolution) or (entries == 2**most and entries < corners(resolution))
+    assert all(isinstance(entries, int) for entries in field.sizes)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 3), (4, 4)])
+def test_the_smallest_pictures_keep_sixteen_entries_a_level(size: tuple[int, int]):
+    field = HashGrid2DField(size)
+    assert max(field.sizes) <= 16 and field.sizes == [min(corners(r), 16) for r in field.resolutions]
+    assert set(field.resolutions) == {tuple(max(side - 1, 1) for side in size)}, "no level is finer than the pixels"
+
+
+@pytest.mark.parametrize("size", [(256, 256), (640, 360), (360, 640)])
+def test_cells_stay_nearly_square_at_every_level(size: tuple[int, int]):
+    field = HashGrid2DField(size)
+    longer = [max(resolution) for resolution in field.resolutions]
+    assert longer[0] == 16 and longer[-1] == max(size) - 1 and longer == sorted(set(longer))
+    for across, down in field.resolutions:
+        assert abs(across / (size[0] - 1) - down / (size[1] - 1)) * (min(size) - 1) <= 1
+
+
+def test_a_given_table_size_is_kept():
+    assert max(HashGrid2DField((256, 256), log2_entries=9).sizes) == 2**9
+    assert HashGrid2DField((64, 64), log2_entries=20).sizes[-1] == 64 * 64, "a level needs no more than its corners"
+
+
+@pytest.mark.parametrize(
+    ("size", "octaves"), [((1, 1), 1), ((2, 1), 2), ((64, 64), 7), ((256, 192), 9), ((100, 60), 8), ((60, 100), 8)]
+)
+def test_octaves_end_at_one_cycle_in_two_pixels(size: tuple[int, int], octaves: int):
+    field = PictureMLP(size, None, width=8, depth=2)
+    assert field.frequencies == octaves
+    assert 2 ** (octaves - 1) / 2 == pytest.approx(field.nyquist, rel=0.42), "to the nearest octave"
+    assert field.net[0].in_features == 2 * (1 + 2 * octaves)
+
+
+def test_the_last_octaves_sine_turns_from_pixel_to_pixel():
+    seen = inputs_of(PictureMLP((64, 64), None, width=8), pixel_grid(64, 64))
+    sine_x = seen[:64, -4]  # per octave: the sines of x and y, then the cosines
+    torch.testing.assert_close(sine_x, 1 - 2 * (torch.arange(64) % 2).float(), atol=1e-3, rtol=0)
+
+
+def inputs_of(field: PictureField, uv: Tensor) -> Tensor:
+    """What the first layer of a field's network sees."""
+    seen: list[Tensor] = []
+    with field.net[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0])):
+        field(uv)
+    return seen[0]
+
+
+@pytest.mark.parametrize("size", [(8, 8), (8, 4), (3, 10), (1, 1)])
+def test_pixels_stay_square(size: tuple[int, int]):
+    width, height = size
+    places = PictureField(size).centred(pixel_grid(height, width)).view(height, width, 2)
+    step = 2 / max(size)
+    torch.testing.assert_close(places.diff(dim=1), torch.tensor([step, 0.0]).expand(height, width - 1, 2))
+    torch.testing.assert_close(places.diff(dim=0), torch.tensor([0.0, step]).expand(height - 1, width, 2))
+    torch.testing.assert_close(places.mean((0, 1)), torch.zeros(2), atol=1e-6, rtol=0)
+
+
+# Random sinusoids
+
+
+@pytest.mark.parametrize("size", [(64, 32), (32, 64)])
+def test_cycles_are_counted_over_the_longer_side(size: tuple[int, int]):
+    field, uv = FourierField(size, features=5, width=8), torch.rand(20, 2)
+    lengths = (uv - 0.5) * torch.tensor(size) / 64
+    angles = torch.tensor(
+        [[2 * math.pi * float(place @ field.cycles[:, k]) for k in range(5)] for place in lengths.unbind()]
+    )
+    torch.testing.assert_close(inputs_of(field, uv), torch.cat([angles.sin(), angles.cos()], dim=1), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(("size", "spread"), [((256, 100), 0.1), ((30, 60), 0.5)])
+def test_frequencies_spread_as_asked(size: tuple[int, int], spread: float):
+    cycles = FourierField(size, features=5000, spread=spread, width=4, depth=1).cycles
+    wanted = spread * max(size) / 2
+    for row in cycles:  # one in 10^6 draws lies further off
+        assert float(row.std()) == pytest.approx(wanted, rel=0.05) and abs(float(row.mean())) < wanted * 0.07
+    assert float((cycles.abs() < wanted).float().mean()) == pytest.approx(0.683, abs=0.025), "of a normal distribution"
+
+
+def test_a_checkpoint_keeps_the_random_frequencies():
+    field, other = (FourierField((20, 10), features=8, width=8) for _ in range(2))
+    assert not torch.equal(field.cycles, other.cycles)
+    assert "cycles" not in dict(field.named_parameters()), "they are not trained"
+    other.load_state_dict(field.state_dict())
+    uv = torch.rand(9, 2)
+    assert torch.equal(field(uv), other(uv))
+
+
+# Sines
+
+
+def test_the_first_frequency_is_the_papers_for_its_picture():
+    assert SirenField((256, 256), width=8, reach=0.075).first_frequency == pytest.approx(30, rel=0.01)
+    assert SirenField((256, 512), width=8, reach=0.075).first_frequency == pytest.approx(60, rel=0.01)
+
+
+@pytest.mark.parametrize("width", [32, 100])
+def test_initial_weights_fill_the_papers_bounds(width: int):
+    field = SirenField((64, 64), width=width, depth=3)
+    first, *later = [*field.hidden, field.last]
+    assert len(later) == 3 and first.weight.shape == (width, 2)
+    for layer, bound in [(first, 1 / 2), *((layer, math.sqrt(6 / width) / 30) for layer in later)]:
+        assert bound * 0.9 < float(layer.weight.detach().abs().max()) <= bound * (1 + 1e-6)
+        assert float(layer.weight.detach().std()) == pytest.approx(bound / math.sqrt(3), rel=0.25), "evenly"
+
+
+@pytest.mark.parametrize("size", [(40, 20), (20, 40)])
+def test_sines_agree_with_a_loop_over_layers(size: tuple[int, int]):
+    field, uv = SirenField(size, width=6, depth=3, reach=0.2), torch.rand(10, 2)
+    first = 0.2 * math.pi * 20
+    h = (2 * uv - 1) * torch.tensor(size) / 40
+    for layer, frequency in zip(field.hidden, (first, 30, 30), strict=True):
+        h = torch.sin(frequency * (h @ layer.weight.T + layer.bias))
+    expected = 0.5 + (h @ field.last.weight.T + field.last.bias) / 2
+    torch.testing.assert_close(field(uv), expected, atol=1e-4, rtol=0)
+
+
+def test_what_enters_the_sines_starts_out_with_variance_one():
+    """The paper's theorem 1.8, biases aside: so signals neither fade nor grow from layer to layer."""
+    field, seen = SirenField((256, 256), width=256, depth=4, reach=0.075), []
+    for layer in field.hidden[1:]:
+        layer.register_forward_hook(lambda layer, _, out: seen.append(30 * (out - layer.bias)))
+    field(torch.rand(2000, 2))
+    assert len(seen) == 3
+    for entering in seen:
+        assert float(entering.square().mean().detach()) == pytest.approx(1, abs=0.15)
+
+
+# Options
+
+
+@pytest.mark.parametrize("rate", [0.1, 1.0, 3.0])
+def test_a_fields_rate_multiplies_the_optimisers(rate: float):
+    fields = [HashGrid2DField((9, 9), rate=rate), FourierField((9, 9), rate=rate), SirenField((9, 9), rate=rate)]
+    for field in fields:
+        system = NeRF2D(field, functools.partial(torch.optim.SGD, lr=0.25), constant)
+        (group,) = system.configure_optimizers().param_groups
+        assert group["lr"] == group["initial_lr"] == pytest.approx(0.25 * rate)
+
+
+@pytest.mark.parametrize("kind", [HashGrid2DField, FourierField, SirenField])
+@pytest.mark.parametrize("rate", [0.0, -1.0, math.nan])
+def test_a_rate_that_is_not_above_zero_is_refused(kind, rate: float):
+    with pytest.raises(InputError, match="model.rate"):
+        kind((9, 9), rate=rate)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "key"),
+    [
+        (HashGrid2DField, {"log2_entries": 25}, "model.log2_entries"),
+        (PictureMLP, {"frequencies": -1}, "model.frequencies"),
+        *((FourierField, {"spread": spread}, "model.spread") for spread in (0.0, -0.1, math.nan)),
+        *((SirenField, {"reach": reach}, "model.reach") for reach in (0.0, -0.1, math.nan)),
+    ],
+)
+def test_options_that_make_no_field_are_refused(kind, options: dict, key: str):
+    with pytest.raises(InputError, match=key):
+        kind((9, 9), **options)
+
+
+def test_a_field_without_colours_says_what_it_lacks():
+    with pytest.raises(TypeError, match="PictureField must define forward"):
+        PictureField((9, 9))(torch.rand(3, 2))

@@ -1,0 +1,101 @@
+import functools
+
+import pytest
+import torch
+
+from nerf_lightning.dataset import Picture, PictureBatch, PixelDataModule
+from nerf_lightning.dataset.picture import builtin_picture
+from nerf_lightning.model import FourierField, HashGrid2DField, PictureField, PictureMLP, SirenField
+from nerf_lightning.system import NeRF2D, constant, nerf2d
+from nerf_lightning.system.nerf2d import dead_rectifiers
+
+SIZE = (20, 20)
+ADAM = functools.partial(torch.optim.Adam, lr=0.01)
+
+
+@pytest.fixture(scope="module")
+def view() -> PictureBatch:
+    return PixelDataModule(Picture("sunset", "test", builtin_picture(20))).held_out(0)
+
+
+def diagnosis(field: PictureField, view: PictureBatch) -> str:
+    return NeRF2D(field, ADAM, constant).diagnose(view)
+
+
+def shifted(field: PictureField, layer: int, by: float) -> PictureField:
+    """The field with the bias of one of its layers moved."""
+    with torch.no_grad():
+        [module for module in field.modules() if isinstance(module, torch.nn.Linear)][layer].bias += by
+    return field
+
+
+@pytest.mark.parametrize("make", [PictureMLP, FourierField])
+@pytest.mark.parametrize("layer", [0, 1, 2])
+def test_a_field_whose_rectifiers_are_all_off_is_told(make, layer: int, view):
+    field = shifted(make(SIZE, width=16), layer, -1e4)
+    told = diagnosis(field, view)
+    assert "same colour" in told and "100% of a layer's rectifiers are off" in told and "lower learning rate" in told
+    shares = dead_rectifiers(field, view.uv)
+    assert len(shares) == 3 and shares[layer] == 1.0 and max(shares[:layer], default=0) < 1
+
+
+@pytest.mark.parametrize(
+    "make", [functools.partial(PictureMLP, width=16), functools.partial(FourierField, width=16), SirenField]
+)
+def test_a_healthy_field_has_nothing_to_tell(make, view):
+    assert diagnosis(make(SIZE), view) == ""
+
+
+def test_a_field_of_one_colour_without_rectifiers_is_told_as_that(view):
+    told = diagnosis(shifted(SirenField(SIZE, width=16), -1, 50.0), view)
+    assert told == "every place gets the same colour"
+    assert diagnosis(HashGrid2DField(SIZE), view) == told, "its tables start out as nearly nothing"
+
+
+def test_a_saturated_field_does_not_blame_its_rectifiers(view):
+    assert "rectifiers" not in diagnosis(shifted(PictureMLP(SIZE, width=16), -1, 100.0), view)
+
+
+class OneChannel(PictureField):
+    """Red differs by so much between left and right; green and blue do not."""
+
+    def __init__(self, contrast: float):
+        super().__init__(SIZE)
+        self.contrast = torch.nn.Parameter(torch.tensor(contrast))
+
+    def forward(self, uv: torch.Tensor) -> torch.Tensor:
+        return 0.3 + torch.cat([self.contrast * (uv[:, :1] > 0.5), torch.zeros_like(uv)], dim=1)
+
+
+@pytest.mark.parametrize(("levels", "told"), [(0.9, True), (1.1, False)])
+def test_what_no_picture_can_show_counts_as_one_colour(levels: float, told: bool, view):
+    assert bool(diagnosis(OneChannel(levels / 255), view)) == told
+
+
+class HalfDead(PictureField):
+    """Two rectifiers of four are off everywhere, one is on in the last row alone."""
+
+    def __init__(self):
+        super().__init__(SIZE)
+        self.rectifier = torch.nn.ReLU()
+
+    def forward(self, uv: torch.Tensor) -> torch.Tensor:
+        self.asked = len(uv)
+        y = uv[:, 1:]
+        return self.rectifier(torch.cat([y - 1, -y, y - 0.96, y], dim=1))[:, 1:]
+
+
+def test_a_rectifier_is_dead_where_it_is_off_at_every_place(view, monkeypatch):
+    field = HalfDead()
+    assert dead_rectifiers(field, view.uv) == [0.5]
+    assert dead_rectifiers(field, view.uv[:-20]) == [0.75]
+    assert dead_rectifiers(SirenField(SIZE), view.uv) == []
+    monkeypatch.setattr(nerf2d, "RENDER_CHUNK", 25)
+    assert dead_rectifiers(field, view.uv)[0] >= 0.5 and field.asked == 25, "some places of a large picture are enough"
+
+
+def test_looking_leaves_a_field_as_it_was(view):
+    field = PictureMLP(SIZE, width=8)
+    dead_rectifiers(field, view.uv)
+    assert not any(module._forward_hooks for module in field.modules())
+    assert field(view.uv).requires_grad and all(p.grad is None for p in field.parameters())

@@ -1,0 +1,56 @@
+"""What a picture's run leaves in its folder."""
+
+import json
+from pathlib import Path
+
+import imageio.v3 as imageio
+import pytest
+from PIL import Image
+
+from nerf_lightning.compose import composed
+from nerf_lightning.training import train
+
+SMALL = ["+experiment=picture", "dataset.max_side=24", "budget.steps=20", "render.scale=2"]
+STEPS = [1, 2, 5, 10, 20]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
+    folder = tmp_path_factory.mktemp("picture")
+    train(composed(SMALL, folder))
+    return folder
+
+
+def read(path: Path) -> dict:
+    return json.loads(path.read_text())
+
+
+def test_a_run_leaves_its_pictures_and_figures(run: Path):
+    assert {path.name for path in run.iterdir()} >= {
+        "baselines.json", "checkpoints", "config.yaml", "curve.png", "enlarged.json", "enlarged.png",
+        "enlarged_panel.png", "error.png", "final.png", "results.json", "snapshots", "spectrum.png", "training.gif",
+    }  # fmt: skip
+    assert sorted(path.name for path in (run / "snapshots").iterdir()) == [f"step_{step:07d}.png" for step in STEPS]
+    assert not list(run.glob("**/.*")), "no temporary file stays behind"
+
+
+def test_pictures_have_their_sizes(run: Path):
+    assert imageio.imread(run / "final.png").shape == (24, 24, 3)
+    assert imageio.imread(run / "enlarged.png").shape == (48, 48, 3)
+    with Image.open(run / "training.gif") as gif:
+        assert len(STEPS) <= gif.n_frames <= len(STEPS) + 2 and gif.width <= 640
+
+
+def test_figures_agree_with_each_other(run: Path):
+    results, baselines, enlarged = (read(run / f"{name}.json") for name in ("results", "baselines", "enlarged"))
+    assert (results["method"], results["steps"], results["scene"]["name"]) == ("hashgrid2d", 20, "sunset")
+    assert baselines["bytes"] == results["artifact_bytes"] and baselines["field"] == results["psnr"]
+    assert baselines["picture_bytes"] == 24 * 24 * 3 and baselines["bicubic"]["psnr"] is None
+    assert enlarged["scale"] == 2 and enlarged["field"] > 5 and enlarged["bicubic"] > enlarged["field"]
+    assert len(results["curve"]) > 5 and results["curve"][-1][1:] == [20, results["psnr"]]
+
+
+def test_nothing_is_enlarged_unless_asked(tmp_path: Path):
+    assert composed(SMALL, tmp_path).callbacks.enlarge.scale == 2
+    for experiment in ("picture", "picture_mlp", "smoke_2d"):
+        assert composed([f"+experiment={experiment}"], tmp_path).callbacks.enlarge.scale is None
