@@ -26,7 +26,9 @@ def test_a_picture_is_known_at_sizes_up_to_its_own():
     assert torch.equal(no_larger_than(original, 12, 8), original)
     smaller = no_larger_than(original, 6, 4)
     assert smaller.shape == (4, 6, 3) and (smaller == 100).all(), "averaged"
-    assert no_larger_than(original, 14, 8) is None and no_larger_than(original, 12, 10) is None, "one more may be rounding"
+    assert no_larger_than(original, 14, 8) is None and no_larger_than(original, 12, 10) is None, (
+        "one more may be rounding"
+    )
 
 
 def test_nothing_is_known_of_a_picture_that_does_not_say():
