@@ -20,7 +20,7 @@ def error_chart(rgb: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], titl
     """The error of every pixel, mean over the colours, with its scale."""
     error = (rgb - truth).abs().mean(-1).numpy() * 255
     height, width = error.shape
-    figure = Figure(figsize=(8, 1 + 7 * height / width), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(8, 1 + 7 * min(max(height / width, 0.2), 3)), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     # The brightest hundredth of a percent would darken all others.
     top = max(float(np.percentile(error, 99.9)), 1e-3)
@@ -34,8 +34,11 @@ def curve_chart(curve: list[list[float]], title: str) -> Figure:
     """PSNR over training seconds and over steps."""
     figure = Figure(figsize=(12, 4.5), dpi=DPI, layout="constrained")
     for axes, column, label in zip(figure.subplots(1, 2), (0, 1), ("training seconds", "step"), strict=True):
-        axes.plot([p[column] for p in curve], [p[2] for p in curve], "o-", color=BLUE, markersize=4)
-        axes.set(xlabel=label, ylabel="PSNR, dB", xscale="log")
+        points = [(p[column], p[2]) for p in curve if p[column] > 0]  # on a logarithmic axis
+        if points:
+            axes.plot(*zip(*points, strict=True), "o-", color=BLUE, markersize=4)
+            axes.set_xscale("log")
+        axes.set(xlabel=label, ylabel="PSNR, dB")
         axes.grid(alpha=0.3, which="both")
     figure.suptitle(title)
     return figure

@@ -28,7 +28,8 @@ def by_frequency(
     """Root mean square over rings of equal frequency: their middles in cycles a pixel, and the sizes (nan for empty rings)."""
     down, across = (np.fft.fftshift(np.fft.fftfreq(n)) for n in spectrum.shape)
     radius = np.hypot(down[:, None], across)
-    ring = np.minimum((radius / 0.5 * bands).astype(int), bands)  # the corners beyond 0.5 go into a ring of their own
+    # The last ring ends with 0.5 itself; the corners beyond go into one of their own.
+    ring = np.where(radius <= 0.5, np.minimum((radius / 0.5 * bands).astype(int), bands - 1), bands)
     count = np.bincount(ring.ravel(), minlength=bands + 1)[:bands]
     power = np.bincount(ring.ravel(), (spectrum**2).ravel(), minlength=bands + 1)[:bands]
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -27,7 +27,7 @@ class TrainingGif(L.Callback):
     """
 
     def __init__(self, path: str = "training.gif", fps: float = 3, width: int = 640):
-        if fps <= 0:
+        if not fps > 0:
             raise InputError("callbacks.training_gif.fps", "", str(fps), "more than 0")
         if width < 1:
             raise InputError("callbacks.training_gif.width", "", str(width), "at least 1")

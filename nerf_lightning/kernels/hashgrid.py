@@ -62,28 +62,31 @@ def hash_interpolate_reference(
     return (entries * torch.stack(weights)[..., None]).sum(1).transpose(0, 1).flatten(1)
 
 
-class _HashInterpolate(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, tables: Tensor, unit: Tensor, resolutions: list[int], sizes: list[int]) -> Tensor:
-        from nerf_lightning.kernels.cpu import hashgrid, workers
+class HashInterpolate(torch.autograd.Function):
+    """The fast version, in two or three dimensions."""
 
+    @staticmethod
+    def forward(ctx, tables: Tensor, unit: Tensor, resolutions: list, sizes: list[int]) -> Tensor:
+        from nerf_lightning.kernels.cpu import hashgrid, hashgrid2d, workers
+
+        kernels = ctx.kernels = hashgrid if unit.shape[1] == 3 else hashgrid2d
         places = unit.T.contiguous()
         ctx.save_for_backward(places)
         ctx.levels = np.array(resolutions, np.int32), np.array(sizes, np.int64)
         ctx.shape = tuple(tables.shape)
         features = (0,) * tables.shape[1]
         out = torch.empty(len(sizes) * tables.shape[1], len(unit))
-        hashgrid.interpolate(tables.detach().numpy(), places.numpy(), *ctx.levels, out.numpy(), features, workers())
+        kernels.interpolate(tables.detach().numpy(), places.numpy(), *ctx.levels, out.numpy(), features, workers())
         return out.T
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        from nerf_lightning.kernels.cpu import hashgrid, workers
+        from nerf_lightning.kernels.cpu import workers
 
         (places,) = ctx.saved_tensors
         tables = torch.empty(ctx.shape)
         above, features = grad.T.contiguous().numpy(), (0,) * ctx.shape[1]
-        hashgrid.scatter(tables.numpy(), places.numpy(), *ctx.levels, above, features, workers())
+        ctx.kernels.scatter(tables.numpy(), places.numpy(), *ctx.levels, above, features, workers())
         return tables, None, None, None
 
 
@@ -99,5 +102,5 @@ def hash_interpolate(
         sizes: entries of each level's table: all corners of its grid, or a power of two to hash into.
     """
     if fast(tables, unit) and not unit.requires_grad:
-        return _HashInterpolate.apply(tables, unit, resolutions, sizes)
+        return HashInterpolate.apply(tables, unit, resolutions, sizes)
     return hash_interpolate_reference(tables, unit, resolutions, sizes)

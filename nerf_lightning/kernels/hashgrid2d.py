@@ -1,11 +1,10 @@
 """Bilinear interpolation on nested grids with hashed entries: `hashgrid` in two dimensions (Instant-NGP, section 3)."""
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.kernels.hashgrid import PRIMES
+from nerf_lightning.kernels.hashgrid import PRIMES, HashInterpolate
 from nerf_lightning.kernels.switch import fast
 
 Resolution = tuple[int, int]
@@ -54,31 +53,6 @@ def hash_interpolate_2d_reference(
     return torch.cat(out, dim=1)
 
 
-class _HashInterpolate2D(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, tables: Tensor, unit: Tensor, resolutions: list[Resolution], sizes: list[int]) -> Tensor:
-        from nerf_lightning.kernels.cpu import hashgrid2d, workers
-
-        places = unit.T.contiguous()
-        ctx.save_for_backward(places)
-        ctx.levels = np.array(resolutions, np.int32), np.array(sizes, np.int64)
-        ctx.shape = tuple(tables.shape)
-        features = (0,) * tables.shape[1]
-        out = torch.empty(len(sizes) * tables.shape[1], len(unit))
-        hashgrid2d.interpolate(tables.detach().numpy(), places.numpy(), *ctx.levels, out.numpy(), features, workers())
-        return out.T
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        from nerf_lightning.kernels.cpu import hashgrid2d, workers
-
-        (places,) = ctx.saved_tensors
-        tables = torch.empty(ctx.shape)
-        above, features = grad.T.contiguous().numpy(), (0,) * ctx.shape[1]
-        hashgrid2d.scatter(tables.numpy(), places.numpy(), *ctx.levels, above, features, workers())
-        return tables, None, None, None
-
-
 def hash_interpolate_2d(
     tables: Float[Tensor, "T F"], unit: Float[Tensor, "N 2"], resolutions: list[Resolution], sizes: list[int]
 ) -> Float[Tensor, "N LF"]:
@@ -91,5 +65,5 @@ def hash_interpolate_2d(
         sizes: entries of each level's table: all corners of its grid, or a power of two to hash into.
     """
     if fast(tables, unit) and not unit.requires_grad:
-        return _HashInterpolate2D.apply(tables, unit, resolutions, sizes)
+        return HashInterpolate.apply(tables, unit, resolutions, sizes)
     return hash_interpolate_2d_reference(tables, unit, resolutions, sizes)

@@ -26,7 +26,7 @@ class HashGrid2DField(PictureField):
 
     Args:
         size: see `PictureField`.
-        levels: how many grids.
+        levels: how many grids; fewer where a picture is so small that they would be the same.
         log2_entries: each level keeps at most 2^log2_entries entries; finer levels than fit share them by hashing. None takes
             the most with which all levels together hold half as many numbers as the picture.
         features: numbers an entry.
@@ -48,10 +48,9 @@ class HashGrid2DField(PictureField):
         super().__init__(size, rate)
         cells = [max(side - 1, 1) for side in size]
         finest = max(cells)
-        self.resolutions = [
-            (max(1, round(cells[0] * r / finest)), max(1, round(cells[1] * r / finest)))
-            for r in level_resolutions(levels, min(coarsest, finest), finest)
-        ]
+        first = finest if levels == 1 else min(coarsest, finest)
+        scaled = [[max(1, round(c * r / finest)) for c in cells] for r in level_resolutions(levels, first, finest)]
+        self.resolutions = list(dict.fromkeys((across, down) for across, down in scaled))  # a small picture has fewer
         if log2_entries is None:
             numbers = SHARE * 3 * size[0] * size[1]
             fitting = [e for e in range(4, 25) if sum(level_sizes(self.resolutions, 2**e)) * features <= numbers]
@@ -60,7 +59,7 @@ class HashGrid2DField(PictureField):
             raise InputError("model.log2_entries", "", str(log2_entries), "at most 24")
         self.sizes = level_sizes(self.resolutions, 2**log2_entries)
         self.tables = torch.nn.Parameter(torch.empty(sum(self.sizes), features).uniform_(-1e-4, 1e-4))
-        self.net = layers(levels * features, width, 3)
+        self.net = layers(len(self.sizes) * features, width, 3)
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         width, height = self.size

@@ -183,3 +183,15 @@ def test_only_the_first_process_writes(make, trainer_with, system, tmp_path: Pat
     trainer.is_global_zero = False
     make().on_test_end(trainer, system)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("height", "width"), [(3000, 5), (5, 3000)])
+def test_charts_of_thin_pictures_stay_of_a_size_to_look_at(height: int, width: int):
+    figure = error_chart(torch.zeros(height, width, 3), torch.ones(height, width, 3), "")
+    assert all(2 <= side <= 25 for side in figure.get_size_inches())
+
+
+def test_a_curve_that_took_no_time_is_drawn_all_the_same():
+    figure = curve_chart([[0.0, 0, 10.0], [0.0, 1, 12.0]], "")
+    seconds, steps = figure.axes
+    assert not seconds.lines and list(steps.lines[0].get_xdata()) == [1]

@@ -116,6 +116,17 @@ def test_cells_stay_nearly_square_at_every_level(size: tuple[int, int]):
         assert abs(across / (size[0] - 1) - down / (size[1] - 1)) * (min(size) - 1) <= 1
 
 
+@pytest.mark.parametrize(("size", "levels"), [((16, 12), 1), ((18, 18), 2), ((20, 20), 4), ((512, 300), 8)])
+def test_no_two_levels_are_the_same(size: tuple[int, int], levels: int):
+    field = HashGrid2DField(size)
+    assert len(set(field.resolutions)) == len(field.resolutions) == levels
+    assert field(torch.rand(5, 2)).shape == (5, 3)
+
+
+def test_a_single_level_is_the_finest():
+    assert HashGrid2DField((300, 200), levels=1).resolutions == [(299, 199)]
+
+
 def test_a_given_table_size_is_kept():
     assert max(HashGrid2DField((256, 256), log2_entries=9).sizes) == 2**9
     assert HashGrid2DField((64, 64), log2_entries=20).sizes[-1] == 64 * 64, "a level needs no more than its corners"
