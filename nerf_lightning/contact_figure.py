@@ -17,8 +17,6 @@ from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.ink import BLUE, DPI, GREY, VERMILLION, readable, shortened
 from nerf_lightning.runs import FINISHED, Run, varied
 
-ACROSS = 6
-"""Pictures in a row, where no option says how many."""
 MOST = 60
 """Pictures in a figure; of more runs the best are shown."""
 SIDE = 320
@@ -43,7 +41,7 @@ def contact_figure(runs: Sequence[Run], title: str) -> Figure:
     rows, columns = len(cells), len(cells[0])
     sheet_width, sheet_height = columns * CELL, rows * (CELL + 0.45)
     notes = "\n".join(
-        line for trouble in troubles[:12] for line in textwrap.wrap(trouble, round(sheet_width * 12 + 90))
+        line for trouble in troubles[:12] for line in textwrap.wrap(readable(trouble), round(sheet_width * 12 + 90))
     )
     note_height = 0.2 * (notes.count("\n") + 1) + 0.2 if notes else 0.0
     height = max(sheet_height, 5.0) + note_height + 0.5
@@ -58,7 +56,7 @@ def contact_figure(runs: Sequence[Run], title: str) -> Figure:
     if keys:
         _by_option(charts[1], shown, keys)
     if notes:
-        parts[1].text(0.01, 0.98, readable(notes), va="top", fontsize=9, color=VERMILLION, parse_math=False)
+        parts[1].text(0.01, 0.98, notes, va="top", fontsize=9, color=VERMILLION, parse_math=False)
     return figure
 
 
@@ -104,7 +102,7 @@ def _arranged(runs: Sequence[Run], keys: Sequence[str]) -> list[list[Run | None]
         if len(places) == len(runs) and len(runs) > len(down) * len(across) / 2:
             return [[places.get((row, column)) for column in across] for row in down]
     ordered: list[Run | None] = [*_ordered(runs, keys)]
-    columns = min(len(ordered), ACROSS)
+    columns = math.ceil(math.sqrt(1.2 * len(ordered)))
     ordered += [None] * (-len(ordered) % columns)
     return [ordered[start : start + columns] for start in range(0, len(ordered), columns)]
 

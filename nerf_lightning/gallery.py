@@ -45,7 +45,8 @@ def draw(root: Path, output: Path | None = None) -> Path:
     runs = find_runs(root)
     scenes = sorted({str((run.results.get("scene") or {}).get("name", "")) for run in runs} - {""})
     path = root / FIGURE if output is None else output
-    write_png(path, pixels_of(contact_figure(runs, f"{root.name}: {', '.join(scenes)}" if scenes else root.name)))
+    title = ": ".join(["/".join(root.resolve().parts[-2:]), *filter(None, [", ".join(scenes)])])
+    write_png(path, pixels_of(contact_figure(runs, title)))
     return path
 
 

@@ -11,6 +11,9 @@ from nerf_lightning.system.system import MakeOptimizer, Schedule, StepStats, Sys
 RENDER_CHUNK = 1 << 16
 """Pixels rendered together without gradient."""
 
+SATURATED = 1 / 255
+"""From 0 or 1, where the slope of a sigmoid is less than a fiftieth of its largest."""
+
 
 class NeRF2D(System):
     """field -> squared error.
@@ -46,17 +49,21 @@ class NeRF2D(System):
         """The field's colours at any places, a chunk at a time, cut to [0, 1]."""
         return torch.cat([self.field(part).clamp(0, 1) for part in uv.split(RENDER_CHUNK)])
 
+    @torch.no_grad()
     def diagnose(self, view: PictureBatch) -> str:
         rgb = self.colours(view.uv)
         if (rgb.amax(0) - rgb.amin(0)).max() > 1 / 255:
             return ""
-        dead = dead_rectifiers(self.field, view.uv)
-        if max(dead, default=0.0) < 0.5:
+        causes = []
+        dead = max(dead_rectifiers(self.field, view.uv), default=0.0)
+        if dead >= 0.5:
+            causes.append(f"{dead:.0%} of a layer's rectifiers are off wherever one looks, so no gradient reaches them")
+        raw = self.field(view.uv[:1])
+        if ((raw - 0.5).abs() <= 0.5).all() and ((raw - 0.5).abs() > 0.5 - SATURATED).all():
+            causes.append("its parts are all at the ends of their range, where a sigmoid has hardly any slope")
+        if not causes:
             return "every place gets the same colour"
-        return (
-            f"every place gets the same colour; {max(dead):.0%} of a layer's rectifiers are off wherever one looks, so no "
-            f"gradient reaches them; a lower learning rate keeps them alive"
-        )
+        return f"every place gets the same colour: {'; '.join(causes)}; a lower learning rate keeps away from there"
 
 
 @torch.no_grad()

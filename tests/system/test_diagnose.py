@@ -52,8 +52,10 @@ def test_a_field_of_one_colour_without_rectifiers_is_told_as_that(view):
     assert diagnosis(HashGrid2DField(SIZE), view) == told, "its tables start out as nearly nothing"
 
 
-def test_a_saturated_field_does_not_blame_its_rectifiers(view):
-    assert "rectifiers" not in diagnosis(shifted(PictureMLP(SIZE, width=16), -1, 100.0), view)
+@pytest.mark.parametrize("by", [100.0, -100.0])
+def test_a_saturated_field_blames_its_sigmoid_and_not_its_rectifiers(by: float, view):
+    told = diagnosis(shifted(PictureMLP(SIZE, width=16), -1, by), view)
+    assert "sigmoid" in told and "lower learning rate" in told and "rectifiers" not in told
 
 
 class OneChannel(PictureField):
