@@ -19,6 +19,8 @@ from nerf_lightning.runs import FINISHED, Run, varied
 
 MOST = 60
 """Pictures in a figure; of more runs the best are shown."""
+WIDEST = 10
+"""Columns of a table that can still be looked at."""
 SIDE = 320
 """Pixels of a picture's longer side."""
 CELL = 2.3
@@ -99,7 +101,8 @@ def _arranged(runs: Sequence[Run], keys: Sequence[str]) -> list[list[Run | None]
     if len(keys) == 2:
         down, across = ([_text(value) for value in _values(runs, key)] for key in keys)
         places = {tuple(_text(run.option(key)) for key in keys): run for run in runs}
-        if len(places) == len(runs) and len(runs) > len(down) * len(across) / 2:
+        full = len(places) == len(runs) and len(runs) > len(down) * len(across) / 2
+        if full and len(across) <= WIDEST:
             return [[places.get((row, column)) for column in across] for row in down]
     ordered: list[Run | None] = [*_ordered(runs, keys)]
     columns = math.ceil(math.sqrt(1.2 * len(ordered)))

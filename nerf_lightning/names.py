@@ -28,7 +28,7 @@ def sweep_folder(arguments: Sequence[str]) -> str:
     given: dict[str, str] = {}
     for argument in arguments:
         key, equals, value = argument.lstrip("+").partition("=")
-        if equals and not argument.startswith("-") and not key.startswith(("hydra.", "hydra/")):
+        if (equals or key.startswith("~")) and not key.startswith(("-", "hydra.", "hydra/")):
             given[key] = value
     experiment = given.pop("experiment", "run")
     name = given.pop("name", experiment)

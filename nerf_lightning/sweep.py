@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 TABLE = "sweep.csv"
 COLUMNS = ("psnr", "ssim", "train_seconds", "steps", "parameters", "artifact_bytes")
-LEFT_BEHIND = ("results.json", "final.png", "checkpoints", "snapshots")
+OUTCOME = ("results.json", "error.txt")
+"""What says how a job ended, which is open once it starts again."""
+STATE = ("final.png", "checkpoints", "snapshots")
 """What of an earlier run with other options would be taken for a new one's."""
 
 
@@ -48,11 +50,10 @@ def job(cfg: "DictConfig") -> float | None:
             told = "without a figure" if before.psnr is None else f"{before.psnr:.2f} dB"
             print(f"{folder.name}: done before ({before.status}, {told})", flush=True)
             return before.psnr
-        checkpoint = folder / "checkpoints" / "last.ckpt" if same else None
-        if checkpoint is None or not usable(checkpoint):
-            checkpoint = None
+        last = folder / "checkpoints" / "last.ckpt"
+        checkpoint = last if same and usable(last) else None
         if leader:
-            for name in LEFT_BEHIND if checkpoint is None else LEFT_BEHIND[:1]:
+            for name in OUTCOME if checkpoint else OUTCOME + STATE:
                 remove(folder / name)
         print(f"{folder.name}: {'starts' if checkpoint is None else 'goes on from its last checkpoint'}", flush=True)
         return train(cfg, checkpoint)
@@ -61,8 +62,9 @@ def job(cfg: "DictConfig") -> float | None:
             record(folder, cfg, error)
         return None
     finally:
-        if leader and root.is_dir():
-            write_table(root, find_runs(root))
+        with suppress(InputError):  # interrupted before any job left something
+            if leader:
+                write_table(root, find_runs(root))
 
 
 def usable(checkpoint: Path) -> bool:

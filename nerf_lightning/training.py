@@ -102,13 +102,21 @@ def check_processes(trainer: L.Trainer, system: System) -> None:
     if isinstance(system, NeRF3D) and type(system.field).grow is not Field.grow:
         name = type(system.field).__name__
         raise InputError(
-            "config", "model", f"{name}, which grows", "a field of fixed size for several processes", "hashgrid"
+            "config",
+            "model",
+            f"{name}, which grows",
+            "a field of fixed size for several processes",
+            "choose model=hashgrid",
         )
     cluster = getattr(trainer.strategy, "cluster_environment", None)
     if HydraConfig.get().mode == RunMode.MULTIRUN and not getattr(cluster, "creates_processes_externally", False):
         expected = "one process a job in a sweep"
         raise InputError(
-            "config", "trainer.devices", str(trainer.world_size), expected, "or a launcher that starts them"
+            "config",
+            "trainer.devices",
+            str(trainer.world_size),
+            expected,
+            "or a launcher that starts the processes itself",
         )
 
 

@@ -31,7 +31,7 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
     done = command("--help", cwd=tmp_path)
     assert done.returncode == 0
     assert "+experiment=lego" in done.stdout
-    assert "model: hashgrid" in done.stdout
+    assert "model: fourier, hashgrid, hashgrid2d" in done.stdout
     probe = "import sys; sys.argv = ['x', '--help']\nfrom nerf_lightning.__main__ import main\n"
     probe += "try: main()\nfinally: print(sorted({'torch', 'lightning', 'cv2'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", probe], cwd=ROOT, capture_output=True, text=True, timeout=60)

@@ -45,6 +45,7 @@ def test_a_job_that_raises_is_named_and_the_others_go_on(inside, tmp_path: Path)
     assert json.loads((root / "model.width=-1" / "results.json").read_text())["seed"] == 0
     code, out, err = inside("-m", *SMALL, "model.width=8,-1,16,9")
     assert code == 1 and out.count("done before") == 3, "what failed is tried again"
+    assert (root / "model.width=-1" / "error.txt").is_file()
 
 
 def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(inside, tmp_path: Path, monkeypatch):
@@ -76,6 +77,7 @@ def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(
     (broken / "config.yaml").write_text(text.replace("lr: 0.01", "lr: 0.02"))
     code, out, err = inside(*small, "budget.steps=20", "name=broken", steps)
     assert "seed=0: done before" in out and "seed=1: starts" in out
+    assert not (broken / "error.txt").exists()
 
 
 def test_a_study_is_one_command(inside, tmp_path: Path):
@@ -128,3 +130,11 @@ def test_two_processes_share_a_run_and_leave_one_folder(tmp_path: Path):
 def test_a_missing_launcher_says_what_to_install(inside, monkeypatch):
     code, out, err = inside("-m", *SMALL, "seed=0,1", "hydra/launcher=submitit_lunar")
     assert code == 2 and "nerf_lightning[sweeps]" in err and err.count("\n") == 1
+
+
+def test_several_processes_refuse_what_they_cannot_share(inside):
+    pair = ["trainer=ddp", "trainer.accelerator=cpu"]
+    code, out, err = inside("model=tensorf", "dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", *pair)
+    assert code == 2 and "TensoRFField, which grows" in err and "model=hashgrid" in err
+    code, out, err = inside("-m", *SMALL, "seed=0,1", *pair)
+    assert code == 1 and err.count("one process a job in a sweep") >= 2

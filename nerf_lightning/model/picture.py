@@ -31,7 +31,7 @@ class PictureMLP(PictureField):
         depth: hidden layers.
     """
 
-    def __init__(self, size: tuple[int, int], frequencies: int | None = 10, width: Count = 256, depth: Count = 3):
+    def __init__(self, size: tuple[int, int], frequencies: int | None = None, width: Count = 256, depth: Count = 3):
         super().__init__(size)
         if frequencies is None:
             # The last octave has 2^(L-1) / 2 cycles over the picture, and `nyquist` is the most that its pixels can show.
