@@ -1,5 +1,6 @@
 """The page about a scene: what is drawn against the scene's own geometry, the server, and the command line."""
 
+import functools
 import http.client
 import math
 import os
@@ -247,7 +248,11 @@ def command(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     environment.pop("NERF_LIGHTNING_TRACEBACK", None)
     line = [sys.executable, "-m", "nerf_lightning.view", *arguments]
-    return subprocess.Popen(line, cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    listen = functools.partial(
+        signal.signal, signal.SIGINT, signal.SIG_DFL
+    )  # what runs in the background may ignore it
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(line, cwd=cwd, env=environment, preexec_fn=listen, **pipes)
 
 
 def test_ctrl_c_ends_it_cleanly_and_nothing_is_written(scene: Scene, tmp_path: Path):
