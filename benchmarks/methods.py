@@ -24,9 +24,7 @@ def train(experiment: str, overrides: list[str], seed: int, folder: Path, measur
     """One run; returns its results.json."""
     command = [sys.executable, "-m", "nerf_lightning", f"+experiment={experiment}", *overrides]
     command += [f"seed={seed}", f"callbacks.heldout.at=[{measured_at}]"]
-    command += ["callbacks.snapshots.steps=[]", f"hydra.run.dir='{folder}'"]
-    if not experiment.startswith("picture"):
-        command += ["callbacks.orbit.frames=0"]
+    command += ["callbacks.snapshots.steps=[]", "callbacks.orbit=null", f"hydra.run.dir='{folder}'"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"benchmarks: {experiment} failed: {done.stderr.strip().splitlines()[-1:]}")
@@ -80,10 +78,8 @@ def measure(
         by_budget: dict[float, list[Run]] = {}
         for seconds in budgets:
             for seed in seeds:
-                given, place = (
-                    [*overrides, f"budget.seconds={seconds}"],
-                    folder / f"{experiment}_{seconds:g}s_seed{seed}",
-                )
+                given = [*overrides, f"budget.seconds={seconds}"]
+                place = folder / f"{experiment}_{seconds:g}s_seed{seed}"
                 run = train(experiment, given, seed, place, marks(seconds))
                 print(f"{experiment}, {seconds:g} s, seed {seed}: {run['psnr']:.2f} dB", flush=True)
                 by_budget.setdefault(seconds, []).append(run)

@@ -7,7 +7,11 @@ from nerf_lightning import cli
 from nerf_lightning.options import check_options
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from omegaconf import DictConfig
+
+    from nerf_lightning.runs import Run
 
 FIGURE = "gallery.png"
 
@@ -31,18 +35,18 @@ def gallery(runs: str, output: str | None) -> None:
     Raises:
         InputError: no such folder, or no run in it.
     """
+    from nerf_lightning.runs import find_runs
+
     root = Path(runs).expanduser()
-    print(f"figure: {draw(root, None if output is None else Path(output).expanduser())}")
+    print(f"figure: {draw(root, find_runs(root), None if output is None else Path(output).expanduser())}")
 
 
-def draw(root: Path, output: Path | None = None) -> Path:
-    """Draws the runs below a folder; returns the path of the PNG."""
+def draw(root: Path, runs: "Sequence[Run]", output: Path | None = None) -> Path:
+    """Draws the runs found below a folder; returns the path of the PNG."""
     from nerf_lightning.callbacks.panels import write_png
     from nerf_lightning.contact_figure import contact_figure
     from nerf_lightning.ink import pixels_of
-    from nerf_lightning.runs import find_runs
 
-    runs = find_runs(root)
     scenes = sorted({str((run.results.get("scene") or {}).get("name", "")) for run in runs} - {""})
     path = root / FIGURE if output is None else output
     title = ": ".join(["/".join(root.resolve().parts[-2:]), *filter(None, [", ".join(scenes)])])

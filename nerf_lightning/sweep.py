@@ -153,7 +153,7 @@ class SweepReport(Callback):
         print_table(root, runs)
         failed = [run for run in runs if run.status not in FINISHED and run.status != "stopped_early"]
         try:
-            print(f"table: {root / TABLE}; figure: {draw(root)}")
+            print(f"table: {root / TABLE}; figure: {draw(root, runs)}")
         finally:
             if failed:
                 told = ", ".join(str(run.folder.relative_to(root)) for run in failed)

@@ -86,6 +86,7 @@ def test_the_gallery_draws_what_lies_in_a_folder(tmp_path: Path):
     for name, text in {"a": "{}", "b": '{"status": "finished", "psnr": 3'}.items():
         (tmp_path / "runs" / name).mkdir(parents=True)
         (tmp_path / "runs" / name / "results.json").write_text(text)
-    assert [run.status for run in find_runs(tmp_path / "runs")] == ["unreadable", "unreadable"]
-    assert draw(tmp_path / "runs") == tmp_path / "runs" / "gallery.png"
-    assert imageio.imread(draw(tmp_path / "runs", tmp_path / "mine.png")).std() > 1
+    found = find_runs(tmp_path / "runs")
+    assert [run.status for run in found] == ["unreadable", "unreadable"]
+    assert draw(tmp_path / "runs", found) == tmp_path / "runs" / "gallery.png"
+    assert imageio.imread(draw(tmp_path / "runs", found, tmp_path / "mine.png")).std() > 1

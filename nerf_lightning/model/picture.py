@@ -9,6 +9,7 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import PictureField
+from nerf_lightning.model.hashgrid import layers
 from nerf_lightning.options import Count
 
 
@@ -109,8 +110,7 @@ class SirenField(PictureField):
             raise InputError("model.reach", "", str(reach), "above 0")
         # In radians a unit, and the longer side is 2 units long: at most pi * nyquist.
         self.first_frequency = reach * math.pi * self.nyquist
-        widths = [2, *[width] * depth]
-        self.hidden = torch.nn.ModuleList(torch.nn.Linear(i, o) for i, o in zip(widths[:-1], widths[1:], strict=True))
+        self.hidden = layers(2, *[width] * depth)
         self.last = torch.nn.Linear(width, 3)
         with torch.no_grad():
             for index, layer in enumerate([*self.hidden, self.last]):
