@@ -133,7 +133,7 @@ def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, sys
     if isinstance(data, PixelDataModule) or data.scene.train.images.shape[-1] == 4:
         return
     assert isinstance(system, NeRF3D)  # what build_system makes for rays
-    wanted = "random" if system.renderer.random else [round(c, 3) for c in system.renderer.colour.tolist()]
+    wanted = "random" if system.renderer.random else system.background
     if wanted != [round(c, 3) for c in data.scene.background]:
         raise InputError(
             "config: renderer.background",

@@ -192,7 +192,7 @@ def _by_option(axes: Axes, runs: Sequence[Run], keys: Sequence[str]) -> None:
         axes.set_xticks(places, [shortened(readable(_text(value)), 24) for value in values], parse_math=False)
     axes.set(xlabel=readable(main), ylabel="final PSNR, dB")
     axes.grid(alpha=0.3)
-    if (others and len(groups) <= 12) or lost:
+    if ((others and len(groups) <= 12) or lost) and axes.lines:
         axes.legend(fontsize=7)
 
 

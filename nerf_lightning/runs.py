@@ -1,6 +1,7 @@
 """Run folders as tables and charts read them: tolerant of broken ones, and never executing what they hold."""
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,17 +36,25 @@ class Run:
             node = node.get(part) if isinstance(node, dict) else None
         return node
 
+    def figure(self, key: str) -> float | None:
+        """A number from the results; None where there is none, or none that is finite."""
+        value = self.results.get(key)
+        return float(value) if _finite(value) else None
+
     @property
     def psnr(self) -> float | None:
-        value = self.results.get("psnr")
-        return float(value) if isinstance(value, int | float) else None
+        return self.figure("psnr")
 
     @property
     def curve(self) -> list[tuple[float, float, float]]:
-        """(training seconds, step, PSNR), as far as they are numbers."""
+        """(training seconds, step, PSNR), as far as they are finite numbers."""
         points = self.results.get("curve")
         whole = [p for p in points if isinstance(p, list) and len(p) == 3] if isinstance(points, list) else []
-        return [(p[0], p[1], p[2]) for p in whole if all(isinstance(x, int | float) for x in p)]
+        return [(p[0], p[1], p[2]) for p in whole if all(map(_finite, p))]
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def read_run(folder: Path) -> Run:
@@ -102,10 +111,12 @@ def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def varied(runs: Sequence[Run]) -> list[str]:
-    """The options in which runs differ, as dotted keys; `method` alone stands for the kind of model and what only it has."""
+    """The options in which runs differ, as dotted keys; `recipe` and `method` alone stand for what they bring along."""
     options = [flat(run.config) for run in runs if run.config]
     common = [key for key in (options[0] if options else {}) if all(key in other for other in options)]
     keys = [key for key in common if any(other[key] != options[0][key] for other in options)]
+    if "recipe" in keys and all(other["recipe"] for other in options):
+        keys = [key for key in keys if key == "recipe" or not _follows(key, "recipe", options)]
     if "method" in keys:
         keys = [key for key in keys if not key.startswith("model.")]
     kept: dict[tuple[str, str], str] = {}
@@ -114,10 +125,16 @@ def varied(runs: Sequence[Run]) -> list[str]:
     return [key for key in keys if key in kept.values() and not key.endswith("_target_")]
 
 
+def _follows(key: str, other: str, options: Sequence[dict[str, Any]]) -> bool:
+    """Whether runs with the same value at `other` have the same at `key`."""
+    pairs = {(str(one[other]), str(one[key])) for one in options}
+    return len(pairs) == len({value for value, _ in pairs})
+
+
 FIGURES = (
-    "scene", "method", "seed", "device", "threads", "versions", "parameters", "artifact_bytes", "train_seconds", "steps",
-    "rays_per_second", "psnr", "ssim", "psnr_worst_view", "render_seconds_per_view", "peak_memory_bytes", "curve", "status",
-    "diagnosis",
+    "scene", "background", "method", "seed", "device", "threads", "machine", "load", "versions", "parameters",
+    "artifact_bytes", "train_seconds", "steps", "rays_per_second", "psnr", "ssim", "psnr_worst_view",
+    "render_seconds_per_view", "peak_memory_bytes", "curve", "status", "diagnosis",
 )  # fmt: skip
 """What stands in every results.json."""
 

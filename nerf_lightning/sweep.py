@@ -21,6 +21,8 @@ from nerf_lightning.runs import FINISHED, Run, failed_results, find_runs, read_r
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from nerf_lightning.sweep_plan import SweepProgress
+
 TABLE = "sweep.csv"
 COLUMNS = ("psnr", "ssim", "train_seconds", "steps", "parameters", "artifact_bytes")
 OUTCOME = ("results.json", "error.txt")
@@ -140,9 +142,24 @@ def print_table(root: Path, runs: Sequence[Run]) -> None:
 class SweepReport(Callback):
     """What Hydra calls before the first job and after the last: table, figure, and exit code 1 where a job failed."""
 
+    def __init__(self) -> None:
+        self.progress: SweepProgress | None = None
+
     def on_multirun_start(self, config: "DictConfig", **kwargs: Any) -> None:
+        from nerf_lightning.sweep_plan import SweepProgress, planned
+
         # Names come from this process's command line: resolved here once, jobs in other processes find them cached.
         print(f"sweep: {config.hydra.sweep.dir}, one folder a job, such as {config.hydra.sweep.subdir}", flush=True)
+        jobs = planned(config)
+        self.progress = SweepProgress(Path(config.hydra.sweep.dir), jobs) if jobs else None
+
+    def on_job_start(self, config: "DictConfig", **kwargs: Any) -> None:
+        if self.progress is not None:
+            print(self.progress.begin(config.hydra.job.num), flush=True)
+
+    def on_job_end(self, config: "DictConfig", **kwargs: Any) -> None:
+        if self.progress is not None:
+            self.progress.end(config.hydra.job.num)
 
     def on_multirun_end(self, config: "DictConfig", **kwargs: Any) -> None:
         from nerf_lightning.gallery import draw

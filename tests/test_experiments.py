@@ -56,6 +56,15 @@ def test_the_courses_recipe(tmp_path: Path):
     assert (cfg.dataset.pixels, cfg.optimizer.lr, cfg.model.frequencies, cfg.model.width) == (10_000, 1e-2, 10, 256)
 
 
+@pytest.mark.parametrize("recipe", sorted(path.stem for path in (cli.conf_dir() / "recipe").glob("*.yaml")))
+def test_recipe(recipe: str, small_scene: tuple[Path, Scene], tmp_path: Path):
+    chosen = ["dataset=photos", f"dataset.path={small_scene[0]}", f"recipe={recipe}", "callbacks.orbit.frames=2"]
+    cfg = composed([*chosen, "trainer.fast_dev_run=true"], tmp_path)
+    assert cfg.recipe == recipe and recipe.startswith(cfg.method)
+    train(cfg)
+    assert json.loads((tmp_path / "results.json").read_text())["psnr"] > 0
+
+
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment(experiment: str, a_scene_for, tmp_path: Path):
     cfg = composed([f"+experiment={experiment}", "trainer.fast_dev_run=true", *a_scene_for(experiment)], tmp_path)
@@ -95,12 +104,15 @@ def test_what_a_run_leaves(tmp_path: Path):
     quality = train(cfg)
     results = json.loads((tmp_path / "results.json").read_text())
     assert set(results) == {
-        "scene", "method", "seed", "device", "threads", "versions", "parameters", "artifact_bytes", "train_seconds",
-        "steps", "rays_per_second", "psnr", "ssim", "psnr_worst_view", "render_seconds_per_view", "peak_memory_bytes",
-        "curve", "status", "diagnosis",
+        "scene", "background", "method", "seed", "device", "threads", "machine", "load", "versions", "parameters",
+        "artifact_bytes", "train_seconds", "steps", "rays_per_second", "psnr", "ssim", "psnr_worst_view",
+        "render_seconds_per_view", "peak_memory_bytes", "curve", "status", "diagnosis",
     }  # fmt: skip
     assert set(results["scene"]) == {"name", "source", "sha256", "views", "resolution"}
     assert results["scene"]["name"] == "bricks"
+    assert results["background"] == [0, 0, 0]
+    assert set(results["machine"]) == {"processor", "cores", "accelerator"}
+    assert results["load"]["own"] > 0 and results["load"]["others"] >= 0
     assert (results["method"], results["seed"], results["steps"], results["status"]) == ("hashgrid", 3, 60, "finished")
     assert results["psnr"] == pytest.approx(quality)
     assert results["psnr"] > 17

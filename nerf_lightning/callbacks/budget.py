@@ -9,6 +9,7 @@ import lightning as L
 
 from nerf_lightning.callbacks.attached import agreed, attached
 from nerf_lightning.errors import InputError
+from nerf_lightning.machine import Load
 from nerf_lightning.system import System
 
 
@@ -36,6 +37,8 @@ class Budget(L.Callback):
         self.limit_seconds = seconds
         self._before = 0.0  # spent up to the last pause or restart
         self._since: float | None = None
+        self.load = Load()
+        """What this process and others did while the clock ran."""
 
     @staticmethod
     def of(trainer: L.Trainer) -> "Budget":
@@ -61,12 +64,20 @@ class Budget(L.Callback):
     def paused(self) -> Iterator[None]:
         """Stops the clock for work that is not training."""
         running = self._since is not None
-        self._before, self._since = self.seconds, None
+        self._stop()
         try:
             yield
         finally:
             if running:
-                self._since = time.perf_counter()
+                self._start()
+
+    def _start(self) -> None:
+        self.load.start()
+        self._since = time.perf_counter()
+
+    def _stop(self) -> None:
+        self._before, self._since = self.seconds, None
+        self.load.stop()
 
     def shared_progress(self, trainer: L.Trainer) -> float:
         """`progress`, the same in all processes of a run."""
@@ -75,7 +86,7 @@ class Budget(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         trainer.should_stop = self.shared_progress(trainer) >= 1.0  # a finished run resumed has nothing left
-        self._since = time.perf_counter()
+        self._start()
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
         pl_module.progress = self.shared_progress(trainer)
@@ -88,7 +99,7 @@ class Budget(L.Callback):
             trainer.should_stop = True
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        self._before, self._since = self.seconds, None
+        self._stop()
 
     def state_dict(self) -> dict[str, float]:
         return {"seconds": self.seconds}

@@ -18,6 +18,7 @@ from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.files import write_json
+from nerf_lightning.machine import describe_machine
 from nerf_lightning.system import System, psnr
 
 try:
@@ -112,10 +113,15 @@ class Results(L.Callback):
         state = pl_module.state_dict().values()
         self.summary = {
             "scene": scene.describe(),
+            "background": pl_module.background,
             "method": self.method,
             "seed": self.seed,
             "device": str(pl_module.device),
             "threads": torch.get_num_threads(),
+            "machine": describe_machine(pl_module.device),
+            "load": budget.load.cores()
+            if trainer.world_size == 1
+            else None,  # of several processes each is one of the others
             "versions": {
                 "python": platform.python_version(),
                 "torch": torch.__version__,

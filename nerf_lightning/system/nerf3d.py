@@ -83,6 +83,10 @@ class NeRF3D(System):
                 parts.append(self.renderer(chunk[run], samples, self.field))
         return Rendered(*(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "depth")))
 
+    @property
+    def background(self) -> list[float]:
+        return [round(c, 3) for c in self.renderer.colour.tolist()]
+
     def truth(self, view: ViewBatch) -> Tensor:
         return view.target(self.renderer.backgrounds(len(view.rays)))
 

@@ -85,6 +85,11 @@ class System(L.LightningModule):
         """The colours the field gives a whole-view batch, with depth and opacity where it has them."""
         raise TypeError(f"{type(self).__name__} must define show(view)")
 
+    @property
+    def background(self) -> list[float] | None:
+        """The colour on which views are judged; None where there is nothing behind what is seen."""
+        return None
+
     def diagnose(self, view: Any) -> str:
         """What is wrong with a field that has learned nothing, in words; "" where nothing is known."""
         return ""
