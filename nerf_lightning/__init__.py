@@ -14,6 +14,8 @@ The tree is the data flow, seven stages in order:
     callbacks/  budget, held-out PSNR, snapshots, orbit, checkpoints, progress, results.json
     build.py    config -> objects, the only place that instantiates
     view.py     a scene in the browser
+    sweep.py    many runs from one command line; gallery.py draws what they made
+    chart/      speed against accuracy: which method is worth its time
     __main__.py the command line: compose -> build -> fit -> test -> results.json
 
 Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples

@@ -9,7 +9,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
 
-BLUE, ORANGE, SKY, VERMILLION, GREY = "#0072B2", "#E69F00", "#56B4E9", "#D55E00", "#6E6E6E"
+BLUE, ORANGE, GREEN, SKY, VERMILLION, MAUVE, GREY = (
+    "#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#6E6E6E",
+)  # fmt: skip
 """Told apart by every kind of eye (Okabe and Ito 2008); what was left out is vermillion."""
 FONT = "DejaVu Sans"
 """Comes with matplotlib."""

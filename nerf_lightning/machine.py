@@ -3,6 +3,7 @@
 import os
 import platform
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,16 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
 def taken(cores: float, threads: float, others: float) -> float:
     """The share of a run's threads that other work took: what it used beyond the cores that the run left free."""
     return max(0.0, others - max(0.0, cores - threads)) / max(threads, 1.0)
+
+
+def crowding(results: Mapping[str, Any]) -> float | None:
+    """`taken` of a run, from its results.json; None where that does not tell it."""
+    load, machine = results.get("load"), results.get("machine")
+    if not isinstance(load, Mapping) or not isinstance(machine, Mapping):
+        return None
+    found = (machine.get("cores"), results.get("threads"), load.get("others"))
+    figures = [figure for figure in found if isinstance(figure, int | float)]
+    return taken(*figures) if len(figures) == len(found) else None
 
 
 def _busy_seconds() -> float:

@@ -171,6 +171,7 @@ class SweepReport(Callback):
         failed = [run for run in runs if run.status not in FINISHED and run.status != "stopped_early"]
         try:
             print(f"table: {root / TABLE}; figure: {draw(root, runs)}")
+            print(f"speed against accuracy: python -m nerf_lightning.chart runs={root}")
         finally:
             if failed:
                 told = ", ".join(str(run.folder.relative_to(root)) for run in failed)

@@ -21,12 +21,15 @@ from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, draw_rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
+from nerf_lightning.machine import CROWDED, crowding
 from nerf_lightning.model import Field
 from nerf_lightning.options import AtLeast, Count, check_options
 from nerf_lightning.run_folder import load_config, read_checkpoint, save_config, save_scene
 from nerf_lightning.seeding import step_generator
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 
+SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
+"""What stands beside the options in TensorBoard's HParams tab."""
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
@@ -152,7 +155,7 @@ def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, resul
     plain = resolved(cfg)
     options = {group: plain[group] for group in GROUPS if plain.get(group) is not None}
     params = {**options, "method": cfg.method, "scene": results["scene"]["name"], "seed": cfg.seed}
-    metrics = {f"final/{key}": results[key] or 0.0 for key in ("psnr", "ssim", "train_seconds", "artifact_bytes")}
+    metrics = {f"final/{key}": results[key] or 0.0 for key in SCORES}
     if isinstance(logger, L.pytorch.loggers.TensorBoardLogger):
         logger.log_hyperparams(params, metrics)
         logger.finalize("success")
@@ -164,6 +167,9 @@ def report(results: dict, folder: Path) -> None:
     print(f"{scene}: {results['psnr']:.2f} dB held out after {seconds:.0f} s of training ({results['status']})")
     if results["diagnosis"]:
         print(results["diagnosis"])
+    crowded = crowding(results)
+    if crowded is not None and crowded > CROWDED:
+        print(f"the machine was busy with something else, which took {crowded:.0%} of this run's threads")
     with suppress(ValueError):  # where the run's folder lies elsewhere, its full path it is
         folder = folder.relative_to(Path.cwd())
     print(f"everything is in {folder}; curves: tensorboard --logdir {folder.parent}")

@@ -1,0 +1,1 @@
+"""Runs -> points of speed and accuracy, what can be compared with what, which methods are worth their time."""

@@ -1,0 +1,71 @@
+"""The chart verb's configuration -> the work. Heavy imports wait until the configuration is checked."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.options import AtLeast, check_options
+
+if TYPE_CHECKING:
+    from nerf_lightning.runs import Run
+
+
+def options(
+    runs: str | list[str],
+    output: str | None,
+    within_db: Annotated[float, AtLeast(0)],
+    seconds: Annotated[float, AtLeast(0)],
+    smallest_within_db: Annotated[float, AtLeast(0)],
+    references: dict | None,
+) -> None:
+    """The keys of conf/chart.yaml, for checking."""
+
+
+def chart_from(cfg: DictConfig) -> None:
+    """Does what the configuration says.
+
+    Raises:
+        InputError: a key that is missing or wrong, a folder that is not there or holds no run.
+    """
+    given = {str(key): cfg[key] for key in cfg if not OmegaConf.is_missing(cfg, key)}
+    given |= {key: OmegaConf.to_container(value) for key, value in given.items() if OmegaConf.is_config(value)}
+    check_options("", options, given, complete=False)
+    if "runs" not in given:
+        raise InputError("config", "runs", "nothing", "folders with runs", "give runs=outputs/pareto")
+    folders = split_folders(given["runs"]) if isinstance(given["runs"], str) else [Path(one) for one in given["runs"]]
+    output = folders[0] / "chart" if given["output"] is None else Path(given["output"]).expanduser()
+
+    from nerf_lightning.chart.references import read_references
+    from nerf_lightning.chart.report import write_report
+    from nerf_lightning.runs import find_runs
+
+    references = read_references(given.get("references") or {})
+    found: dict[Path, Run] = {run.folder.resolve(): run for folder in folders for run in find_runs(folder)}
+    limits = (given["within_db"], given["seconds"], given["smallest_within_db"])
+    write_report(list(found.values()), references, limits, output)
+
+
+def split_folders(text: str) -> list[Path]:
+    """Folders separated by commas; those of a sweep's jobs have commas in their names, so the longest that exists counts."""
+    parts, folders = text.split(","), []
+    while parts:
+        longest = next((n for n in range(len(parts), 0, -1) if Path(",".join(parts[:n])).expanduser().is_dir()), 1)
+        folders.append(Path(",".join(parts[:longest])).expanduser())
+        parts = parts[longest:]
+    return folders
+
+
+def quoted(arguments: Sequence[str]) -> list[str]:
+    """A command line whose runs=DIR,DIR Hydra reads as one text, whatever is in the names."""
+    return [_quoted(one) if one.startswith("runs=") else one for one in arguments]
+
+
+def _quoted(argument: str) -> str:
+    value = argument.removeprefix("runs=")
+    if not value or value[0] in "'\"[":
+        return argument
+    escaped = value.replace("'", "\\'")
+    return f"runs='{escaped}'"

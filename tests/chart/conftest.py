@@ -1,0 +1,37 @@
+"""Run folders made by hand."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from made_runs import MakeRun, results
+
+from nerf_lightning.runs import Run, read_run
+
+
+@pytest.fixture
+def make_run(tmp_path: Path) -> MakeRun:
+    """Writes a run's folder below tmp_path/runs and reads it: make_run(name, config={...}, psnr=..., ...)."""
+
+    def make(name: str, config: dict[str, Any] | None = None, text: str | None = None, **changes: Any) -> Run:
+        folder = tmp_path / "runs" / name
+        folder.mkdir(parents=True)
+        figures = results(**changes)
+        plain = {
+            "method": figures["method"],
+            "recipe": None,
+            "seed": figures["seed"],
+            "dataset": {"path": f"/somewhere/{name}.npz", "rays": 64, "seed": figures["seed"]},
+            "model": {"_target_": f"fields.{figures['method']}", "width": 16},
+            "budget": {"steps": None, "seconds": 5, "default": {"steps": None, "seconds": 90}},
+            "callbacks": {"orbit": {"frames": figures["seed"]}},
+        } | (config or {})
+        if plain["recipe"] is not None:
+            plain["model"] = plain["model"] | {"kind": plain["recipe"]}  # what a recipe stands for
+        (folder / "config.yaml").write_text(yaml.safe_dump(plain, sort_keys=False))
+        (folder / "results.json").write_text(json.dumps(figures) if text is None else text)
+        return read_run(folder)
+
+    return make
