@@ -104,6 +104,7 @@ def _draw(axes: Axes, cost: Cost, row: int, one: Comparison, methods: dict[str, 
     axes.set(xscale="log", xlabel=cost.label)
     axes.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(matplotlib.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
     axes.grid(alpha=0.25, which="both", linewidth=0.5)
     if not placed:
         axes.text(0.5, 0.5, "not measured", ha="center", va="center", transform=axes.transAxes, color=GREY)
