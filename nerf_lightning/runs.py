@@ -134,7 +134,8 @@ def _follows(key: str, other: str, options: Sequence[dict[str, Any]]) -> bool:
 FIGURES = (
     "scene", "background", "method", "seed", "device", "threads", "machine", "load", "versions", "parameters",
     "artifact_bytes", "train_seconds", "steps", "rays_per_second", "psnr", "ssim", "psnr_worst_view",
-    "render_seconds_per_view", "peak_memory_bytes", "curve", "status", "diagnosis",
+    "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "recoveries", "status",
+    "diagnosis",
 )  # fmt: skip
 """What stands in every results.json."""
 
@@ -142,4 +143,5 @@ FIGURES = (
 def failed_results(method: Any, seed: Any, diagnosis: str) -> dict[str, Any]:
     """A results.json for a run that failed before it could write its own: nothing was measured."""
     nothing: dict[str, Any] = dict.fromkeys(FIGURES)
-    return nothing | {"method": method, "seed": seed, "curve": [], "status": "failed", "diagnosis": diagnosis}
+    empty: dict[str, Any] = {"curve": [], "warnings": [], "recoveries": []}
+    return nothing | empty | {"method": method, "seed": seed, "status": "failed", "diagnosis": diagnosis}

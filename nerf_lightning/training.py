@@ -5,7 +5,7 @@ import logging
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import lightning as L
 import torch
@@ -19,6 +19,7 @@ from nerf_lightning.build import build_data, build_system, build_trainer, check_
 from nerf_lightning.callbacks import Results
 from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, draw_rays
+from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.machine import CROWDED, crowding
@@ -30,6 +31,7 @@ from nerf_lightning.system import NeRF2D, NeRF3D, System
 
 SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
 """What stands beside the options in TensorBoard's HParams tab."""
+log = logging.getLogger(__name__)
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
@@ -51,9 +53,13 @@ def train(cfg: DictConfig, checkpoint: Path | None = None) -> float:
     check_options("", prepare_process, settings)
     prepare_process(**settings)
     data = build_data(cfg)
+    doubts = check_scene(data.scene) if isinstance(data, RayDataModule) else []
+    for doubt in doubts:
+        log.warning("%s: %s", data.scene.name, doubt)
     system = build_system(cfg, frame_of(data))
     check_background(cfg, data, system)
     trainer = build_trainer(cfg, folder)
+    results_of(trainer).warnings = doubts
     check_processes(trainer, system)
     if trainer.is_global_zero:
         save_config(cfg, folder)
@@ -61,7 +67,7 @@ def train(cfg: DictConfig, checkpoint: Path | None = None) -> float:
     warm_up(system, data)
     trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(system, data, verbose=False)
-    results = written(trainer)
+    results = results_of(trainer).summary
     if trainer.is_global_zero:
         if trainer.logger is not None:
             log_hyperparameters(trainer.logger, cfg, results)
@@ -135,11 +141,11 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule) -> None:
             trial.field(torch.rand(64, 2, generator=step_generator(0, 0, 0))).sum().backward()
 
 
-def written(trainer: L.Trainer) -> dict[str, Any]:
-    """What stands in results.json."""
+def results_of(trainer: L.Trainer) -> Results:
+    """What writes results.json."""
     results = attached(trainer, Results)
     assert results is not None  # build_trainer puts one into every trainer
-    return results.summary
+    return results
 
 
 def quiet() -> None:
@@ -163,6 +169,8 @@ def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, resul
 
 def report(results: dict, folder: Path) -> None:
     """The last words on the terminal."""
+    for one in results["recoveries"]:
+        print(f"guard: at step {one['step']}: {one['cause']}; {one['action']}")
     scene, seconds = results["scene"]["name"], results["train_seconds"]
     print(f"{scene}: {results['psnr']:.2f} dB held out after {seconds:.0f} s of training ({results['status']})")
     if results["diagnosis"]:

@@ -4,6 +4,7 @@ from nerf_lightning.callbacks.baselines import Baselines
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.checkpoints import Checkpoints
 from nerf_lightning.callbacks.enlarge import Enlarge
+from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.orbit import Orbit
 from nerf_lightning.callbacks.picture_charts import PictureCharts
@@ -18,6 +19,7 @@ __all__ = [
     "Budget",
     "Checkpoints",
     "Enlarge",
+    "Guard",
     "HeldOut",
     "Orbit",
     "PictureCharts",

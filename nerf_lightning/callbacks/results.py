@@ -3,6 +3,7 @@
 import math
 import platform
 import sys
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean, median
@@ -14,12 +15,13 @@ import torch
 import nerf_lightning
 from nerf_lightning.callbacks.attached import attached, data_of
 from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.files import write_json
 from nerf_lightning.machine import describe_machine
-from nerf_lightning.system import System, psnr
+from nerf_lightning.system import System, decibels, psnr
 
 try:
     import resource
@@ -28,6 +30,8 @@ except ImportError:  # Windows has no such module; peak memory is then not repor
 
 NO_BETTER = 1.0
 """dB above a picture of one colour below which a run has learned nothing."""
+WIDE_GAP = 8.0
+"""dB from training pixels down to held-out views beyond which a field has learned its photos rather than the scene."""
 
 
 def peak_memory_bytes() -> int | None:
@@ -49,6 +53,20 @@ def plain_colour_psnr(data: RayDataModule | PixelDataModule, system: System) -> 
     return fmean(scores)
 
 
+def gap(trainer: L.Trainer, quality: float) -> str:
+    """What a held-out PSNR far below that of the training pixels means; "" where it is not, or not known."""
+    guard = attached(trainer, Guard)
+    if guard is None or guard.level is None or guard.level <= 0:
+        return ""
+    trained = decibels(guard.level)
+    if trained < quality + WIDE_GAP:
+        return ""
+    return (
+        f"training pixels {trained:.1f} dB, held-out views {quality:.1f} dB: too few views for this model,"
+        " or poses that do not fit their photos"
+    )
+
+
 class Results(L.Callback):
     """Writes results.json after the test, and also when the run fails or is interrupted.
 
@@ -62,6 +80,8 @@ class Results(L.Callback):
         self.path = path
         self.method = method
         self.seed = seed
+        self.warnings: list[str] = []
+        """What was doubtful about the data before training began."""
         self.views: list[dict[str, float]] = []
         self.summary: dict[str, Any] = {}
         """What was written last."""
@@ -86,7 +106,7 @@ class Results(L.Callback):
             diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
             self.write(trainer, pl_module, "collapsed", f"{diagnosis}: {found}" if found else diagnosis)
         else:
-            self.write(trainer, pl_module, stopped, "")
+            self.write(trainer, pl_module, stopped, gap(trainer, quality))
         if trainer.logger is not None:
             scores = {"test/psnr": quality, "test/ssim": self.summary["ssim"] or 0.0}
             trainer.logger.log_metrics(scores, trainer.global_step)
@@ -101,6 +121,7 @@ class Results(L.Callback):
         """Writes the file with what is known by now; measures not taken are null."""
         scene, budget = data_of(trainer).scene, Budget.of(trainer)
         throughput, held_out = attached(trainer, Throughput), attached(trainer, HeldOut)
+        guard = attached(trainer, Guard)
         curve = held_out.curve if held_out is not None else []
 
         def over_views(statistic: Any, key: str) -> float | None:
@@ -140,6 +161,8 @@ class Results(L.Callback):
             "render_seconds_per_view": over_views(median, "seconds"),
             "peak_memory_bytes": peak_memory_bytes(),
             "curve": curve,
+            "warnings": self.warnings,
+            "recoveries": [asdict(one) for one in guard.recoveries] if guard is not None else [],
             "status": status,
             "diagnosis": diagnosis,
         }

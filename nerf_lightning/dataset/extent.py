@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, focus_point
@@ -15,6 +15,8 @@ MAX_VIEWS = 32
 ALPHA_FLOOR = 0.02
 COLOUR_FLOOR = 3
 """In 1/255: JPEG-free renders are exact, resampled ones wobble by one or two."""
+FLAT = 0.9
+"""Share of the border's pixels that must have one colour to be the background: the rest is content that leaves the picture."""
 AGREEMENT = 0.95
 """Share of the views seeing a voxel that must find it in the silhouette; the rest forgives dark-on-dark pixels."""
 
@@ -54,6 +56,19 @@ def silhouettes(views: Views, background: tuple[float, float, float]) -> Bool[np
     border = np.concatenate([masks[:, 0], masks[:, -1], masks[:, :, 0], masks[:, :, -1]], axis=1)
     flat = border.mean(1) < 0.2
     return masks if flat.mean() > 0.5 else None
+
+
+def border_colour(images: UInt8[Tensor, "V H W C"]) -> tuple[float, float, float] | None:
+    """The one colour along the borders of photos without alpha, sRGB in [0, 1]; None where they have several, or alpha."""
+    if images.shape[3] == 4:
+        return None
+    edges = torch.cat([images[:, 0], images[:, -1], images[:, :, 0], images[:, :, -1]], dim=1).flatten(0, 1).int()
+    middle = edges.median(0).values
+    alike = ((edges - middle).abs() <= COLOUR_FLOOR).all(1).float().mean()
+    if float(alike) < FLAT:
+        return None
+    red, green, blue = (middle / 255).tolist()
+    return red, green, blue
 
 
 def viewing_distance(c2w: Float[Tensor, "V 4 4"], centre: Float[Tensor, "3"]) -> float:

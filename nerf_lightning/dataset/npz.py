@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, orbit_like
 from nerf_lightning.dataset import checks
-from nerf_lightning.dataset.extent import estimate_bounds
+from nerf_lightning.dataset.extent import border_colour, estimate_bounds
 from nerf_lightning.dataset.scene import Scene, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic
@@ -27,7 +27,8 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
         c2ws_train, c2ws_val, c2ws_test: (V, 4, 4); the last is the orbit, made up like the training cameras if absent.
         focal: pixels, with the principal point in the middle; or K: (3, 3), for all views, which then rules.
         near, far: distances along the rays, and aabb: (2, 3), world units; optional, the box is estimated if absent.
-        background: (3,), sRGB, black if absent. unbounded: whether content lies outside aabb too, false if absent.
+        background: (3,), sRGB; if absent the one colour along the photos' borders, or black.
+        unbounded: whether content lies outside aabb too, false if absent.
         to_source: (4, 4), similarity to the frame of the original, identity if absent. `save_npz` writes these three
         only where they say something.
 
@@ -63,7 +64,7 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
         orbit = cameras("c2ws_test")
         checks.split_size(path, "c2ws_test", len(orbit))
 
-    background = (0.0, 0.0, 0.0)
+    background = border_colour(splits["train"].images) or (0.0, 0.0, 0.0)
     if "background" in data:
         red, green, blue = checks.numeric(path, "background", data["background"], "3").tolist()
         background = (red, green, blue)

@@ -1,6 +1,6 @@
 """Stage 4, fields: position and direction -> density and rgb; and pictures as fields of two coordinates."""
 
-from nerf_lightning.model.activation import density_activation, truncated_exp
+from nerf_lightning.model.activation import Rectifier, density_activation, truncated_exp
 from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import Field, PictureField
 from nerf_lightning.model.hashgrid import HashGrid, HashGridField
@@ -19,6 +19,7 @@ __all__ = [
     "MLPField",
     "PictureField",
     "PictureMLP",
+    "Rectifier",
     "SirenField",
     "TensoRFField",
     "VectorMatrix",

@@ -1,6 +1,7 @@
 """From a network's raw output to a density."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -26,6 +27,32 @@ def truncated_exp(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return _TruncatedExp.apply(x)
 
 
+def shifted_softplus(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """softplus(x - 1) (Mip-NeRF, Barron et al. 2021): little density at the start, and a gradient everywhere."""
+    return torch.nn.functional.softplus(x - 1.0)
+
+
+class Rectifier(torch.nn.Module):
+    """The original NeRF's density. Where it is zero no gradient comes back, so a field can die: `soften` is the way out."""
+
+    soft: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("soft", torch.tensor(False))  # in checkpoints, as it changes what the weights mean
+
+    def soften(self) -> None:
+        """From now on `shifted_softplus`."""
+        self.soft.fill_(True)
+
+    def forward(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        return shifted_softplus(x) if self.soft else torch.relu(x)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        state_dict.setdefault(prefix + "soft", torch.tensor(False))  # older checkpoints lack it
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
 def density_activation(name: str) -> Callable[[Tensor], Tensor]:
     """The map from raw output to density: "relu" (NeRF), "softplus" (Mip-NeRF, shifted by -1) or "exp" (truncated).
 
@@ -34,9 +61,9 @@ def density_activation(name: str) -> Callable[[Tensor], Tensor]:
     """
     match name:
         case "relu":
-            return torch.relu
+            return Rectifier()
         case "softplus":
-            return lambda x: torch.nn.functional.softplus(x - 1.0)
+            return shifted_softplus
         case "exp":
             return truncated_exp
     raise InputError("model.density", "", repr(name), "relu, softplus or exp")

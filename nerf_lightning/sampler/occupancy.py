@@ -91,6 +91,8 @@ class OccupancySampler(Sampler):
         self.register_buffer("allowed", torch.ones(cells, dtype=torch.bool))
         self.register_buffer("reached", torch.zeros(cells, dtype=torch.int32))
         self.register_buffer("lit", torch.ones(cells, dtype=torch.bool))
+        self.first_step = 0
+        """Where training began: the warm-up counts from there."""
         self.updates = 0
         """Number of the last update; `reached` holds the number of the update after which light last met the cell."""
         self.look_everywhere = True
@@ -141,6 +143,9 @@ class OccupancySampler(Sampler):
         self.occupied &= self.allowed
         self.lit &= self.allowed
 
+    def restart(self, step: int) -> None:
+        self.first_step = step
+
     @torch.no_grad()
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         self.updates, phase = divmod(step, self.update_every)
@@ -149,7 +154,7 @@ class OccupancySampler(Sampler):
             return
         device = self.thickness.device
         total = self.resolution**3
-        if step < self.warmup:
+        if step - self.first_step < self.warmup:
             cells = torch.arange(total, device=device)
         else:
             # A random phase of a stride of four: no cell twice, and every cell has the same chance.

@@ -69,5 +69,8 @@ class Sampler(InBounds):
     def look_through(self, cameras: Cameras) -> None:
         """Called before training with the cameras of the photos; samplers that leave out what none has in view do so here."""
 
+    def restart(self, step: int) -> None:
+        """Called where training starts again at a step with a field that has learned nothing yet."""
+
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         """Called before each training step; samplers that learn where content is do so here."""

@@ -59,7 +59,8 @@ class NeRF3D(System):
         backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
         rendered = self.renderer(batch.rays, samples, self.field, backgrounds)
         loss = torch.nn.functional.mse_loss(rendered.rgb, batch.target(backgrounds))
-        stats = StepStats(loss.detach().item(), len(batch.rays), len(samples))
+        opacity = float(rendered.opacity.detach().mean())
+        stats = StepStats(loss.detach().item(), len(batch.rays), len(samples), opacity)
         for penalty in (self.field.penalty(), rendered.penalty):
             loss = loss if penalty is None else loss + penalty
         return loss, stats

@@ -25,6 +25,8 @@ class StepStats:
     rays: int
     """Rays, or pixels in 2D."""
     samples: int
+    opacity: float | None = None
+    """Mean over the rays: 0 where all is empty, 1 where nothing is seen through."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ class System(L.LightningModule):
         self.seed = seed
         self.progress = 0.0
         """Fraction of the budget done; the Budget callback keeps it."""
+        self.rate = 1.0
+        """Factor on the learning rate beside the schedule's; the Guard callback lowers it where training broke down."""
         self.stats = StepStats(float("nan"), 0, 0)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -66,7 +70,7 @@ class System(L.LightningModule):
         return optimizer
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        factor = self.schedule(self.progress)
+        factor = self.schedule(self.progress) * self.rate
         for group in self.parameter_groups:
             group["lr"] = group["initial_lr"] * factor
 

@@ -1,0 +1,223 @@
+"""Data that can be read but cannot work: cameras that look away, photos that do not fit their poses, a box that is cut."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from nerf_lightning.cameras import Bounds, Cameras, focus_point
+from nerf_lightning.dataset.extent import MAX_VIEWS, border_colour, silhouettes, visible_cube
+from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.errors import InputError
+
+MEETING = 0.25
+"""Optical axes meet in a point where they pass it, on average, within this share of the cameras' distance to it."""
+SAME_PLACE, SAME_WAY = 1e-6, 1e-6
+"""Cameras nearer than these (of the scene's size, and entry by entry of the rotation) stand in one pose."""
+OTHER_COLOUR = 8 / 255
+"""From the background, in any part, beyond which a border shows something else."""
+HULL = 40
+"""Voxels along each side of the grid that photos are checked against each other with."""
+FITS, FITS_WELL = 0.5, 0.975
+"""Shares of what photos show that nearly all of them together must be able to explain: below, there is no hope, or some doubt.
+
+Exact poses of the built-in scene and of Lego explain all; shuffled ones 86 and 62 %, ones turned by 5 degrees 87 and 59 %.
+"""
+IN_BOX = 0.9
+"""The same share of what the box leaves out, where without it the photos fit."""
+MOST_AGREE = 0.95
+"""Share of the views that must find a voxel inside the outlines; the rest forgives dark content on a dark background."""
+CUT = 0.02
+"""Share of rays that near or far may cut short inside the box."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Something about the data that will spoil the result."""
+
+    text: str
+    hopeless: bool = False
+    """Whether nothing good can come of training at all."""
+
+
+def check_scene(scene: Scene) -> list[str]:
+    """Looks a scene over before training.
+
+    Returns:
+        Warnings, in plain words.
+
+    Raises:
+        InputError: for data of which no method can make a scene.
+    """
+    doubts = [
+        *looking_away(scene),
+        *border(scene),
+        *misfits(scene),
+        *repeats(scene),
+        *overlap(scene),
+        *cut_short(scene),
+    ]
+    for doubt in doubts:
+        if doubt.hopeless:
+            raise InputError(
+                scene.source, "", doubt.text, "photos and poses that fit each other", "see the file's convention"
+            )
+    return [doubt.text for doubt in doubts]
+
+
+def looking_away(scene: Scene) -> Iterator[Doubt]:
+    """Cameras whose axes meet in a point behind them: the sign of a mixed-up convention (OpenGL looks along -z)."""
+    c2w = scene.train.cameras.c2w
+    if len(c2w) < 3:
+        return
+    focus = focus_point(c2w)
+    offset = focus - c2w[:, :3, 3]
+    axes = torch.nn.functional.normalize(c2w[:, :3, 2], dim=1)
+    along = (offset * axes).sum(1)
+    distance = offset.norm(dim=1)
+    beside = (offset - along[:, None] * axes).norm(dim=1)
+    if float(beside.mean()) > MEETING * float(distance.mean()):
+        return  # the axes do not meet: a panorama, a fly-through
+    behind = float((along < 0).float().mean())
+    if behind > 0.5:
+        text = f"{behind:.0%} of the cameras with their backs to the point where their axes meet; their z axis points backward"
+        yield Doubt(text, hopeless=True)
+    elif behind > 0:
+        yield Doubt(f"{behind:.0%} of the cameras look away from the point where the others' axes meet")
+
+
+def border(scene: Scene) -> Iterator[Doubt]:
+    """Photos whose borders have one colour, while the background is said to have another."""
+    found = None if scene.bounds.unbounded else border_colour(scene.train.images)
+    if found is None:
+        return
+    if max(abs(is_ - said) for is_, said in zip(found, scene.background, strict=True)) > OTHER_COLOUR:
+        seen, said = ([round(part, 2) for part in colour] for colour in (found, scene.background))
+        yield Doubt(f"borders of the colour {seen}, while the background is said to be {said}", hopeless=True)
+
+
+def misfits(scene: Scene) -> Iterator[Doubt]:
+    """Photos whose outlines no single body explains: shuffled or turned poses. Of a body like a ball outlines tell nothing."""
+    chosen = torch.linspace(0, len(scene.train) - 1, min(len(scene.train), MAX_VIEWS)).round().long()
+    views = Views(scene.train.images[chosen], scene.train.cameras[chosen])
+    masks = silhouettes(views, scene.background)
+    if masks is None or len(views) < 3 or scene.bounds.unbounded or not masks.any() or masks.mean() > 0.9:
+        return
+    explained = hull_coverage(masks, views.cameras, scene.bounds)
+    if explained >= FITS_WELL:
+        return
+    everything = Bounds(torch.from_numpy(visible_cube(views.cameras)).float())
+    if explained < IN_BOX and hull_coverage(masks, views.cameras, everything) >= FITS_WELL:
+        text = f"content beyond the box: the box explains {explained:.0%} of what the photos show"
+        yield Doubt(text, hopeless=explained < FITS)
+    else:
+        text = (
+            f"outlines that no body has: the photos together can explain {explained:.0%} of what each shows."
+            " The poses may belong to other photos, be turned, or be inexact"
+        )
+        yield Doubt(text, hopeless=explained < FITS)
+
+
+def hull_coverage(masks: Bool[np.ndarray, "V H W"], cameras: Cameras, bounds: Bounds) -> float:
+    """How much of the outlines the visual hull covers that they carve out of the bounds, in [0, 1]."""
+    low, high = bounds.aabb.double().numpy()
+    side = (high - low) / HULL
+    x, y, z = low[:, None] + (np.arange(HULL) + 0.5) * side[:, None]
+    centres = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    seen_by = np.zeros(len(centres), np.int32)
+    inside_of = np.zeros(len(centres), np.int32)
+    places = []
+    for mask, K, c2w in zip(masks, cameras.K.double().numpy(), cameras.c2w.double().numpy(), strict=True):
+        local = (centres - c2w[:3, 3]) @ c2w[:3, :3]
+        depth = np.maximum(local[:, 2], 1e-9)
+        pixels = np.floor((local @ K.T)[:, :2] / depth[:, None])
+        seen = (local[:, 2] > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)
+        column, row = np.where(seen[:, None], pixels, 0).astype(np.int32).T
+        reach = _reach(side, K, depth[seen], mask.shape)
+        grown = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+        seen_by += seen
+        inside_of += seen & grown[row, column]
+        places.append((column, row, seen, reach))
+    inside = (seen_by > 0) & (inside_of >= MOST_AGREE * seen_by)
+    covered = []
+    for mask, (column, row, seen, reach) in zip(masks, places, strict=True):
+        shown = np.zeros(mask.shape, np.uint8)
+        kept = inside & seen
+        shown[row[kept], column[kept]] = 1
+        shown = cv2.dilate(shown, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+        if mask.any():
+            covered.append(float(shown[mask].mean()))
+    return float(np.mean(covered)) if covered else 1.0
+
+
+def _reach(
+    side: Float[np.ndarray, "3"], K: Float[np.ndarray, "3 3"], depth: Float[np.ndarray, "N"], shape: tuple[int, ...]
+) -> int:
+    """Half a voxel's diagonal as a camera sees it, in pixels."""
+    if not len(depth):
+        return 1
+    return int(min(np.ceil(0.5 * np.linalg.norm(side) * K[0, 0] / float(np.median(depth))), max(shape)))
+
+
+def repeats(scene: Scene) -> Iterator[Doubt]:
+    """Several photos in one pose."""
+    c2w = scene.train.cameras.c2w
+    first = _first_alike(c2w, c2w, scene)
+    doubles = int((first != torch.arange(len(c2w))).sum())
+    if doubles:
+        yield Doubt(f"{doubles} of {len(c2w)} training photos have the pose of another one")
+
+
+def overlap(scene: Scene) -> Iterator[Doubt]:
+    """Held-out views that are trained on as well: their PSNR says nothing about unseen views."""
+    first = _first_alike(scene.val.cameras.c2w, scene.train.cameras.c2w, scene)
+    found = (first >= 0).nonzero()[:, 0].tolist()
+    same = [view for view in found if torch.equal(scene.val.images[view], scene.train.images[int(first[view])])]
+    if same:
+        yield Doubt(
+            f"{len(same)} of {len(scene.val)} held-out photos are trained on as well: their PSNR says nothing of unseen views"
+        )
+
+
+def _first_alike(some: Float[Tensor, "A 4 4"], others: Float[Tensor, "B 4 4"], scene: Scene) -> Tensor:
+    """For each pose the first of the others that is the same, or -1."""
+    size = float(scene.train.cameras.c2w[:, :3, 3].abs().max()) + 1e-12
+    place = (some[:, None, :3, 3] - others[None, :, :3, 3]).abs().amax(-1) <= SAME_PLACE * size
+    way = (some[:, None, :3, :3] - others[None, :, :3, :3]).abs().amax((-1, -2)) <= SAME_WAY
+    alike = place & way
+    return torch.where(alike.any(1), alike.int().argmax(1), -1)
+
+
+def cut_short(scene: Scene) -> Iterator[Doubt]:
+    """near and far that leave out parts of the box."""
+    bounds = scene.bounds
+    if bounds.unbounded or (bounds.near is None and bounds.far is None):
+        return
+    whole = Bounds(bounds.aabb)
+    rays = scene.train.cameras.view_rays(0)
+    for view in range(1, min(len(scene.train), 4)):
+        more = scene.train.cameras.view_rays(view)
+        rays = type(rays)(torch.cat([rays.origins, more.origins]), torch.cat([rays.directions, more.directions]))
+    near, far = whole.near_far(rays)
+    meets = far > near
+    if not meets.any():
+        return
+    near, far = near[meets], far[meets]
+    length = far - near
+    lost_near = ((bounds.near or 0.0) - near).clamp_min(0).minimum(length) / length
+    lost_far = (
+        (far - bounds.far).clamp_min(0).minimum(length) / length if bounds.far is not None else torch.zeros_like(far)
+    )
+    for name, lost in (("near", lost_near), ("far", lost_far)):
+        share = float(lost.mean())
+        if share > CUT:
+            value = getattr(bounds, name)
+            yield Doubt(
+                f"{name}={value:g} cuts {share:.0%} of the box off (its rays run from {float(near.median()):.3g} to"
+                f" {float(far.median()):.3g}); leave it out, and the box decides",
+                hopeless=share > 0.99,
+            )

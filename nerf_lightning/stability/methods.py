@@ -1,0 +1,41 @@
+"""What is tried: shipped recipes as they are, and controls that are known to fail."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Method:
+    """A model with its settings."""
+
+    kind: str
+    """Of the model, by which conditions choose options for it."""
+    options: tuple[str, ...]
+    guard: bool = True
+    flat: bool = False
+    """Whether it fits pictures."""
+    control: bool = False
+    """Whether it is here because it fails: a suite that no method fails proves nothing."""
+
+
+UNGUARDED = ("callbacks.guard.attempts=0",)
+RECTIFIED = (
+    *("model=mlp", "model.depth=2", "model.width=32", "model.skip=null", "optimizer.lr=5e-3"),
+    *("sampler=stratified", "sampler.samples=32", "dataset.rays=256", "dataset.samples=null"),
+)
+FLAT = ("+experiment=picture", "dataset.pixels=1024")
+
+METHODS = {
+    "hashgrid": Method("hashgrid", ("recipe=hashgrid_small",)),
+    "voxels": Method("voxels", ("recipe=voxels_small",)),
+    "tensorf": Method("tensorf", ("recipe=tensorf_small",)),
+    "mlp": Method("mlp", ("recipe=mlp_small",)),
+    "relu mlp": Method("mlp", RECTIFIED, control=True),
+    "relu mlp, no guard": Method("mlp", (*RECTIFIED, *UNGUARDED), guard=False, control=True),
+    "2D hashgrid": Method("hashgrid2d", FLAT, flat=True),
+    "2D mlp": Method("picture_mlp", (*FLAT, "model=picture_mlp"), flat=True),
+    "2D fourier": Method("fourier", (*FLAT, "model=fourier"), flat=True),
+    "2D siren": Method("siren", (*FLAT, "model=siren"), flat=True),
+    "2D mlp, no guard": Method(
+        "picture_mlp", (*FLAT, "model=picture_mlp", *UNGUARDED), guard=False, flat=True, control=True
+    ),
+}

@@ -1,0 +1,170 @@
+"""The guard: what it notices, what it does, and that it leaves good training alone."""
+
+import functools
+import json
+import math
+from pathlib import Path
+
+import lightning as L
+import pytest
+import torch
+
+from nerf_lightning.callbacks import Budget, Guard
+from nerf_lightning.callbacks.guard import AS_PLAIN, LOWER, plain_error
+from nerf_lightning.compose import composed
+from nerf_lightning.dataset import Picture, PixelDataModule, save_npz
+from nerf_lightning.model import PictureField
+from nerf_lightning.run_folder import load_run
+from nerf_lightning.stability.methods import METHODS
+from nerf_lightning.stability.toys import MARBLE, toy
+from nerf_lightning.system import NeRF2D, StepStats, constant
+from nerf_lightning.training import quiet, train
+
+
+class Blob(PictureField):
+    """A picture of its own, pixel by pixel: learns quickly with any rate below one."""
+
+    def __init__(self):
+        super().__init__((8, 8))
+        self.colours = torch.nn.Parameter(torch.full((64, 3), 0.5))
+
+    def forward(self, uv: torch.Tensor) -> torch.Tensor:
+        column, row = (uv * 8).long().unbind(1)
+        return self.colours[row * 8 + column]
+
+
+def stripes() -> Picture:
+    image = torch.zeros(8, 8, 3, dtype=torch.uint8)
+    image[::2] = 255
+    return Picture("stripes", "test", image)
+
+
+class Broken(NeRF2D):
+    """A system that goes wrong at a step, as told."""
+
+    def __init__(self, how: str, when: int, rate: float = 20.0):
+        super().__init__(Blob(), functools.partial(torch.optim.SGD, lr=rate), constant)
+        self.how, self.when, self.done = how, when, False
+
+    def training_step(self, batch, batch_idx: int) -> torch.Tensor:
+        loss = super().training_step(batch, batch_idx)
+        if self.done or self.global_step < self.when:
+            return loss
+        match self.how:
+            case "nan loss":
+                self.done = True
+                self.stats = StepStats(math.nan, 1, 1)
+                return loss * math.nan
+            case "nan weight":
+                self.done = True
+                with torch.no_grad():
+                    self.field.colours[:, 0] = math.nan  # the step's own gradient is fine
+            case "rise" if self.rate == 1:
+                with torch.no_grad():
+                    self.field.colours.uniform_()
+            case "spike":
+                self.done = True
+                with torch.no_grad():
+                    self.field.colours.copy_(1 - self.field.colours)
+            case "no gradient":
+                return loss * 0 + (self.field.colours * 0).sum()
+        return loss
+
+
+def run(system: NeRF2D, guard: Guard, tmp_path: Path, steps: int = 400, picture: Picture | None = None) -> float:
+    """Trains and returns the last mean squared error over the picture."""
+    data = PixelDataModule(picture or stripes(), 64)
+    trainer = L.Trainer(
+        accelerator="cpu", max_epochs=-1, logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        enable_model_summary=False, limit_val_batches=0, default_root_dir=tmp_path, callbacks=[Budget(steps), guard],
+    )  # fmt: skip
+    trainer.fit(system, data)
+    view = data.held_out(0)
+    return float((system.colours(view.uv) - view.rgb).square().mean())
+
+
+@pytest.fixture(autouse=True)
+def without_lightnings_hints() -> None:
+    quiet()
+
+
+@pytest.mark.parametrize("how", ["not at all", "spike"])
+def test_training_that_gets_there_is_left_alone(how: str, tmp_path: Path):
+    guard = Guard(every=10)
+    assert run(Broken(how, 130), guard, tmp_path) < 1e-3
+    assert guard.recoveries == [] and guard.rate == 1.0
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [("nan loss", "no longer a finite number"), ("nan weight", "no longer"), ("rise", "times its lowest")],
+)
+def test_what_was_learned_comes_back(how: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    guard = Guard(every=10, keep_every=50)
+    assert run(Broken(how, 130), guard, tmp_path) < 1e-3
+    (one,) = guard.recoveries
+    assert words in one.cause and "last good weights" in one.action and 130 < one.step < 230
+    assert guard.rate == pytest.approx(LOWER)
+    assert f"guard: step {one.step}" in capsys.readouterr().out, "never silently"
+
+
+def test_without_good_weights_it_starts_again(tmp_path: Path):
+    guard = Guard(every=10)
+    assert run(Broken("nan loss", 5), guard, tmp_path) < 1e-2
+    (one,) = guard.recoveries
+    assert one.step == 6 and "started again" in one.action
+
+
+def test_it_gives_up_in_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    guard = Guard(attempts=2, every=10, patience=50)
+    run(Broken("no gradient", 0), guard, tmp_path)
+    assert len(guard.recoveries) == 2 and all("no gradient" in one.cause for one in guard.recoveries)
+    assert guard.rate == pytest.approx(LOWER**2)
+    assert "given up after 2 attempts" in capsys.readouterr().out
+
+
+def test_without_attempts_it_only_stands_by(tmp_path: Path):
+    guard = Guard(attempts=0)
+    assert not run(Broken("nan loss", 5), guard, tmp_path, 50) < 1
+    assert guard.recoveries == []
+
+
+def test_a_picture_of_one_colour_is_no_failure(tmp_path: Path):
+    guard = Guard(every=10, patience=30)
+    plain = Picture("plain", "test", torch.full((8, 8, 3), 90, dtype=torch.uint8))
+    assert run(Broken("not at all", 0), guard, tmp_path, picture=plain) < 1e-3
+    assert guard.recoveries == []
+
+
+def test_slow_but_steady_is_no_failure(tmp_path: Path):
+    guard = Guard(every=10, patience=50)
+    slow = Broken("not at all", 0, rate=0.03)
+    error = run(slow, guard, tmp_path, steps=200)
+    assert error > AS_PLAIN * plain_error(PixelDataModule(stripes(), 64), slow), "it has hardly begun"
+    assert guard.recoveries == []
+
+
+def test_the_checkpoint_says_what_took_the_rectifiers_place(tmp_path: Path):
+    """Of the seeds 0 to 7 this one dies: its density is zero everywhere, and no gradient comes back."""
+    save_npz(toy(MARBLE, (1.0, 1.0, 1.0)), tmp_path / "scene.npz")
+    given = [
+        "dataset=photos",
+        f"dataset.path={tmp_path}/scene.npz",
+        *METHODS["relu mlp"].options,
+        "seed=7",
+        "threads=1",
+    ]
+    train(composed([*given, "budget.steps=100", "callbacks.orbit.frames=0"], tmp_path))
+    (one,) = json.loads((tmp_path / "results.json").read_text())["recoveries"]
+    assert "no density anywhere" in one["cause"] and "softplus" in one["action"] and one["step"] <= 60
+    activation = load_run(tmp_path).system.field.activation
+    assert activation(torch.tensor([-1.0])) > 0, "a rectifier would give zero"
+
+
+def test_a_recovered_run_resumes_as_it_was(tmp_path: Path):
+    guard = Guard(every=10)
+    run(Broken("nan loss", 5), guard, tmp_path, 60)
+    other = Guard(every=10)
+    other.load_state_dict(guard.state_dict())
+    assert other.state_dict() == guard.state_dict()
+    assert other.recoveries == guard.recoveries and other.began == guard.began

@@ -1,0 +1,142 @@
+"""Data that cannot work is told before training; data that can is left alone."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.dataset import Scene, Views, load_npz, save_npz
+from nerf_lightning.dataset.bricks import bricks
+from nerf_lightning.dataset.extent import border_colour
+from nerf_lightning.dataset.plausible import check_scene
+from nerf_lightning.errors import InputError
+from nerf_lightning.stability.toys import MARBLE, PILE, ROD, toy
+
+WHITE = (1.0, 1.0, 1.0)
+Change = Callable[[Scene], Scene]
+
+
+def with_poses(scene: Scene, change: Callable[[torch.Tensor], torch.Tensor]) -> Scene:
+    """The same photos with other training and held-out poses."""
+
+    def moved(views: Views) -> Views:
+        return replace(views, cameras=replace(views.cameras, c2w=change(views.cameras.c2w.clone())))
+
+    return replace(scene, train=moved(scene.train), val=moved(scene.val))
+
+
+def opengl(c2w: torch.Tensor) -> torch.Tensor:
+    c2w[:, :3, 1:3] *= -1
+    return c2w
+
+
+def upside_down(c2w: torch.Tensor) -> torch.Tensor:
+    c2w[:, :3, :2] *= -1
+    return c2w
+
+
+def shuffled(c2w: torch.Tensor) -> torch.Tensor:
+    return c2w[torch.randperm(len(c2w), generator=torch.Generator().manual_seed(0))]
+
+
+def limited(near: float | None, far: float | None) -> Change:
+    return lambda scene: replace(scene, bounds=replace(scene.bounds, near=near, far=far))
+
+
+@pytest.fixture(scope="module")
+def pile() -> Scene:
+    return toy(PILE, size=32)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        lambda: toy(PILE, size=32),
+        lambda: toy(PILE, None, size=32),
+        lambda: toy(MARBLE, WHITE, size=32),
+        lambda: toy(ROD, WHITE, size=32),
+        lambda: toy(PILE, size=32, views=3),
+        lambda: bricks(size=32, train_views=12, val_views=2),
+    ],
+    ids=["pile", "alpha", "white", "rod", "few", "bricks"],
+)
+def test_good_scenes_raise_no_doubt(scene: Callable[[], Scene]):
+    assert check_scene(scene()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda scene: with_poses(scene, opengl), "backs to the point"),
+        (lambda scene: replace(scene, background=WHITE), "while the background is said to be"),
+        (limited(0.2, 0.6), "far=0.6 cuts"),
+        (limited(20.0, None), "near=20 cuts"),
+        (lambda scene: replace(scene, bounds=Bounds(0.2 * scene.bounds.aabb)), "beyond the box"),
+    ],
+    ids=["opengl", "flag", "far", "near", "box"],
+)
+def test_hopeless_scenes_are_refused(change: Change, words: str, pile: Scene):
+    with pytest.raises(InputError, match=words):
+        check_scene(change(pile))
+
+
+@pytest.mark.parametrize("change", [upside_down, shuffled])
+def test_photos_that_do_not_fit_are_warned_of(change: Callable[[torch.Tensor], torch.Tensor], pile: Scene):
+    (doubt,) = check_scene(with_poses(pile, change))
+    assert "outlines that no body has" in doubt
+
+
+def test_doubtful_scenes_are_warned_of(pile: Scene):
+    (doubt,) = check_scene(limited(3.6, None)(pile))
+    assert "near=3.6 cuts" in doubt
+    assert check_scene(limited(0.1, 40.0)(pile)) == [], "wider than the box: the box decides"
+
+    c2w = pile.train.cameras.c2w.clone()
+    c2w[5] = c2w[4]
+    doubled = replace(pile, train=replace(pile.train, cameras=replace(pile.train.cameras, c2w=c2w)))
+    (doubt,) = check_scene(doubled)
+    assert "1 of 24 training photos have the pose of another" in doubt
+
+    images, poses = pile.val.images.clone(), pile.val.cameras.c2w.clone()
+    images[1], poses[1] = pile.train.images[7], pile.train.cameras.c2w[7]
+    leaked = replace(pile, val=Views(images, replace(pile.val.cameras, c2w=poses)))
+    (doubt,) = check_scene(leaked)
+    assert "1 of 4 held-out photos are trained on as well" in doubt
+
+
+def test_one_camera_that_looks_away(pile: Scene):
+    def turned(c2w: torch.Tensor) -> torch.Tensor:
+        c2w[:1] = opengl(c2w[:1])
+        return c2w
+
+    doubts = check_scene(replace(pile, train=with_poses(pile, turned).train))
+    assert any("look away" in doubt for doubt in doubts)
+
+
+def test_a_panorama_is_no_mistake(pile: Scene):
+    """Cameras in one place that look outward have no common point to look at."""
+
+    def outward(c2w: torch.Tensor) -> torch.Tensor:
+        c2w[:, :3, 3] = 0.05 * c2w[:, :3, 2] + 0.3 * torch.randn(len(c2w), 3)
+        return c2w
+
+    scene = with_poses(replace(pile, bounds=Bounds(pile.bounds.aabb, unbounded=True)), outward)
+    assert check_scene(scene) == []
+
+
+def test_the_border_tells_the_background(pile: Scene, tmp_path: Path):
+    assert border_colour(pile.train.images) == (0.0, 0.0, 0.0)
+    assert border_colour(toy(PILE, WHITE, size=32).train.images) == WHITE
+    assert border_colour(toy(PILE, None, size=32).train.images) is None
+    assert border_colour(torch.randint(0, 255, (4, 16, 16, 3), dtype=torch.uint8)) is None
+    import numpy as np
+
+    path = tmp_path / "white.npz"
+    save_npz(toy(MARBLE, WHITE, size=32), path)
+    arrays = dict(np.load(path))
+    assert arrays.pop("background").tolist() == [1, 1, 1]
+    np.savez(path, **arrays)
+    assert load_npz(path).background == WHITE, "also where the file does not say"
