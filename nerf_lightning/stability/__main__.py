@@ -1,0 +1,52 @@
+"""python -m nerf_lightning.stability: methods tried where they are known to fail. Heavy imports wait until there is work."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nerf_lightning import cli
+from nerf_lightning.errors import InputError
+from nerf_lightning.options import Count, check_options
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+
+def task(cfg: "DictConfig") -> None:
+    """Checks the configuration and tries all cells."""
+    from omegaconf import OmegaConf
+
+    given = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(given, dict)  # a DictConfig gives nothing else
+    plain = {str(key): value for key, value in given.items()}
+    check_options("", stability, plain)
+    stability(**plain)
+
+
+def stability(
+    suite: str, methods: list[str] | None, seeds: Count, steps: Count, workers: Count | None, output: str
+) -> None:
+    """Trains all cells and writes what became of them.
+
+    Raises:
+        InputError: for a suite or a method that is not known.
+    """
+    from nerf_lightning.capture.progress import tracked
+    from nerf_lightning.stability.conditions import CONDITIONS
+    from nerf_lightning.stability.methods import METHODS
+    from nerf_lightning.stability.report import write_report
+    from nerf_lightning.stability.suite import QUICK, cells_of, run_all
+
+    every = [condition.name for condition in CONDITIONS]
+    if suite not in ("quick", "full"):
+        raise InputError("config", "suite", repr(suite), "quick or full")
+    unknown = [method for method in methods or [] if method not in METHODS]
+    if unknown:
+        raise InputError("config", "methods", unknown[0], f"some of {', '.join(METHODS)}")
+    cells = cells_of(QUICK if suite == "quick" else every, methods or list(METHODS), seeds, steps)
+    root = Path(output).expanduser()
+    outcomes = dict(tracked(run_all(cells, root, workers), len(cells), "cells"))
+    write_report([outcomes[cell] for cell in cells], suite, root)
+
+
+if __name__ == "__main__":
+    cli.run("stability", task)

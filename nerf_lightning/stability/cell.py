@@ -1,0 +1,138 @@
+"""One cell of the suite: a condition, a method and a seed, trained as a user would train it."""
+
+import contextlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.files import write_json
+from nerf_lightning.names import slug
+from nerf_lightning.stability.conditions import CONDITIONS, Condition
+from nerf_lightning.stability.methods import METHODS, Method
+
+OUTCOME = "cell.json"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a cell, as stability.json tells it."""
+
+    condition: str
+    method: str
+    seed: int
+    guard: bool
+    psnr: float | None
+    status: str
+    """finished, collapsed, refused (before training) or failed."""
+    diagnosis: str
+    recoveries: int
+    alarm: str
+    """What was doubtful about the data, or the result, as the run itself says."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What is to be tried."""
+
+    condition: str
+    method: str
+    seed: int
+    steps: int
+
+    @property
+    def parts(self) -> tuple[Condition, Method]:
+        condition = next(one for one in CONDITIONS if one.name == self.condition)
+        return condition, METHODS[self.method]
+
+    @property
+    def options(self) -> list[str] | None:
+        """Overrides; None where the condition is not for the method."""
+        condition, method = self.parts
+        own = condition.options_for(method.kind)
+        return None if own is None else [*method.options, *own]
+
+    def folder(self, root: Path) -> Path:
+        return folder_of(root, self.condition, self.method, self.seed)
+
+
+def folder_of(root: Path, condition: str, method: str, seed: int) -> Path:
+    """Where a cell's run is left."""
+    return root / "cells" / slug(condition) / f"{slug(method)}_seed{seed}"
+
+
+def run(cell: Cell, root: Path) -> Outcome:
+    """Trains a cell, unless it was trained before with the same options."""
+    folder = cell.folder(root)
+    before = _read(folder, cell)
+    if before is not None:
+        return before
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "log.txt").open("w") as log, _to(log):
+        outcome = _train(cell, folder)
+    write_json(folder / OUTCOME, {"cell": asdict(cell), "options": cell.options, "outcome": asdict(outcome)})
+    return outcome
+
+
+def _read(folder: Path, cell: Cell) -> Outcome | None:
+    try:
+        content = json.loads((folder / OUTCOME).read_text())
+        if content["cell"] == asdict(cell) and content["options"] == cell.options:
+            return Outcome(**content["outcome"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # not there, or cut short: it is done anew
+    return None
+
+
+@contextlib.contextmanager
+def _to(log: Any) -> Iterator[None]:
+    with contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
+        yield
+
+
+def _train(cell: Cell, folder: Path) -> Outcome:
+    from nerf_lightning.callbacks.panels import write_png
+    from nerf_lightning.compose import composed
+    from nerf_lightning.dataset import Scene, save_npz
+    from nerf_lightning.training import train
+
+    condition, method = cell.parts
+    made = condition.scene(cell.seed)
+    if isinstance(made, Scene):
+        path = folder / "scene.npz"
+        save_npz(made, path)
+        given = ["dataset=photos", "callbacks.orbit=null"]
+    else:
+        path = folder / "picture.png"
+        write_png(path, made.image.numpy())
+        given = [
+            "callbacks.training_gif=null",
+            "callbacks.charts=null",
+            "callbacks.baselines=null",
+            "callbacks.enlarge=null",
+        ]
+    given += [
+        *(cell.options or []),
+        f"dataset.path='{path}'",
+        f"seed={cell.seed}",
+        "threads=1",
+        f"budget.steps={cell.steps}",
+    ]
+    given += ["~logger", "callbacks.snapshots.steps=[]", "callbacks.heldout=null", "callbacks.checkpoints=null"]
+    psnr, status, diagnosis, recoveries, alarm = None, "failed", "", 0, ""
+    try:
+        cfg = composed(given, folder)
+        cfg.optimizer.lr *= condition.rate
+        train(cfg)
+        results = json.loads((folder / "results.json").read_text())
+        psnr, status, diagnosis = results["psnr"], results["status"], results["diagnosis"]
+        recoveries = len(results["recoveries"])
+        alarm = "; ".join([*results["warnings"], *([diagnosis] if status == "finished" and diagnosis else [])])
+    except InputError as error:
+        status, diagnosis = "refused", str(error).replace(str(path), condition.name)
+    except Exception as error:  # noqa: BLE001  (a failure is what the suite is for; it stands in the outcome)
+        diagnosis = " ".join(f"{type(error).__name__}: {error}".split())
+    path.unlink(missing_ok=True)
+    return Outcome(cell.condition, cell.method, cell.seed, method.guard, psnr, status, diagnosis, recoveries, alarm)

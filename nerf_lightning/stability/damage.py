@@ -1,0 +1,104 @@
+"""What can go wrong with a scene, done to it on purpose. All of it depends on the seed alone."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.seeding import step_generator
+
+Poses = Callable[[Float[Tensor, "V 4 4"]], Float[Tensor, "V 4 4"]]
+Photos = Callable[[Float[Tensor, "V H W C"]], Float[Tensor, "V H W C"]]
+
+
+def posed(views: Views, change: Poses) -> Views:
+    """Views with other poses."""
+    return replace(views, cameras=replace(views.cameras, c2w=change(views.cameras.c2w.clone())))
+
+
+def exposed(views: Views, change: Photos) -> Views:
+    """Views with other colours: `change` takes and gives the photos in [0, 1]."""
+    colours = change(views.images.float() / 255)
+    return replace(views, images=(colours.clamp(0, 1) * 255).round().to(torch.uint8))
+
+
+def turned_to_opengl(scene: Scene, seed: int) -> Scene:
+    """Poses whose y axis points up and whose z axis points backward, read as if they did not."""
+
+    def flip(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
+        c2w[:, :3, 1:3] *= -1
+        return c2w
+
+    return replace(scene, train=posed(scene.train, flip), val=posed(scene.val, flip))
+
+
+def shuffled(scene: Scene, seed: int) -> Scene:
+    """Each training photo has another one's pose."""
+    order = torch.randperm(len(scene.train), generator=step_generator(seed, 4, 0))
+    return replace(scene, train=posed(scene.train, lambda c2w: c2w[order]))
+
+
+def with_pose_noise(scene: Scene, seed: int, degrees: float) -> Scene:
+    """Training cameras turned about random axes, by angles of that standard deviation."""
+
+    def turn(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
+        vectors = torch.randn(len(c2w), 3, generator=step_generator(seed, 4, 1)) * (degrees / 180 * torch.pi / 3**0.5)
+        cross = torch.zeros(len(c2w), 3, 3)
+        cross[:, [2, 0, 1], [1, 2, 0]] = vectors
+        c2w[:, :3, :3] = torch.linalg.matrix_exp(cross - cross.mT) @ c2w[:, :3, :3]
+        return c2w
+
+    return replace(scene, train=posed(scene.train, turn))
+
+
+def with_exposure_drift(scene: Scene, seed: int, share: float) -> Scene:
+    """Training photos brighter or darker, by up to that share."""
+    gains = 1 + share * (2 * torch.rand(len(scene.train), 1, 1, 1, generator=step_generator(seed, 4, 2)) - 1)
+    return replace(scene, train=exposed(scene.train, lambda colours: colours * gains))
+
+
+def with_noise(scene: Scene, seed: int, spread: float) -> Scene:
+    """Noise of that standard deviation on each training pixel."""
+    generator = step_generator(seed, 4, 3)
+    return replace(scene, train=exposed(scene.train, lambda x: x + spread * torch.randn(x.shape, generator=generator)))
+
+
+def with_views(scene: Scene, seed: int, count: int) -> Scene:
+    """Few training photos, evenly chosen."""
+    kept = torch.linspace(0, len(scene.train) - 1, count).round().long()
+    return replace(scene, train=Views(scene.train.images[kept], scene.train.cameras[kept]))
+
+
+def scaled(scene: Scene, seed: int, factor: float) -> Scene:
+    """The same world in another unit."""
+
+    def scale(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
+        c2w[:, :3, 3] *= factor
+        return c2w
+
+    orbit = replace(scene.orbit, c2w=scale(scene.orbit.c2w.clone()))
+    bounds = Bounds(scene.bounds.aabb * factor)
+    return replace(scene, train=posed(scene.train, scale), val=posed(scene.val, scale), orbit=orbit, bounds=bounds)
+
+
+def with_limits(scene: Scene, seed: int, factor: float) -> Scene:
+    """near and far as a file may state them, wrong by a factor."""
+    distance = float(scene.train.cameras.centres.norm(dim=1).mean())
+    reach = float(scene.bounds.half_size.norm())
+    return replace(
+        scene, bounds=replace(scene.bounds, near=factor * (distance - reach), far=factor * (distance + reach))
+    )
+
+
+def with_box(scene: Scene, seed: int, factor: float) -> Scene:
+    """Bounds smaller or larger than the content."""
+    return replace(scene, bounds=Bounds(scene.bounds.aabb * factor))
+
+
+def with_background(scene: Scene, seed: int, colour: tuple[float, float, float]) -> Scene:
+    """The pictures as they are, and another colour said to be behind them."""
+    return replace(scene, background=colour)

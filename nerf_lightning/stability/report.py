@@ -1,0 +1,55 @@
+"""What a suite leaves behind: stability.json, a heat map, a table in Markdown, and the worst renders."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from nerf_lightning.callbacks.panels import write_png
+from nerf_lightning.files import atomic, write_json
+from nerf_lightning.ink import pixels_of
+from nerf_lightning.stability.cell import Outcome, folder_of
+from nerf_lightning.stability.heatmap import heatmap
+from nerf_lightning.stability.verdict import Square, squares
+from nerf_lightning.stability.worst import worst_page
+
+
+def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> None:
+    """Writes all files into the suite's folder and says what was found."""
+    found = squares(outcomes)
+    write_json(root / "stability.json", {"suite": suite, "cells": [asdict(one) for one in outcomes]})
+    seeds = max((len(square.outcomes) for square in found), default=0)
+    title = f"worst of {seeds} seeds, dB held out; failed/all; suite={suite}"
+    write_png(root / "heatmap.png", pixels_of(heatmap(found, title)))
+    page = worst_page(found, lambda one: folder_of(root, one.condition, one.method, one.seed))
+    write_png(root / "worst.png", pixels_of(page))
+    with atomic(root / "stability.md") as temporary:
+        temporary.write_text(markdown(found))
+    for square in found:
+        if square.failed:
+            first = square.failed[0]
+            print(
+                f"{square.condition.name}, {square.method}: {len(square.failed)} of {len(square.outcomes)} failed"
+                f" ({square.condition.check}); seed {first.seed}: {first.status}: {first.diagnosis}"
+            )
+    print(f"{len(outcomes)} cells: {root}/heatmap.png, worst.png, stability.md, stability.json")
+
+
+def markdown(found: Sequence[Square]) -> str:
+    """A row for each condition, a column for each method."""
+    methods = list(dict.fromkeys(square.method for square in found))
+    rows: dict[str, dict[str, str]] = {}
+    checks = {}
+    for square in found:
+        worst = square.worst
+        told = "refused" if worst is None and not square.failed else "-" if worst is None else f"{worst:.1f} dB"
+        if square.failed:
+            told += f", {len(square.failed)} of {len(square.outcomes)} failed"
+        if square.recovered:
+            told += f", {square.recovered} recovered"
+        rows.setdefault(square.condition.name, {})[square.method] = told
+        checks[square.condition.name] = square.condition.check
+    lines = [f"| condition | must be | {' | '.join(methods)} |", "|---" * (len(methods) + 2) + "|"]
+    for name, by_method in rows.items():
+        cells = " | ".join(by_method.get(method, "") for method in methods)
+        lines.append(f"| {name} | {checks[name]} | {cells} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,58 @@
+"""All cells of a suite, side by side on the machine's cores, each done once."""
+
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+from nerf_lightning.machine import cores
+from nerf_lightning.stability.cell import Cell, Outcome, run
+from nerf_lightning.stability.conditions import CONDITIONS
+from nerf_lightning.stability.methods import METHODS
+
+QUICK = (
+    "clean",
+    "white, small object",
+    "rate x10",
+    "3 views",
+    "wrong background flag",
+    "OpenGL poses",
+    "shuffled poses",
+)
+"""Conditions of the shortest suite."""
+
+
+def cells_of(conditions: Sequence[str], methods: Sequence[str], seeds: int, steps: int) -> list[Cell]:
+    """What is to be tried: of conditions that are refused one seed tells all."""
+    chosen = [
+        Cell(condition.name, method, seed, steps)
+        for condition in CONDITIONS
+        if condition.name in conditions
+        for method in methods
+        if METHODS[method].flat == condition.flat
+        for seed in range(1 if condition.hopeless else seeds)
+    ]
+    return [cell for cell in chosen if cell.options is not None]
+
+
+def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Iterator[tuple[Cell, Outcome]]:
+    """Trains cells in processes of one thread each; yields them as they end."""
+    count = min(workers or cores(), len(cells))
+    context = multiprocessing.get_context("spawn")  # what numba compiled, and torch's threads, do not survive a fork
+    with ProcessPoolExecutor(count, context, _prepare) as pool:
+        pending = {pool.submit(run, cell, root): cell for cell in cells}
+        try:
+            for done in as_completed(pending):
+                yield pending[done], done.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _prepare() -> None:
+    """One thread a process: more would wait for each other."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    import torch
+
+    torch.set_num_threads(1)

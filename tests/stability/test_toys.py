@@ -1,0 +1,101 @@
+"""Toy scenes against geometry done by hand, and the damage done to them."""
+
+import math
+
+import pytest
+import torch
+
+from nerf_lightning.cameras import Rays
+from nerf_lightning.stability import damage
+from nerf_lightning.stability.conditions import picture
+from nerf_lightning.stability.toys import DISTANCE, MARBLE, PILE, Ball, Block, around, enclosing, toy, trace
+
+
+def ray(origin: list[float], direction: list[float]) -> Rays:
+    return Rays(torch.tensor([origin]), torch.nn.functional.normalize(torch.tensor([direction]), dim=1))
+
+
+@pytest.mark.parametrize(
+    ("body", "start", "way", "distance", "normal"),
+    [
+        (Ball((0.0, 0.0, 0.0), 0.5), [0.0, 0.0, 3.0], [0.0, 0.0, -1.0], 2.5, [0.0, 0.0, 1.0]),
+        (Ball((1.0, 0.0, 0.0), 0.5), [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 0.5, [-1.0, 0.0, 0.0]),
+        (Ball((0.0, 0.0, 0.0), 0.5), [0.0, 0.0, 3.0], [0.0, 1.0, 0.0], math.inf, None),
+        (Ball((0.0, 0.0, 0.0), 0.5), [0.0, 0.0, 3.0], [0.0, 0.0, 1.0], math.inf, None),
+        (Block((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), [3.0, 0.2, 0.1], [-1.0, 0.001, 0.001], 2.0, [1.0, 0.0, 0.0]),
+        (Block((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), [3.0, 2.0, 0.0], [-1.0, 0.001, 0.001], math.inf, None),
+    ],
+)
+def test_where_rays_meet_bodies(
+    body, start: list[float], way: list[float], distance: float, normal: list[float] | None
+):
+    t, found = body.meet(ray(start, way))
+    assert float(t) == pytest.approx(distance, rel=1e-5)
+    if normal is not None:
+        assert found[0].tolist() == pytest.approx(normal, abs=1e-6)
+
+
+def test_the_nearer_body_is_seen():
+    red, behind = Ball((0.0, 0.0, 1.0), 0.3), Ball((0.0, 0.0, -1.0), 0.3)
+    colour, cover = trace([behind, red], ray([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]))
+    alone, _ = trace([red], ray([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]))
+    assert torch.equal(colour, alone) and cover.tolist() == [1.0]
+
+
+def test_cameras_stand_apart_and_look_at_the_middle():
+    train, val = around(24, 32), around(4, 32, phase=0.7)
+    centres = torch.cat([train.centres, val.centres])
+    assert torch.cdist(centres, centres).fill_diagonal_(9).min() > 0.2
+    assert torch.allclose(centres.norm(dim=1), torch.tensor(DISTANCE))
+    assert torch.allclose(train.c2w[:, :3, 2], -train.centres / DISTANCE, atol=1e-5)
+
+
+def test_a_small_object_covers_what_it_should():
+    """A ball of radius 0.3 at distance 4 in a field of 0.7: about 3 % of the picture."""
+    scene = toy(MARBLE, (1.0, 1.0, 1.0))
+    shown = (scene.train.images != 255).any(-1).float().mean()
+    half_picture = 4 * math.tan(0.35)
+    assert float(shown) == pytest.approx(math.pi * 0.3**2 / (2 * half_picture) ** 2, rel=0.2)
+    assert toy(MARBLE, None).train.images.shape[-1] == 4
+
+
+def test_bounds_hold_all_bodies():
+    aabb = enclosing(PILE).aabb
+    for body in PILE:
+        assert (body.box[0] > aabb[0]).all() and (body.box[1] < aabb[1]).all()
+
+
+def test_the_same_every_time():
+    assert torch.equal(toy(PILE).train.images, toy(PILE).train.images)
+    for change in (damage.shuffled, lambda s, seed: damage.with_noise(s, seed, 0.1)):
+        first, again, other = (change(toy(PILE, size=16), seed) for seed in (1, 1, 2))
+        assert first.sha256() == again.sha256()
+        assert torch.equal(first.train.cameras.c2w, again.train.cameras.c2w)
+        assert first.sha256() != other.sha256() or not torch.equal(first.train.cameras.c2w, other.train.cameras.c2w)
+
+
+def test_damage():
+    scene = toy(PILE, size=16)
+    flipped = damage.turned_to_opengl(scene, 0)
+    assert torch.allclose(flipped.train.cameras.c2w[:, :3, 2], -scene.train.cameras.c2w[:, :3, 2])
+    assert len(damage.with_views(scene, 0, 3).train) == 3
+    big = damage.scaled(scene, 0, 10.0)
+    assert torch.allclose(big.train.cameras.centres, 10 * scene.train.cameras.centres)
+    assert torch.allclose(big.bounds.aabb, 10 * scene.bounds.aabb)
+    assert torch.equal(scene.train.cameras.c2w, toy(PILE, size=16).train.cameras.c2w), "the scene itself is untouched"
+    turned = damage.with_pose_noise(scene, 0, 5.0).train.cameras.c2w[:, :3, :3]
+    trace_ = (turned.mT @ scene.train.cameras.c2w[:, :3, :3]).diagonal(dim1=1, dim2=2).sum(1)
+    angles = ((trace_ - 1) / 2).clamp(-1, 1).acos() * 180 / math.pi
+    assert float(angles.square().mean().sqrt()) == pytest.approx(5.0, rel=0.4)
+    drifted = damage.with_exposure_drift(scene, 0, 0.3)
+    sums = [one.train.images.float().sum((1, 2, 3)) for one in (drifted, scene)]
+    gains = sums[0] / sums[1]
+    assert 0.69 < gains.min() < 0.9 < 1.1 < gains.max() < 1.31
+    assert damage.with_noise(scene, 0, 0.1).train.images.float().std() > scene.train.images.float().std()
+
+
+def test_the_picture_holds_all_frequencies():
+    image = picture(96, 16).image
+    assert image.shape == (16, 96, 3)
+    spectrum = torch.fft.rfft(image[0, :, 0].float() - 127.5).abs()
+    assert (spectrum[1:32] > 20).float().mean() > 0.8
