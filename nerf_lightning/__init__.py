@@ -11,10 +11,11 @@ The tree is the data flow, seven stages in order:
     model/      fields: position, direction -> density, rgb; encodings; 2D fields
     renderer/   Samples with density and rgb become colour, opacity, depth
     system/     NeRF2D and NeRF3D: LightningModules that hold step, loss, metrics, optimiser
-    callbacks/  budget, held-out PSNR, snapshots, orbit, checkpoints, progress, results.json
+    callbacks/  budget, guard, held-out PSNR, snapshots, orbit, checkpoints, progress, results.json
     build.py    config -> objects, the only place that instantiates
     view.py     a scene in the browser
     sweep.py    many runs from one command line; gallery.py draws what they made
+    stability/  methods tried where they are known to fail
     chart/      speed against accuracy: which method is worth its time
     __main__.py the command line: compose -> build -> fit -> test -> results.json
 
