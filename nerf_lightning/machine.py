@@ -13,6 +13,8 @@ import torch
 
 CROWDED = 0.1
 """Share of a run's threads that other work may take before its seconds are called those of a busy machine."""
+SHORTEST = 0.5
+"""Seconds below which the system's clock, which counts in hundredths, tells nothing about a load."""
 
 
 def cores() -> int:
@@ -89,7 +91,7 @@ class Load:
         self.others += busy - own  # may be below zero for a moment: the system counts in hundredths
 
     def cores(self) -> dict[str, float] | None:
-        """Cores in use on average; None where no time has passed."""
-        if self.seconds <= 0:
+        """Cores in use on average; None where too little time has passed to tell."""
+        if self.seconds < SHORTEST:
             return None
         return {"own": round(self.own / self.seconds, 3), "others": round(max(0.0, self.others) / self.seconds, 3)}

@@ -112,7 +112,7 @@ def test_what_a_run_leaves(tmp_path: Path):
     assert results["scene"]["name"] == "bricks"
     assert results["background"] == [0, 0, 0]
     assert set(results["machine"]) == {"processor", "cores", "accelerator"}
-    assert results["load"]["own"] > 0 and results["load"]["others"] >= 0
+    assert results["load"] is None or results["load"].keys() == {"own", "others"}, "None for less than half a second"
     assert (results["method"], results["seed"], results["steps"], results["status"]) == ("hashgrid", 3, 60, "finished")
     assert results["psnr"] == pytest.approx(quality)
     assert results["psnr"] > 17

@@ -54,6 +54,11 @@ def test_load_counts_only_between_start_and_stop(monkeypatch: pytest.MonkeyPatch
     passes(2, 3, 1.5)
     load.stop()
     assert load.cores() == {"own": 1.5, "others": 0.5}
+    short = Load()
+    short.start()
+    passes(0.2, 0.2, 0.2)
+    short.stop()
+    assert short.cores() is None, "too short to tell"
 
 
 def test_guests_and_waiting_are_not_counted_as_work(monkeypatch: pytest.MonkeyPatch):

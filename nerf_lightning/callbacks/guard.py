@@ -108,7 +108,8 @@ class Guard(L.Callback):
             self._start = copied(pl_module)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        self.plain = plain_error(data_of(trainer), pl_module)
+        with Budget.of(trainer).paused():
+            self.plain = plain_error(data_of(trainer), pl_module)
         if self.began and isinstance(pl_module, NeRF3D):
             pl_module.sampler.restart(self.began)
 
@@ -155,6 +156,7 @@ class Guard(L.Callback):
             "earlier": self.earlier,
             "lowest": self.lowest,
             "risen": self._risen,
+            "dead": self._dead,
             "given_up": self._given_up,
         }
 
@@ -162,7 +164,7 @@ class Guard(L.Callback):
         self.recoveries = [Recovery(**one) for one in state_dict["recoveries"]]
         self.rate, self.began, self.level = state_dict["rate"], state_dict["began"], state_dict["level"]
         self.earlier, self.lowest, self.softened = state_dict["earlier"], state_dict["lowest"], state_dict["softened"]
-        self._risen, self._given_up = state_dict["risen"], state_dict["given_up"]
+        self._risen, self._dead, self._given_up = state_dict["risen"], state_dict["dead"], state_dict["given_up"]
 
     # How it decides
 
@@ -177,9 +179,8 @@ class Guard(L.Callback):
         """Why training has broken down; "" where it has not."""
         assert self.level is not None  # a step has been made
         risen = self.lowest < AS_PLAIN * self.plain and self.level > RISEN * self.lowest
-        stays = (
-            bool(self.earlier) and self.level > STANDING * self.earlier[-1]
-        )  # a spike that passes is none of its business
+        # A spike that passes is none of its business.
+        stays = bool(self.earlier) and self.level > STANDING * self.earlier[-1]
         self._risen = self._risen + 1 if risen and stays else 0
         if self._risen >= 3:
             return f"the loss rose to {self.level / self.lowest:.0f} times its lowest"

@@ -72,14 +72,19 @@ def run(cell: Cell, root: Path) -> Outcome:
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "log.txt").open("w") as log, _to(log):
         outcome = _train(cell, folder)
-    write_json(folder / OUTCOME, {"cell": asdict(cell), "options": cell.options, "outcome": asdict(outcome)})
+    write_json(folder / OUTCOME, {**_identity(cell), "outcome": asdict(outcome)})
     return outcome
+
+
+def _identity(cell: Cell) -> dict[str, Any]:
+    """What a cell that was done before must agree in."""
+    return {"cell": asdict(cell), "options": cell.options, "rate": cell.parts[0].rate}
 
 
 def _read(folder: Path, cell: Cell) -> Outcome | None:
     try:
         content = json.loads((folder / OUTCOME).read_text())
-        if content["cell"] == asdict(cell) and content["options"] == cell.options:
+        if {key: content[key] for key in _identity(cell)} == _identity(cell):
             return Outcome(**content["outcome"])
     except (OSError, ValueError, KeyError, TypeError):
         pass  # not there, or cut short: it is done anew

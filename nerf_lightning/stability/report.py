@@ -19,7 +19,10 @@ def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> None:
     write_json(root / "stability.json", {"suite": suite, "cells": [asdict(one) for one in outcomes]})
     seeds = max((len(square.outcomes) for square in found), default=0)
     title = f"worst of {seeds} seeds, dB held out; failed/all; suite={suite}"
-    write_png(root / "heatmap.png", pixels_of(heatmap(found, title)))
+    for name, flat in (("heatmap.png", False), ("heatmap_2d.png", True)):
+        part = [square for square in found if square.condition.flat == flat]
+        if part:
+            write_png(root / name, pixels_of(heatmap(part, title)))
     page = worst_page(found, lambda one: folder_of(root, one.condition, one.method, one.seed))
     write_png(root / "worst.png", pixels_of(page))
     with atomic(root / "stability.md") as temporary:

@@ -12,13 +12,8 @@ from nerf_lightning.stability.conditions import CONDITIONS
 from nerf_lightning.stability.methods import METHODS
 
 QUICK = (
-    "clean",
-    "white, small object",
-    "rate x10",
-    "3 views",
-    "wrong background flag",
-    "OpenGL poses",
-    "shuffled poses",
+    *("clean", "white, small object", "rate x10", "wrong background flag", "OpenGL poses", "shuffled poses"),
+    *("2D: clean", "2D: rate x10", "2D: L = 40"),
 )
 """Conditions of the shortest suite."""
 
