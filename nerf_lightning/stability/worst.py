@@ -25,14 +25,14 @@ def worst_page(found: Sequence[Square], folder_of: Callable[[Outcome], Path]) ->
     shown = [(one, square) for one, square in lowest if (folder_of(one) / "final.png").exists()]
     shown = sorted(shown, key=lambda pair: _quality(pair[0]))[:MOST]
     rows = max(1, math.ceil(len(shown) / COLUMNS))
-    figure = Figure(figsize=(2 * COLUMNS, 2.5 * rows), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(2 * COLUMNS, 2.6 * rows), dpi=DPI, layout="constrained")
     for axes in figure.subplots(rows, COLUMNS, squeeze=False).flat:
         axes.axis("off")
     for axes, (one, square) in zip(figure.axes, shown, strict=False):
         axes.imshow(imageio.imread(folder_of(one) / "final.png"), interpolation="nearest")
         told = "no figure" if one.psnr is None else f"{one.psnr:.1f} dB"
         axes.set_title(
-            readable(f"{one.condition}\n{one.method}, seed {one.seed}: {told}"),
+            f"{readable(one.condition)}\n{readable(one.method)}\nseed {one.seed}: {told}",
             fontsize=7.5,
             color=VERMILLION if one in square.failed else "black",
             parse_math=False,
