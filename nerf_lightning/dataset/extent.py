@@ -1,9 +1,12 @@
 """Where the content is, told from cameras and silhouettes alone: a box to sample in."""
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, focus_point
@@ -86,30 +89,57 @@ def visible_cube(cameras: Cameras) -> Float[np.ndarray, "2 3"]:
     return np.stack([centre.numpy() - half, centre.numpy() + half]).astype(np.float64)
 
 
-def _carve(
-    aabb: Float[np.ndarray, "2 3"], masks: Bool[np.ndarray, "V H W"], cameras: Cameras
-) -> Float[np.ndarray, "2 3"] | None:
-    """The box of the voxels inside (nearly) all silhouettes, one voxel wider; None when there are none."""
-    voxel = (aabb[1] - aabb[0]) / GRID
-    x, y, z = aabb[0][:, None] + (np.arange(GRID) + 0.5) * voxel[:, None]
-    centres = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
-    seen = np.zeros(len(centres), np.int32)
-    hits = np.zeros(len(centres), np.int32)
-    for mask, K, c2w in zip(masks, cameras.K.double().numpy(), cameras.c2w.double().numpy(), strict=True):
-        # P = K [R t; 0 1]^-1 maps world to pixels. On a grid it is a sum of one term an axis, cheaper than 48^3 products.
+@dataclass(frozen=True)
+class Sighting:
+    """The voxels of a grid, N in all, as one view sees them."""
+
+    inside: Bool[np.ndarray, "N"]
+    """Which are in the picture."""
+    column: Int[np.ndarray, "N"]
+    row: Int[np.ndarray, "N"]
+    """The pixel of each voxel's centre; 0 where it is not in the picture."""
+    reach: int
+    """Half a voxel's diagonal, pixels: any part of a voxel may be content, or show some."""
+
+    def grown(self, mask: Shaped[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+        """A mask wider by the reach."""
+        return cv2.dilate(mask.astype(np.uint8), np.ones((2 * self.reach + 1, 2 * self.reach + 1), np.uint8))
+
+
+def voxel_centres(aabb: Float[np.ndarray, "2 3"], count: int) -> Float[np.ndarray, "3 count"]:
+    """Coordinates of the middles of `count` voxels along each axis of a box."""
+    voxel = (aabb[1] - aabb[0]) / count
+    return aabb[0][:, None] + (np.arange(count) + 0.5) * voxel[:, None]
+
+
+def sightings(aabb: Float[np.ndarray, "2 3"], count: int, cameras: Cameras) -> Iterator[Sighting]:
+    """A box of count^3 voxels, in the order of their indices, as each camera sees it."""
+    x, y, z = voxel_centres(aabb, count)
+    diagonal = np.linalg.norm((aabb[1] - aabb[0]) / count)
+    for K, c2w in zip(cameras.K.double().numpy(), cameras.c2w.double().numpy(), strict=True):
+        # P = K [R t; 0 1]^-1 maps world to pixels. On a grid it is a sum of one term an axis, cheaper than products.
         P = K @ np.linalg.inv(c2w)[:3]
         u, v, depth = ((p[0] * x[:, None, None] + p[1] * y[:, None] + (p[2] * z + p[3])).reshape(-1) for p in P)
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = u / depth, v / depth
         inside = (depth > 0) & (u >= 0) & (v >= 0) & (u < cameras.width) & (v < cameras.height)
-        if not inside.any():
-            continue
-        # A voxel counts when any part of it may be inside: grow the mask by half its diagonal as this view sees it.
-        reach = 0.5 * np.linalg.norm(voxel) * K[0, 0] / float(np.median(depth[inside]))
-        reach = int(min(np.ceil(reach), max(mask.shape)))
-        grown = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
-        seen[inside] += 1
-        hits[inside] += grown[v[inside].astype(np.int32), u[inside].astype(np.int32)]
+        column, row = (np.where(inside, pixel, 0).astype(np.int32) for pixel in (u, v))
+        nearness = float(np.median(depth[inside])) if inside.any() else np.inf
+        reach = int(min(np.ceil(0.5 * diagonal * K[0, 0] / nearness), max(cameras.width, cameras.height)))
+        yield Sighting(inside, column, row, reach)
+
+
+def _carve(
+    aabb: Float[np.ndarray, "2 3"], masks: Bool[np.ndarray, "V H W"], cameras: Cameras
+) -> Float[np.ndarray, "2 3"] | None:
+    """The box of the voxels inside (nearly) all silhouettes, one voxel wider; None when there are none."""
+    voxel = (aabb[1] - aabb[0]) / GRID
+    centres = np.stack(np.meshgrid(*voxel_centres(aabb, GRID), indexing="ij"), axis=-1).reshape(-1, 3)
+    seen = np.zeros(len(centres), np.int32)
+    hits = np.zeros(len(centres), np.int32)
+    for mask, sighting in zip(masks, sightings(aabb, GRID, cameras), strict=True):
+        seen += sighting.inside
+        hits += sighting.inside & (sighting.grown(mask)[sighting.row, sighting.column] > 0)
     kept = centres[(seen >= 0.5 * len(masks)) & (hits >= AGREEMENT * seen)]
     if len(kept) == 0:
         return None

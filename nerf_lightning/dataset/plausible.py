@@ -3,14 +3,13 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, focus_point
-from nerf_lightning.dataset.extent import MAX_VIEWS, border_colour, silhouettes, visible_cube
+from nerf_lightning.dataset.extent import MAX_VIEWS, border_colour, sightings, silhouettes, visible_cube
 from nerf_lightning.dataset.scene import Scene, Views
 from nerf_lightning.errors import InputError
 
@@ -53,20 +52,14 @@ def check_scene(scene: Scene) -> list[str]:
     Raises:
         InputError: for data of which no method can make a scene.
     """
-    doubts = [
-        *looking_away(scene),
-        *border(scene),
-        *misfits(scene),
-        *repeats(scene),
-        *overlap(scene),
-        *cut_short(scene),
-    ]
-    for doubt in doubts:
-        if doubt.hopeless:
-            raise InputError(
-                scene.source, "", doubt.text, "photos and poses that fit each other", "see the file's convention"
-            )
-    return [doubt.text for doubt in doubts]
+    told = []
+    for check in (looking_away, border, misfits, repeats, overlap, cut_short):
+        for doubt in check(scene):
+            if doubt.hopeless:
+                expected = "photos and poses that fit each other"
+                raise InputError(scene.source, "", doubt.text, expected, "see the file's convention")
+            told.append(doubt.text)
+    return told
 
 
 def looking_away(scene: Scene) -> Iterator[Doubt]:
@@ -124,43 +117,21 @@ def misfits(scene: Scene) -> Iterator[Doubt]:
 
 def hull_coverage(masks: Bool[np.ndarray, "V H W"], cameras: Cameras, bounds: Bounds) -> float:
     """How much of the outlines the visual hull covers that they carve out of the bounds, in [0, 1]."""
-    low, high = bounds.aabb.double().numpy()
-    side = (high - low) / HULL
-    x, y, z = low[:, None] + (np.arange(HULL) + 0.5) * side[:, None]
-    centres = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
-    seen_by = np.zeros(len(centres), np.int32)
-    inside_of = np.zeros(len(centres), np.int32)
-    places = []
-    for mask, K, c2w in zip(masks, cameras.K.double().numpy(), cameras.c2w.double().numpy(), strict=True):
-        local = (centres - c2w[:3, 3]) @ c2w[:3, :3]
-        depth = np.maximum(local[:, 2], 1e-9)
-        pixels = np.floor((local @ K.T)[:, :2] / depth[:, None])
-        seen = (local[:, 2] > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)
-        column, row = np.where(seen[:, None], pixels, 0).astype(np.int32).T
-        reach = _reach(side, K, depth[seen], mask.shape)
-        grown = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
-        seen_by += seen
-        inside_of += seen & grown[row, column]
-        places.append((column, row, seen, reach))
-    inside = (seen_by > 0) & (inside_of >= MOST_AGREE * seen_by)
+    seen = list(sightings(bounds.aabb.double().numpy(), HULL, cameras))
+    seen_by = sum(sighting.inside.astype(np.int32) for sighting in seen)
+    inside_of = sum(
+        (sighting.inside & (sighting.grown(mask)[sighting.row, sighting.column] > 0)).astype(np.int32)
+        for mask, sighting in zip(masks, seen, strict=True)
+    )
+    hull = (seen_by > 0) & (inside_of >= MOST_AGREE * seen_by)
     covered = []
-    for mask, (column, row, seen, reach) in zip(masks, places, strict=True):
+    for mask, sighting in zip(masks, seen, strict=True):
         shown = np.zeros(mask.shape, np.uint8)
-        kept = inside & seen
-        shown[row[kept], column[kept]] = 1
-        shown = cv2.dilate(shown, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+        kept = hull & sighting.inside
+        shown[sighting.row[kept], sighting.column[kept]] = 1
         if mask.any():
-            covered.append(float(shown[mask].mean()))
+            covered.append(float(sighting.grown(shown)[mask].mean()))
     return float(np.mean(covered)) if covered else 1.0
-
-
-def _reach(
-    side: Float[np.ndarray, "3"], K: Float[np.ndarray, "3 3"], depth: Float[np.ndarray, "N"], shape: tuple[int, ...]
-) -> int:
-    """Half a voxel's diagonal as a camera sees it, in pixels."""
-    if not len(depth):
-        return 1
-    return int(min(np.ceil(0.5 * np.linalg.norm(side) * K[0, 0] / float(np.median(depth))), max(shape)))
 
 
 def repeats(scene: Scene) -> Iterator[Doubt]:
