@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Annotated, Any
 
 import lightning as L
@@ -21,16 +22,18 @@ MEMORY = 0.96
 """Of the running mean of the loss, a step: it looks back about 25 steps."""
 AS_PLAIN = 0.85
 """Share of the error of one plain colour above which a field has not learned the scene."""
-STANDING = 0.98
-"""Share of an earlier error above which it has not fallen since."""
-RISEN = 4.0
-"""Times the lowest error seen, above which training is coming apart."""
+STANDING, HARDLY_FALLING = 0.98, 0.9
+"""Shares of the error some steps ago above which it has not fallen since: below that of a plain colour, and above it."""
+RISEN, WORSE = 4.0, 1.1
+"""Times the lowest error seen, above which training is coming apart; and above which it must not stay ..."""
+HALF_LEARNED = 0.3
+"""... while the error is more than this share of that of one plain colour."""
 EMPTY, FULL = 1e-3, 0.999
 """Mean opacity of rays below which there is no density, and above which there is nothing but density."""
-LOWER = 0.3
-"""Factor on the learning rate, each time that rate is what is to blame."""
+LOWER, MUCH_LOWER = 0.3, 0.2
+"""Factors on the learning rate where it is what is to blame: after something was learned, and where nothing ever was."""
 WARM = 100
-"""Steps in which the rate comes back after a new start."""
+"""Steps in which the rate comes back after a new start, where it was to blame."""
 PIXELS = 8192
 """Drawn to learn how well one plain colour would do."""
 
@@ -110,12 +113,15 @@ class Guard(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         with Budget.of(trainer).paused():
             self.plain = plain_error(data_of(trainer), pl_module)
-        if self.began and isinstance(pl_module, NeRF3D):
-            pl_module.sampler.restart(self.began)
+        if isinstance(pl_module, NeRF3D):
+            if self.began:
+                pl_module.sampler.restart(self.began)
+            if self.attempts and trainer.global_step == 0 and trainer.world_size == 1:
+                self._slow_down(trainer, pl_module)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
         since = trainer.global_step - self.began
-        warm = min(1.0, (since + 1) / WARM) if self.began else 1.0
+        warm = min(1.0, (since + 1) / WARM) if self.began and self.rate < 1 else 1.0
         pl_module.rate = self.rate * warm
 
     def on_after_backward(self, trainer: L.Trainer, pl_module: System) -> None:
@@ -136,7 +142,7 @@ class Guard(L.Callback):
         if self._due(step):
             cause = self._cause(pl_module, step)
             if cause:
-                self._recover(trainer, pl_module, cause, lost=self._risen >= 3)
+                self._recover(trainer, pl_module, cause, lost=self.lowest < AS_PLAIN * self.plain)
                 return
             self.earlier = [*self.earlier, self.level][-(self.patience // self.every + 1) :]
             self.lowest = min(self.lowest, self.level)
@@ -184,11 +190,16 @@ class Guard(L.Callback):
         self._risen = self._risen + 1 if risen and stays else 0
         if self._risen >= 3:
             return f"the loss rose to {self.level / self.lowest:.0f} times its lowest"
+        waited = step - self.began >= self.patience and len(self.earlier) > self.patience // self.every
+        looks = [*self.earlier, self.level]
+        if waited and min(looks[1:]) > max(WORSE * self.lowest, HALF_LEARNED * self.plain):
+            return f"the loss fell to {self.lowest / self.plain:.2f} times that of one plain colour, and stays above that since"
         if self._learning() or not self.plain:
             return ""  # a scene of one colour is learned as soon as its colour is
         if self._dead < 2:  # without a gradient there is nothing to wait for
-            waited = step - self.began >= self.patience and len(self.earlier) > self.patience // self.every
-            if not waited or self.level < STANDING * self.earlier[0]:
+            falling = all(after < before for before, after in pairwise(looks))
+            enough = HARDLY_FALLING if self.level > self.plain and not falling else STANDING
+            if not waited or self.level < enough * looks[0]:
                 return ""
         stuck = f"the loss stands at {self.level / self.plain:.2f} times that of one plain colour"
         opacity = system.stats.opacity
@@ -217,18 +228,32 @@ class Guard(L.Callback):
             action = self._start_again(system, step, lost)
         forget(trainer)
         self.level, self.earlier, self.lowest, self._risen, self._dead = None, [], math.inf, 0, 0
-        seconds = round(Budget.of(trainer).seconds, 3)
+        self._record(trainer, cause, action)
+
+    def _record(self, trainer: L.Trainer, cause: str, action: str) -> None:
+        step, seconds = trainer.global_step, round(Budget.of(trainer).seconds, 3)
         self.recoveries.append(Recovery(step, seconds, cause, action))
         print(f"guard: step {step}: {cause}; {action}", flush=True)
+
+    def _slow_down(self, trainer: L.Trainer, system: NeRF3D) -> None:
+        """Before the first step, where the rate is one at which the field is known to come apart."""
+        asked, fastest = trainer.optimizers[0].param_groups[0]["initial_lr"], system.field.fastest
+        if asked > fastest:
+            self.rate = fastest / asked
+            cause = f"a learning rate of {asked:.3g} is more than this field stands ({fastest:.3g})"
+            self._record(trainer, cause, f"{self.rate:.2g} times the learning rate")
 
     def _start_again(self, system: System, step: int, lost: bool) -> str:
         """Fresh weights, and something else besides, as the same again would come to the same end."""
         system.load_state_dict(self._start)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(step_generator(system.seed, 3, step).initial_seed() & 0xFFFFFFFF))
-            for layer in system.modules():
-                if isinstance(layer, torch.nn.Linear):
-                    layer.reset_parameters()
+            for module in reversed(
+                list(system.modules())
+            ):  # layers first: a field may have a start of its own for them
+                reset = getattr(module, "reset_parameters", None)
+                if reset is not None:
+                    reset()
         system.on_fit_start()  # what a sampler finds out about the scene is part of a start
         if isinstance(system, NeRF3D):
             system.sampler.restart(step)
@@ -238,7 +263,7 @@ class Guard(L.Callback):
             self.softened = True
             action = "started again with softplus in place of the rectifier that makes the density"
         else:
-            self.rate *= LOWER
+            self.rate *= LOWER if lost else MUCH_LOWER
             action = f"started again with {self.rate:.2g} times the learning rate"
         if self.softened:
             for one in rectifiers:

@@ -18,10 +18,10 @@ from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
-from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.dataset import PictureBatch, PixelDataModule, RayDataModule
 from nerf_lightning.files import write_json
 from nerf_lightning.machine import describe_machine
-from nerf_lightning.system import System, decibels, psnr
+from nerf_lightning.system import NeRF2D, System, decibels, psnr
 
 try:
     import resource
@@ -29,9 +29,13 @@ except ImportError:  # Windows has no such module; peak memory is then not repor
     resource = None  # type: ignore[assignment]
 
 NO_BETTER = 1.0
-"""dB above a picture of one colour below which a run has learned nothing."""
+"""dB above a picture of one colour below which a run has learned nothing ..."""
+SEEN_AS_EQUAL = 40.0
+"""... unless it reaches so many dB, as where one colour is all there is to learn."""
 WIDE_GAP = 8.0
-"""dB from training pixels down to held-out views beyond which a field has learned its photos rather than the scene."""
+"""dB from training pixels down to held-out views beyond which a field has learned its photos rather than the scene ..."""
+GOOD = 30.0
+"""... unless what is held out reaches so many dB: then there is little to mend."""
 
 
 def peak_memory_bytes() -> int | None:
@@ -59,11 +63,25 @@ def gap(trainer: L.Trainer, quality: float) -> str:
     if guard is None or guard.level is None or guard.level <= 0:
         return ""
     trained = decibels(guard.level)
-    if trained < quality + WIDE_GAP:
+    if trained < quality + WIDE_GAP or quality >= GOOD:
         return ""
     return (
         f"training pixels {trained:.1f} dB, held-out views {quality:.1f} dB: too few views for this model,"
         " or poses that do not fit their photos"
+    )
+
+
+def wild_between(trainer: L.Trainer, system: System, nothing: float) -> str:
+    """What it means where a 2D field shows no more than `nothing` (dB) between its pixels; "" where it shows them too."""
+    view = data_of(trainer).held_out(0).to(system.device)
+    if not isinstance(system, NeRF2D) or not isinstance(view, PictureBatch):
+        return ""
+    between = system.between(view)
+    if between is None or between >= nothing:
+        return ""
+    return (
+        f"between its pixels the field is no better than one plain colour ({between:.1f} dB):"
+        " it holds frequencies that the pixels do not show"
     )
 
 
@@ -97,16 +115,17 @@ class Results(L.Callback):
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         quality = fmean(view["psnr"] for view in self.views)
         plain = plain_colour_psnr(data_of(trainer), pl_module)
+        nothing = min(plain + NO_BETTER, SEEN_AS_EQUAL)
         stopped = "stopped_early" if Budget.of(trainer).progress(trainer.global_step) < 1.0 else "finished"
         broken = [name for name, value in pl_module.named_parameters() if not value.isfinite().all()]
         if broken:
             self.write(trainer, pl_module, "collapsed", f"{broken[0]} is no longer finite")
-        elif quality < plain + NO_BETTER:
+        elif quality < nothing:
             found = pl_module.diagnose(data_of(trainer).held_out(0).to(pl_module.device))
             diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
             self.write(trainer, pl_module, "collapsed", f"{diagnosis}: {found}" if found else diagnosis)
         else:
-            self.write(trainer, pl_module, stopped, gap(trainer, quality))
+            self.write(trainer, pl_module, stopped, gap(trainer, quality) or wild_between(trainer, pl_module, nothing))
         if trainer.logger is not None:
             scores = {"test/psnr": quality, "test/ssim": self.summary["ssim"] or 0.0}
             trainer.logger.log_metrics(scores, trainer.global_step)

@@ -10,20 +10,28 @@ from torch import Tensor
 from nerf_lightning.errors import InputError
 
 
+def _at_least_single(x: Tensor) -> Tensor:
+    """Half precision ends at e^11."""
+    return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
 class _TruncatedExp(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: Tensor) -> Tensor:
         ctx.save_for_backward(x)
-        return torch.exp(x.clamp_max(15.0))
+        return torch.exp(_at_least_single(x).clamp_max(15.0))
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
-        return grad * torch.exp(x.clamp(-15.0, 15.0))
+        return (grad * torch.exp(_at_least_single(x).clamp(-15.0, 15.0))).to(x.dtype)
 
 
 def truncated_exp(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """exp(x), held at e^15 above, with a gradient that neither vanishes nor overflows (Instant-NGP's density)."""
+    """exp(x), held at e^15 above, with a gradient that neither vanishes nor overflows (Instant-NGP's density).
+
+    Of half-precision input it gives single precision.
+    """
     return _TruncatedExp.apply(x)
 
 

@@ -1,5 +1,7 @@
 """What every field offers, in three dimensions and in two."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -42,6 +44,11 @@ class Field(InBounds):
             Parameters whose data was replaced by data of another shape: what an optimiser remembers of them is void.
         """
         return []
+
+    @property
+    def fastest(self) -> float:
+        """The learning rate above which training comes apart whatever the scene; infinite where none is known."""
+        return math.inf
 
     def penalty(self) -> Float[Tensor, ""] | None:
         """What training adds to the squared error, if anything."""

@@ -26,8 +26,8 @@ class PictureMLP(PictureField):
 
     Args:
         size: see `PictureField`.
-        frequencies: octaves L of the encoding; 0 feeds the bare coordinates; None takes the octaves up to the picture's own
-            limit, one cycle in two pixels.
+        frequencies: octaves L of the encoding; 0 feeds the bare coordinates; None takes the octaves up to about half of the
+            most that the picture's pixels can show, one cycle in two pixels: further ones run wild between the pixels.
         width: neurons of each hidden layer.
         depth: hidden layers.
     """
@@ -36,7 +36,8 @@ class PictureMLP(PictureField):
         super().__init__(size)
         if frequencies is None:
             # The last octave has 2^(L-1) / 2 cycles over the picture, and `nyquist` is the most that its pixels can show.
-            frequencies = 1 + max(0, round(math.log2(2 * self.nyquist)))
+            # At that limit a sine has one value at all pixels, up to its sign, and whatever it likes between them.
+            frequencies = 1 + max(0, round(math.log2(self.nyquist)))
         if frequencies < 0:
             raise InputError(
                 "model.frequencies", "", str(frequencies), "0 or more, or null to take them from the picture"
@@ -112,11 +113,15 @@ class SirenField(PictureField):
         self.first_frequency = reach * math.pi * self.nyquist
         self.hidden = layers(2, *[width] * depth)
         self.last = torch.nn.Linear(width, 3)
-        with torch.no_grad():
-            for index, layer in enumerate([*self.hidden, self.last]):
-                inputs = layer.weight.shape[1]
-                bound = 1 / inputs if index == 0 else math.sqrt(6 / inputs) / self.HIDDEN_FREQUENCY
-                layer.weight.uniform_(-bound, bound)
+        self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Draws weights so that activations spread alike in all layers; biases are left as the layers drew them."""
+        for index, layer in enumerate([*self.hidden, self.last]):
+            inputs = layer.weight.shape[1]
+            bound = 1 / inputs if index == 0 else math.sqrt(6 / inputs) / self.HIDDEN_FREQUENCY
+            layer.weight.uniform_(-bound, bound)
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         h = self.centred(uv)

@@ -116,6 +116,11 @@ class VoxelField(Field):
         """All that vertices hold, one row a vertex."""
         return self.log_density, self.colours, self.views
 
+    @property
+    def fastest(self) -> float:
+        """Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog before cameras."""
+        return 1 / self.density_rate
+
     def per_length(self, raw: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
         """Densities from what the table holds, 1 / world unit."""
         return truncated_exp(self.density_rate * raw) / self.unit_length

@@ -114,7 +114,8 @@ class OccupancySampler(Sampler):
         if not len(candidates):
             return candidates
         with torch.no_grad():
-            found = torch.cat([density(part) for part in candidates.positions(rays).split(MAX_ASKED)])
+            asked = candidates.positions(rays).split(MAX_ASKED)
+            found = torch.cat([density(part) for part in asked]).float()  # mixed precision gives halves
         # A picture must not depend on how its rays are cut into calls: only training looks at the mean, and drops.
         thin = 0.0
         if generator is not None:

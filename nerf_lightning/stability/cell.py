@@ -10,7 +10,7 @@ from typing import Any
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import write_json
 from nerf_lightning.names import slug
-from nerf_lightning.stability.conditions import CONDITIONS, Condition
+from nerf_lightning.stability.conditions import CONDITIONS, LARGER, Condition
 from nerf_lightning.stability.methods import METHODS, Method
 
 OUTCOME = "cell.json"
@@ -25,6 +25,7 @@ class Outcome:
     seed: int
     guard: bool
     psnr: float | None
+    """dB: of held-out views; of a picture, at `LARGER` times the pixels it was trained on."""
     status: str
     """finished, collapsed, refused (before training) or failed."""
     diagnosis: str
@@ -116,7 +117,8 @@ def _train(cell: Cell, folder: Path) -> Outcome:
             "callbacks.training_gif=null",
             "callbacks.charts=null",
             "callbacks.baselines=null",
-            "callbacks.enlarge=null",
+            f"dataset.max_side={max(made.size) // LARGER}",
+            f"render.scale={LARGER}",
         ]
     given += [
         *(cell.options or []),
@@ -133,6 +135,9 @@ def _train(cell: Cell, folder: Path) -> Outcome:
         train(cfg)
         results = json.loads((folder / "results.json").read_text())
         psnr, status, diagnosis = results["psnr"], results["status"], results["diagnosis"]
+        if method.flat:
+            between = json.loads((folder / "enlarged.json").read_text())["field"]
+            psnr = psnr if between is None else between  # none where each byte is right
         recoveries = len(results["recoveries"])
         alarm = "; ".join([*results["warnings"], *([diagnosis] if status == "finished" and diagnosis else [])])
     except InputError as error:

@@ -29,7 +29,9 @@ def heatmap(found: Sequence[Square], title: str) -> Figure:
             told = "refused" if all(one.status == "refused" for one in square.outcomes) else "failed"
         else:
             colour, told = colours(scale(worst)), f"{worst:.1f}"
-        if lost or worst is not None:
+        if square.condition.hopeless and not lost and worst is not None:
+            told += "  alarm"
+        elif lost or worst is not None:
             told += f"  {lost}/{seeds}"
         axes.add_patch(
             matplotlib.patches.Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=colour, edgecolor="white")

@@ -9,14 +9,16 @@ from nerf_lightning.files import atomic, write_json
 from nerf_lightning.ink import pixels_of
 from nerf_lightning.stability.cell import Outcome, folder_of
 from nerf_lightning.stability.heatmap import heatmap
-from nerf_lightning.stability.verdict import Square, squares
+from nerf_lightning.stability.verdict import NEAR, Rescue, Square, rescues, squares
 from nerf_lightning.stability.worst import worst_page
 
 
 def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> None:
     """Writes all files into the suite's folder and says what was found."""
     found = squares(outcomes)
-    write_json(root / "stability.json", {"suite": suite, "cells": [asdict(one) for one in outcomes]})
+    saved = rescues(outcomes)
+    whole = {"suite": suite, "cells": [asdict(one) for one in outcomes], "rescues": [asdict(one) for one in saved]}
+    write_json(root / "stability.json", whole)
     seeds = max((len(square.outcomes) for square in found), default=0)
     title = f"worst of {seeds} seeds, dB held out; failed/all; suite={suite}"
     for name, flat in (("heatmap.png", False), ("heatmap_2d.png", True)):
@@ -26,15 +28,34 @@ def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> None:
     page = worst_page(found, lambda one: folder_of(root, one.condition, one.method, one.seed))
     write_png(root / "worst.png", pixels_of(page))
     with atomic(root / "stability.md") as temporary:
-        temporary.write_text(markdown(found))
+        temporary.write_text("\n".join([markdown(found), *summary(found, saved)]) + "\n")
     for square in found:
-        if square.failed:
+        if square.failed and not square.control:
             first = square.failed[0]
             print(
                 f"{square.condition.name}, {square.method}: {len(square.failed)} of {len(square.outcomes)} failed"
                 f" ({square.condition.check}); seed {first.seed}: {first.status}: {first.diagnosis}"
             )
+    print("\n".join(summary(found, saved)))
     print(f"{len(outcomes)} cells: {root}/heatmap.png, worst.png, stability.md, stability.json")
+
+
+def summary(found: Sequence[Square], saved: Sequence[Rescue]) -> list[str]:
+    """What it comes to, in sentences."""
+    shipped = [square for square in found if square.shipped]
+    lost, tried = (sum(len(getattr(square, part)) for square in shipped) for part in ("failed", "outcomes"))
+    controls = [square for square in found if square.control]
+    lines = [f"shipped recipes: {lost} of {tried} cells failed"] if shipped else []
+    if controls:
+        failing = [
+            f"{s.condition.name}, {s.method} ({len(s.failed)} of {len(s.outcomes)})" for s in controls if s.failed
+        ]
+        told = "; ".join(failing) or "none, so this suite proves nothing"
+        lines.append(f"controls that failed, as they should: {told}")
+    if saved:
+        back = sum(one.back for one in saved)
+        lines.append(f"guard: {back} of {len(saved)} broken control runs brought back to within {NEAR:g} dB")
+    return lines
 
 
 def markdown(found: Sequence[Square]) -> str:

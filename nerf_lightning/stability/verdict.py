@@ -6,8 +6,11 @@ from statistics import median
 
 from nerf_lightning.stability.cell import Outcome
 from nerf_lightning.stability.conditions import CONDITIONS, Condition
+from nerf_lightning.stability.methods import METHODS
 
 CLEAN = ("clean", "2D: clean")
+NEAR = 2.0
+"""dB below an undisturbed run within which the guard has brought a broken one back."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,17 @@ class Square:
         """dB of the worst seed; None where one has no figure."""
         figures = [one.psnr for one in self.outcomes]
         return None if None in figures else min(figure for figure in figures if figure is not None)
+
+    @property
+    def control(self) -> bool:
+        """Whether it must fail."""
+        method = METHODS[self.method]
+        return self.condition.control or (method.control and not method.guard)
+
+    @property
+    def shipped(self) -> bool:
+        """Whether it is a recipe as it is shipped, which must not fail."""
+        return not self.condition.control and not METHODS[self.method].control
 
     @property
     def recovered(self) -> int:
@@ -54,6 +68,43 @@ def passes(outcome: Outcome, condition: Condition, clean: float | None) -> bool:
     return condition.loses is None or clean is None or outcome.psnr >= clean - condition.loses
 
 
+@dataclass(frozen=True)
+class Rescue:
+    """What the guard made of a run that breaks down without it."""
+
+    condition: str
+    method: str
+    """With the guard."""
+    seed: int
+    psnr: float | None
+    undisturbed: float | None
+    """Median dB of the seeds that do not break down under the same condition, or of the clean runs where all do."""
+
+    @property
+    def back(self) -> bool:
+        return self.psnr is not None and self.undisturbed is not None and self.psnr >= self.undisturbed - NEAR
+
+
+def rescues(outcomes: Sequence[Outcome]) -> list[Rescue]:
+    """Every control run that broke down without the guard, with the same run under its watch."""
+    by_cell = {(one.condition, one.method, one.seed): one for one in outcomes}
+    found = []
+    for lost in outcomes:
+        guarded = METHODS[lost.method].guarded
+        saved = by_cell.get((lost.condition, guarded, lost.seed)) if guarded else None
+        if saved is None or lost.status not in ("collapsed", "failed"):
+            continue
+        undisturbed = _undisturbed(outcomes, (lost.condition,), lost.method) or _clean(outcomes, lost.method)
+        found.append(Rescue(lost.condition, saved.method, lost.seed, saved.psnr, undisturbed))
+    return found
+
+
 def _clean(outcomes: Sequence[Outcome], method: str) -> float | None:
-    figures = [one.psnr for one in outcomes if one.condition in CLEAN and one.method == method and one.psnr is not None]
+    return _undisturbed(outcomes, CLEAN, method)
+
+
+def _undisturbed(outcomes: Sequence[Outcome], conditions: Sequence[str], method: str) -> float | None:
+    """Median dB of the runs that did not break down."""
+    mine = [one for one in outcomes if one.condition in conditions and one.method == method]
+    figures = [one.psnr for one in mine if one.psnr is not None and one.status == "finished"]
     return median(figures) if figures else None

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from nerf_lightning.dataset import PictureBatch, PixelBatch
 from nerf_lightning.model import PictureField
+from nerf_lightning.system.metrics import psnr
 from nerf_lightning.system.system import MakeOptimizer, Schedule, StepStats, System
 
 RENDER_CHUNK = 1 << 16
@@ -48,6 +49,17 @@ class NeRF2D(System):
     def colours(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         """The field's colours at any places, a chunk at a time, cut to [0, 1]."""
         return torch.cat([self.field(part).clamp(0, 1) for part in uv.split(RENDER_CHUNK)])
+
+    def between(self, view: PictureBatch) -> float | None:
+        """PSNR where four pixels meet, against their mean: far below that of the pixels, the field runs wild between them.
+
+        None for a picture of one row or one column.
+        """
+        if min(view.height, view.width) < 2:
+            return None
+        grid = torch.cat([view.uv, view.rgb], dim=1).view(view.height, view.width, 5)
+        met = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]).view(-1, 5) / 4
+        return psnr(self.colours(met[:, :2]), met[:, 2:])
 
     @torch.no_grad()
     def diagnose(self, view: PictureBatch) -> str:

@@ -12,9 +12,9 @@ from nerf_lightning.stability.__main__ import stability
 from nerf_lightning.stability.cell import Cell, Outcome, folder_of, run
 from nerf_lightning.stability.conditions import CONDITIONS
 from nerf_lightning.stability.methods import METHODS
-from nerf_lightning.stability.report import markdown, write_report
+from nerf_lightning.stability.report import markdown, summary, write_report
 from nerf_lightning.stability.suite import QUICK, cells_of
-from nerf_lightning.stability.verdict import passes, squares
+from nerf_lightning.stability.verdict import passes, rescues, squares
 
 CONDITION = {condition.name: condition for condition in CONDITIONS}
 GOOD = Outcome("clean", "hashgrid", 0, True, 30.0, "finished", "", 0, "")
@@ -121,7 +121,26 @@ def test_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert set(saved["cells"][0]) >= {"condition", "method", "seed", "guard", "psnr", "status", "diagnosis"}
     for name in ("heatmap.png", "worst.png"):
         assert imageio.imread(tmp_path / name).std() > 0 or name == "worst.png"
-    assert markdown(squares(outcomes)) == table
+    assert table.startswith(markdown(squares(outcomes)))
+    for text in (told, table):
+        assert "shipped recipes: 1 of 7 cells failed" in text
+
+
+def test_controls_and_what_the_guard_makes_of_them():
+    without = replace(GOOD, method="relu mlp, no guard", guard=False)
+    guarded = replace(GOOD, method="relu mlp", recoveries=1)
+    lost = replace(without, psnr=12.0, status="collapsed")
+    outcomes = [replace(without, seed=0, psnr=30.0), replace(lost, seed=1), replace(lost, seed=2)]
+    outcomes += [replace(guarded, seed=0), replace(guarded, seed=1, psnr=28.1), replace(guarded, seed=2, psnr=27.9)]
+    outcomes += [replace(lost, condition="rate x30"), replace(guarded, condition="rate x30", psnr=29.0)]
+    saved = rescues(outcomes)
+    assert [(one.condition, one.seed, one.undisturbed, one.back) for one in saved] == [
+        ("clean", 1, 30.0, True), ("clean", 2, 30.0, False), ("rate x30", 0, 30.0, True),
+    ]  # fmt: skip
+    told = summary(squares(outcomes), saved)
+    assert "clean, relu mlp, no guard (2 of 3); rate x30, relu mlp, no guard (1 of 1)" in told[0]
+    assert "2 of 3 broken control runs brought back to within 2 dB" in told[1]
+    assert "proves nothing" in summary(squares(outcomes[:1]), [])[0]
 
 
 @pytest.mark.parametrize(("suite", "methods", "words"), [("all", None, "suite"), ("quick", ["nerf"], "methods")])

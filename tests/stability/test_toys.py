@@ -94,8 +94,9 @@ def test_damage():
     assert damage.with_noise(scene, 0, 0.1).train.images.float().std() > scene.train.images.float().std()
 
 
-def test_the_picture_holds_all_frequencies():
+def test_the_picture_holds_all_frequencies_down_to_six_pixels_of_training():
     image = picture(96, 16).image
-    assert image.shape == (16, 96, 3)
+    assert image.shape == (32, 192, 3)
     spectrum = torch.fft.rfft(image[0, :, 0].float() - 127.5).abs()
-    assert (spectrum[1:32] > 20).float().mean() > 0.8
+    assert (spectrum[1:16] > 100).float().mean() > 0.8
+    assert spectrum[20:].max() < 0.2 * spectrum.max(), "nothing that the smaller picture cannot show"

@@ -18,6 +18,9 @@ exact = partial(numba.njit, cache=True, error_model="numpy", parallel=True)
 
 def workers() -> int:
     """Threads to use: as many as torch."""
-    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
+    asked = torch.get_num_threads()
+    threads = min(asked, numba.config.NUMBA_NUM_THREADS)
     numba.set_num_threads(threads)
+    if torch.get_num_threads() != asked:  # both stand on OpenMP, and numba's first start takes all cores for torch too
+        torch.set_num_threads(asked)
     return threads
