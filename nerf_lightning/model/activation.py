@@ -24,7 +24,8 @@ class _TruncatedExp(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
-        return (grad * torch.exp(_at_least_single(x).clamp(-15.0, 15.0))).to(x.dtype)
+        most = torch.finfo(x.dtype).max
+        return (grad * torch.exp(_at_least_single(x).clamp(-15.0, 15.0))).clamp(-most, most).to(x.dtype)
 
 
 def truncated_exp(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

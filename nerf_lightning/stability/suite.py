@@ -19,13 +19,13 @@ QUICK = (
 
 
 def cells_of(conditions: Sequence[str], methods: Sequence[str], seeds: int, steps: int) -> list[Cell]:
-    """What is to be tried: of conditions that are refused one seed tells all."""
+    """What is to be tried: of conditions that are refused one seed tells all, and one control at a time is enough."""
     chosen = [
         Cell(condition.name, method, seed, steps)
         for condition in CONDITIONS
         if condition.name in conditions
         for method in methods
-        if METHODS[method].flat == condition.flat
+        if METHODS[method].flat == condition.flat and not (METHODS[method].control and condition.control)
         for seed in range(1 if condition.hopeless else seeds)
     ]
     return [cell for cell in chosen if cell.options is not None]

@@ -13,7 +13,7 @@ from nerf_lightning.callbacks import Budget, Guard
 from nerf_lightning.callbacks.guard import AS_PLAIN, LOWER, MUCH_LOWER, plain_error
 from nerf_lightning.compose import composed
 from nerf_lightning.dataset import Picture, PixelDataModule, save_npz
-from nerf_lightning.model import PictureField
+from nerf_lightning.model import PictureField, SirenField
 from nerf_lightning.run_folder import load_run
 from nerf_lightning.stability.methods import METHODS
 from nerf_lightning.stability.toys import MARBLE, toy
@@ -42,8 +42,8 @@ def stripes() -> Picture:
 class Broken(NeRF2D):
     """A system that goes wrong at a step, as told."""
 
-    def __init__(self, how: str, when: int, rate: float = 20.0):
-        super().__init__(Blob(), functools.partial(torch.optim.SGD, lr=rate), constant)
+    def __init__(self, how: str, when: int, rate: float = 20.0, field: PictureField | None = None):
+        super().__init__(field or Blob(), functools.partial(torch.optim.SGD, lr=rate), constant)
         self.how, self.when, self.done = how, when, False
 
     def training_step(self, batch, batch_idx: int) -> torch.Tensor:
@@ -66,9 +66,20 @@ class Broken(NeRF2D):
                 self.done = True
                 with torch.no_grad():
                     self.field.colours.copy_(1 - self.field.colours)
+            case "rise a little" if self.rate == 1:
+                self.show(0.4 if self.global_step < 200 else 0.5)
+            case "hover" if self.rate == 1:  # two steps down, one up
+                self.show(1.3 - 0.0004 * self.global_step + 0.1 * (self.global_step // 10 % 3 == 2))
             case "no gradient":
                 return loss * 0 + (self.field.colours * 0).sum()
         return loss
+
+    @torch.no_grad()
+    def show(self, error: float) -> None:
+        """Makes the field show the stripes with so much of the error that their mean colour has."""
+        truth = torch.zeros(8, 8, 3)
+        truth[::2] = 1
+        self.field.colours.copy_((0.5 + (1 - error**0.5) * (truth - 0.5)).view(64, 3))
 
 
 def run(system: NeRF2D, guard: Guard, tmp_path: Path, steps: int = 400, picture: Picture | None = None) -> float:
@@ -113,6 +124,32 @@ def test_without_good_weights_it_starts_again(tmp_path: Path):
     assert run(Broken("nan loss", 5), guard, tmp_path) < 1e-2
     (one,) = guard.recoveries
     assert one.step == 6 and "started again" in one.action
+
+
+@pytest.mark.parametrize(
+    ("how", "words", "action"),
+    [
+        ("rise a little", "times that of one plain colour, and stays above that since", "last good weights"),
+        ("hover", "times that of one plain colour", "started again with 0.2 times"),
+    ],
+)
+def test_what_goes_nowhere_is_noticed(how: str, words: str, action: str, tmp_path: Path):
+    guard = Guard(every=10, patience=60, keep_every=50)
+    assert run(Broken(how, 0), guard, tmp_path, 600) < 1e-2
+    (one,) = guard.recoveries
+    assert words in one.cause and action in one.action
+
+
+def test_a_field_starts_again_as_it_starts_itself(tmp_path: Path):
+    field = SirenField((8, 8), width=32, depth=2)
+    before = field.hidden[1].weight.detach().clone()
+    guard = Guard(every=10)
+    run(Broken("nan loss", 5, rate=1e-9, field=field), guard, tmp_path, 20)
+    (one,) = guard.recoveries
+    assert "started again" in one.action
+    after = field.hidden[1].weight.detach()
+    bound = math.sqrt(6 / 32) / field.HIDDEN_FREQUENCY
+    assert not torch.equal(before, after) and bound / 2 < float(after.abs().max()) <= bound * (1 + 1e-4)
 
 
 def test_it_gives_up_in_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -31,6 +31,16 @@ def test_density_activations(name, at_zero, at_three):
     assert values.min() >= 0
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("name", ["softplus", "exp"])
+def test_large_inputs_of_half_precision_stay_finite(name: str, dtype: torch.dtype):
+    x = torch.tensor([-1e4, -20.0, 0.0, 12.0, 1e4], dtype=dtype, requires_grad=True)
+    values = density_activation(name)(x)
+    values.float().sum().backward()
+    assert values.isfinite().all() and x.grad.isfinite().all()
+    assert values[3] > 0.9 * (11 if name == "softplus" else math.exp(12)), "e^12 is beyond half precision"
+
+
 @pytest.mark.parametrize("name", ["", "ReLU", "sigmoid"])
 def test_other_activations_are_refused(name):
     with pytest.raises(InputError, match="model.density"):

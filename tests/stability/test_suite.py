@@ -84,6 +84,26 @@ def test_a_rectifier_dies_without_the_guard_and_lives_with_it(tmp_path: Path):
     assert saved.psnr is not None and lost.psnr is not None and saved.psnr > lost.psnr + 5
 
 
+def test_a_rate_that_voxels_do_not_stand_is_lowered_before_the_first_step(tmp_path: Path):
+    outcome = run(Cell("rate x10", "voxels", 0, 40), tmp_path)
+    assert outcome.status == "finished" and outcome.recoveries == 1
+    results = json.loads((Cell("rate x10", "voxels", 0, 40).folder(tmp_path) / "results.json").read_text())
+    (one,) = results["recoveries"]
+    assert one["step"] == 0 and "more than this field stands" in one["cause"]
+
+
+def test_a_picture_of_one_colour_is_learned(tmp_path: Path):
+    outcome = run(Cell("2D: one colour", "2D mlp", 0, 150), tmp_path)
+    assert (outcome.status, outcome.diagnosis) == ("finished", "")
+    assert outcome.psnr is not None and outcome.psnr > 40
+
+
+def test_octaves_beyond_the_pixels_fail_between_them_and_it_is_told(tmp_path: Path):
+    outcome = run(Cell("2D: L = 40", "2D mlp", 0, 150), tmp_path)
+    assert outcome.status == "finished" and "between its pixels" in outcome.alarm
+    assert outcome.psnr is not None and outcome.psnr < 15
+
+
 @pytest.mark.parametrize(
     ("name", "outcome", "good"),
     [

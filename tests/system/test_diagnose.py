@@ -1,4 +1,5 @@
 import functools
+import math
 
 import pytest
 import torch
@@ -101,3 +102,41 @@ def test_looking_leaves_a_field_as_it_was(view):
     dead_rectifiers(field, view.uv)
     assert not any(module._forward_hooks for module in field.modules())
     assert field(view.uv).requires_grad and all(p.grad is None for p in field.parameters())
+
+
+class Waves(PictureField):
+    """Cosines of so many cycles across the picture."""
+
+    def __init__(self, cycles: int):
+        super().__init__(SIZE)
+        self.cycles = cycles
+
+    def forward(self, uv: torch.Tensor) -> torch.Tensor:
+        return (0.5 + 0.4 * torch.cos(2 * torch.pi * self.cycles * uv[:, :1])).expand(-1, 3)
+
+
+def waves_seen(cycles: int) -> tuple[NeRF2D, PictureBatch]:
+    system = NeRF2D(Waves(cycles), ADAM, constant)
+    data = PixelDataModule(Picture("waves", "test", torch.zeros(20, 20, 3, dtype=torch.uint8)))
+    empty = data.held_out(0)
+    return system, PictureBatch(empty.uv, system.colours(empty.uv), 20, 20)
+
+
+def test_between_pixels_a_field_is_held_against_the_mean_of_the_four_around():
+    system, view = waves_seen(1)
+    # Neighbours of a wave of one cycle are 18 degrees apart: their mean falls short of it by 1 - cos(9 degrees).
+    expected = -10 * math.log10((0.4 * (1 - math.cos(math.radians(9)))) ** 2 / 2)
+    assert system.between(view) == pytest.approx(expected, abs=0.3)
+
+
+def test_frequencies_that_pixels_do_not_show_run_wild_between_them():
+    slow, view = waves_seen(1)
+    fast, _ = waves_seen(21)  # at the pixels' middles the same, but for the sign
+    assert fast.between(PictureBatch(view.uv, fast.colours(view.uv), 20, 20)) < 15 < slow.between(view)
+
+
+@pytest.mark.parametrize("size", [(1, 20), (20, 1), (1, 1)])
+def test_a_single_row_or_column_has_nothing_between(size: tuple[int, int], view):
+    height, width = size
+    line = PictureBatch(view.uv[: height * width], view.rgb[: height * width], height, width)
+    assert NeRF2D(Waves(1), ADAM, constant).between(line) is None

@@ -1,0 +1,82 @@
+"""Trains every shipped model for a moment and prints a fingerprint of its weights; run as a process of its own.
+
+python every_model.py FOLDER SEED STOP     (interrupted after STOP steps and resumed; 0: in one go)
+"""
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerf_lightning.callbacks import Checkpoints
+from nerf_lightning.compose import composed
+from nerf_lightning.training import train
+
+SCENE = [
+    *("dataset=bricks", "dataset.size=16", "dataset.train_views=12", "dataset.val_views=1", "dataset.rays=256"),
+    *("dataset.samples=2048", "sampler.samples=32", "sampler.resolution=16", "callbacks.orbit=null"),
+]
+PICTURE = [
+    *("+experiment=picture", "dataset.max_side=24", "dataset.pixels=256", "callbacks.baselines=null"),
+    *("callbacks.training_gif=null", "callbacks.charts=null"),
+]
+MODELS = {
+    "hashgrid": [*SCENE, "model.levels=3", "model.finest=32", "model.log2_entries=10", "model.width=16"],
+    "voxels": [*SCENE, "recipe=voxels_small", "model.coarsest=8", "model.finest=16", "model.grown=1"],
+    "tensorf": [*SCENE, "recipe=tensorf_small", "model.coarsest=8", "model.finest=16", "model.grown=1"],
+    "mlp": [*SCENE, "recipe=mlp_small", "model.width=16"],
+    "hashgrid2d": PICTURE,
+    "picture_mlp": [*PICTURE, "model.width=32"],
+    "fourier": [*PICTURE, "model.width=32"],
+    "siren": [*PICTURE, "model.width=32"],
+}
+STEPS = 40
+
+
+class Stop(Exception):
+    """Training is to end here."""
+
+
+def main(folder: Path, seed: int, stop: int, models: list[str]) -> None:
+    save = Checkpoints.on_train_batch_end
+
+    def save_and_stop(self: Checkpoints, trainer: Any, *rest: Any) -> None:
+        save(self, trainer, *rest)
+        if trainer.global_step == stop:
+            self.save(trainer, "last.ckpt")
+            raise Stop
+
+    prints = {}
+    for model in models:
+        run = folder / model
+        cfg = composed(
+            [*MODELS[model], f"model={model}", f"seed={seed}", "threads=2", f"budget.steps={STEPS}", "~logger"], run
+        )
+        last = run / "checkpoints" / "last.ckpt"
+        if stop:
+            Checkpoints.on_train_batch_end = save_and_stop  # type: ignore[method-assign]
+            try:
+                train(cfg)
+            except Stop:
+                Checkpoints.on_train_batch_end = save  # type: ignore[method-assign]
+            assert json.loads((run / "results.json").read_text())["steps"] == stop
+        train(cfg, last if stop else None)
+        prints[model] = fingerprint(run / "checkpoints" / "last.ckpt")
+    print(json.dumps(prints))
+
+
+def fingerprint(checkpoint: Path) -> str:
+    """Of all weights and buffers, bit by bit."""
+    state = torch.load(checkpoint, weights_only=True)
+    assert state["global_step"] == STEPS
+    digest = hashlib.sha256()
+    for key, value in sorted(state["state_dict"].items()):
+        digest.update(f"{key} {tuple(value.shape)} {value.dtype}".encode() + value.numpy().tobytes())
+    return digest.hexdigest()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:] or list(MODELS))
