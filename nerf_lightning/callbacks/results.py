@@ -60,9 +60,10 @@ def plain_colour_psnr(data: RayDataModule | PixelDataModule, system: System) -> 
 def gap(trainer: L.Trainer, quality: float) -> str:
     """What a held-out PSNR far below that of the training pixels means; "" where it is not, or not known."""
     guard = attached(trainer, Guard)
-    if guard is None or guard.level is None or guard.level <= 0:
+    level = guard.watch.level if guard is not None else None
+    if not level:
         return ""
-    trained = decibels(guard.level)
+    trained = decibels(level)
     if trained < quality + WIDE_GAP or quality >= GOOD:
         return ""
     return (

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from nerf_lightning.callbacks import Budget, Guard
-from nerf_lightning.callbacks.guard import AS_PLAIN, LOWER, MUCH_LOWER, plain_error
+from nerf_lightning.callbacks.guard import LOWER, MUCH_LOWER, plain_error
+from nerf_lightning.callbacks.watch import AS_PLAIN
 from nerf_lightning.compose import composed
 from nerf_lightning.dataset import Picture, PixelDataModule, save_npz
 from nerf_lightning.model import PictureField, SirenField
@@ -204,4 +205,4 @@ def test_a_recovered_run_resumes_as_it_was(tmp_path: Path):
     other = Guard(every=10)
     other.load_state_dict(guard.state_dict())
     assert other.state_dict() == guard.state_dict()
-    assert other.recoveries == guard.recoveries and other.began == guard.began
+    assert other.recoveries == guard.recoveries and other.watch.began == guard.watch.began > 0
