@@ -57,8 +57,10 @@ def plain_colour_psnr(data: RayDataModule | PixelDataModule, system: System) -> 
     return fmean(scores)
 
 
-def gap(trainer: L.Trainer, quality: float) -> str:
-    """What a held-out PSNR far below that of the training pixels means; "" where it is not, or not known."""
+def gap(trainer: L.Trainer, system: System, quality: float) -> str:
+    """What a held-out PSNR far below that of the training pixels means; "" where it is not, not known, or of a picture."""
+    if isinstance(system, NeRF2D):
+        return ""
     guard = attached(trainer, Guard)
     level = guard.watch.level if guard is not None else None
     if not level:
@@ -126,7 +128,12 @@ class Results(L.Callback):
             diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
             self.write(trainer, pl_module, "collapsed", f"{diagnosis}: {found}" if found else diagnosis)
         else:
-            self.write(trainer, pl_module, stopped, gap(trainer, quality) or wild_between(trainer, pl_module, nothing))
+            self.write(
+                trainer,
+                pl_module,
+                stopped,
+                gap(trainer, pl_module, quality) or wild_between(trainer, pl_module, nothing),
+            )
         if trainer.logger is not None:
             scores = {"test/psnr": quality, "test/ssim": self.summary["ssim"] or 0.0}
             trainer.logger.log_metrics(scores, trainer.global_step)

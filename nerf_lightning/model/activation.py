@@ -24,8 +24,11 @@ class _TruncatedExp(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad: Tensor) -> Tensor:
         (x,) = ctx.saved_tensors
+        found = grad * torch.exp(_at_least_single(x).clamp(-15.0, 15.0))
+        if found.dtype == x.dtype:
+            return found
         most = torch.finfo(x.dtype).max
-        return (grad * torch.exp(_at_least_single(x).clamp(-15.0, 15.0))).clamp(-most, most).to(x.dtype)
+        return found.clamp(-most, most).to(x.dtype)
 
 
 def truncated_exp(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
