@@ -90,6 +90,8 @@ class Guard(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         with Budget.of(trainer).paused():
             self.watch.plain = plain_error(data_of(trainer), pl_module)
+        if self.attempts and self.watch.learning and not self.watch.risen:
+            self._good = copied(pl_module)  # of a run that is resumed
         if isinstance(pl_module, NeRF3D):
             if self.watch.began:
                 pl_module.sampler.restart(self.watch.began)

@@ -206,3 +206,13 @@ def test_a_recovered_run_resumes_as_it_was(tmp_path: Path):
     other.load_state_dict(guard.state_dict())
     assert other.state_dict() == guard.state_dict()
     assert other.recoveries == guard.recoveries and other.watch.began == guard.watch.began > 0
+
+
+def test_a_resumed_run_goes_back_to_where_it_was_resumed(tmp_path: Path):
+    before = Guard(every=10)
+    run(Broken("not at all", 0), before, tmp_path, 60)
+    guard = Guard(every=10)
+    guard.load_state_dict(before.state_dict())
+    run(Broken("nan loss", 5), guard, tmp_path, 60)
+    (one,) = guard.recoveries
+    assert one.step == 6 and "last good weights" in one.action
