@@ -168,8 +168,9 @@ class Guard(L.Callback):
 
     def _slow_down(self, trainer: L.Trainer, system: NeRF3D) -> None:
         """Before the first step, where the rate is one at which the field is known to come apart."""
-        asked, fastest = trainer.optimizers[0].param_groups[0]["initial_lr"], system.field.fastest
-        if asked > fastest:
+        optimizer = trainer.optimizers[0]
+        asked, fastest = optimizer.param_groups[0]["initial_lr"], system.field.fastest
+        if isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW) and asked > fastest:
             self.rate = fastest / asked
             cause = f"a learning rate of {asked:.3g} is more than this field stands ({fastest:.3g})"
             self._record(trainer, cause, f"{self.rate:.2g} times the learning rate")

@@ -25,6 +25,9 @@ class Field(InBounds):
     metres and the same scene in millimetres train alike.
     """
 
+    fastest: float = math.inf
+    """Adam's learning rate above which training comes apart, as measured by the stability suite; infinite where not known."""
+
     def __init__(self, bounds: Bounds):
         super().__init__(bounds)
         self.unit_length = float(bounds.half_size.max())
@@ -44,11 +47,6 @@ class Field(InBounds):
             Parameters whose data was replaced by data of another shape: what an optimiser remembers of them is void.
         """
         return []
-
-    @property
-    def fastest(self) -> float:
-        """The learning rate above which training comes apart whatever the scene; infinite where none is known."""
-        return math.inf
 
     def penalty(self) -> Float[Tensor, ""] | None:
         """What training adds to the squared error, if anything."""

@@ -73,6 +73,8 @@ class HashGridField(Field):
     """
 
     GEOMETRY = 15  # features handed from density to colour network, Instant-NGP section 5.4
+    START = -1.0  # what an exponential begins with: thin fog
+    fastest = 0.1
 
     def __init__(
         self,
@@ -90,6 +92,14 @@ class HashGridField(Field):
         self.activation = density_activation(density)
         self.density_net = layers(self.grid.width, width, 1 + self.GEOMETRY)
         self.colour_net = layers(self.GEOMETRY + 16, width, width, 3)
+        self.starts_thin = density == "exp"
+        self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """The layers have drawn theirs. From dense fog training may throw all density away, and with it all gradient."""
+        if self.starts_thin:
+            self.density_net[-1].get_parameter("bias")[0] = self.START
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         encoded = self.grid(self.bounds.to_unit(positions))

@@ -27,6 +27,8 @@ class MLPField(Field):
         InputError: where `skip` is not one of the trunk's layers after the first.
     """
 
+    fastest = 0.05
+
     def __init__(
         self,
         bounds: Bounds,

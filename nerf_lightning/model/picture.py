@@ -46,7 +46,8 @@ class PictureMLP(PictureField):
         self.net = rectified([2 * (1 + 2 * frequencies), *[width] * depth, 3])
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(self.net(sinusoidal(uv, self.frequencies)))
+        places = 0.5 + 0.5 * self.centred(uv)  # pixels stay square: octaves that suit the longer side suit the shorter
+        return torch.sigmoid(self.net(sinusoidal(places, self.frequencies)))
 
 
 class FourierField(PictureField):

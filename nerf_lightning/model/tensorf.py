@@ -82,6 +82,8 @@ class TensoRFField(Field):
         InputError: where coarsest > finest, for a single stage of two sizes, or `grown` outside [0, 1].
     """
 
+    fastest = 0.2
+
     def __init__(
         self,
         bounds: Bounds,

@@ -98,6 +98,8 @@ class VoxelField(Field):
         self.times = [grown * (i / intervals) ** 2 for i in range(stages)]
         self.terms = (degree + 1) ** 2 - 1
         self.density_rate = density_rate
+        # Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog before cameras.
+        self.fastest = 1 / density_rate
         self.smoothness = smoothness
         rows = (self.resolutions[0] + 1) ** 3 + 1
         self.register_buffer("index", torch.arange(1, rows, dtype=torch.int32))
@@ -115,11 +117,6 @@ class VoxelField(Field):
     def tables(self) -> tuple[torch.nn.Parameter, torch.nn.Parameter, torch.nn.Parameter]:
         """All that vertices hold, one row a vertex."""
         return self.log_density, self.colours, self.views
-
-    @property
-    def fastest(self) -> float:
-        """Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog before cameras."""
-        return 1 / self.density_rate
 
     def per_length(self, raw: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
         """Densities from what the table holds, 1 / world unit."""
