@@ -180,11 +180,7 @@ class Guard(L.Callback):
         system.load_state_dict(self._start)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(step_generator(system.seed, 3, step).initial_seed() & 0xFFFFFFFF))
-            # Layers first: a field may have a start of its own for them.
-            for module in reversed(list(system.modules())):
-                reset = getattr(module, "reset_parameters", None)
-                if reset is not None:
-                    reset()
+            started_anew(system)
         system.on_fit_start()  # what a sampler finds out about the scene is part of a start
         if isinstance(system, NeRF3D):
             system.sampler.restart(step)
@@ -204,6 +200,14 @@ class Guard(L.Callback):
 def copied(module: torch.nn.Module) -> dict[str, Tensor]:
     """A copy of all weights and buffers."""
     return {key: value.detach().clone() for key, value in module.state_dict().items()}
+
+
+def started_anew(module: torch.nn.Module) -> None:
+    """Draws weights again, layers first: a field may have a start of its own for them."""
+    for part in reversed(list(module.modules())):
+        reset = getattr(part, "reset_parameters", None)
+        if reset is not None:
+            reset()
 
 
 def finite(parameters: Iterable[torch.nn.Parameter]) -> bool:

@@ -22,14 +22,14 @@ def worst_page(found: Sequence[Square], folder_of: Callable[[Outcome], Path]) ->
         folder_of: where a cell left its render.
     """
     lowest = [(min(square.outcomes, key=_quality), square) for square in found]
-    shown = [(one, square) for one, square in lowest if (folder_of(one) / "final.png").exists()]
-    shown = sorted(shown, key=lambda pair: _quality(pair[0]))[:MOST]
+    pictures = [(_picture(folder_of(one)), one, square) for one, square in lowest]
+    shown = sorted([entry for entry in pictures if entry[0].exists()], key=lambda entry: _quality(entry[1]))[:MOST]
     rows = max(1, math.ceil(len(shown) / COLUMNS))
     figure = Figure(figsize=(2 * COLUMNS, 2.6 * rows), dpi=DPI, layout="constrained")
     for axes in figure.subplots(rows, COLUMNS, squeeze=False).flat:
         axes.axis("off")
-    for axes, (one, square) in zip(figure.axes, shown, strict=False):
-        axes.imshow(imageio.imread(folder_of(one) / "final.png"), interpolation="nearest")
+    for axes, (picture, one, square) in zip(figure.axes, shown, strict=False):
+        axes.imshow(imageio.imread(picture), interpolation="nearest")
         told = "no figure" if one.psnr is None else f"{one.psnr:.1f} dB"
         axes.set_title(
             f"{readable(one.condition)}\n{readable(one.method)}\nseed {one.seed}: {told}",
@@ -38,6 +38,12 @@ def worst_page(found: Sequence[Square], folder_of: Callable[[Outcome], Path]) ->
             parse_math=False,
         )
     return figure
+
+
+def _picture(folder: Path) -> Path:
+    """What a cell was judged by: of a picture, all that lies between its pixels too."""
+    enlarged = folder / "enlarged.png"
+    return enlarged if enlarged.exists() else folder / "final.png"
 
 
 def _quality(one: Outcome) -> float:

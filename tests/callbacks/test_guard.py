@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from nerf_lightning.callbacks import Budget, Guard
-from nerf_lightning.callbacks.guard import LOWER, MUCH_LOWER, plain_error
+from nerf_lightning.callbacks.guard import LOWER, MUCH_LOWER, plain_error, started_anew
 from nerf_lightning.callbacks.watch import AS_PLAIN
+from nerf_lightning.cameras import Bounds
 from nerf_lightning.compose import composed
 from nerf_lightning.dataset import Picture, PixelDataModule, save_npz
-from nerf_lightning.model import PictureField, SirenField
+from nerf_lightning.model import HashGridField, PictureField, SirenField
 from nerf_lightning.run_folder import load_run
 from nerf_lightning.stability.methods import METHODS
 from nerf_lightning.stability.toys import MARBLE, toy
@@ -216,3 +217,25 @@ def test_a_resumed_run_goes_back_to_where_it_was_resumed(tmp_path: Path):
     run(Broken("nan loss", 5), guard, tmp_path, 60)
     (one,) = guard.recoveries
     assert one.step == 6 and "last good weights" in one.action
+
+
+def test_a_hash_grid_starts_again_from_thin_fog():
+    field = HashGridField(Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])), levels=2, log2_entries=8, width=16)
+    first = field.density_net[-1].bias.detach()
+    assert float(first[0]) == field.START and (first[1:] != field.START).all()
+    first.fill_(3.0)
+    started_anew(field)
+    assert float(first[0]) == field.START and (first[1:].abs() < 1).all()
+
+
+@pytest.mark.parametrize(("optimizer", "lowered"), [(torch.optim.Adam, True), (torch.optim.SGD, False)])
+def test_rates_are_lowered_for_adam_alone(optimizer: type, lowered: bool, tmp_path: Path):
+    save_npz(toy(MARBLE), tmp_path / "scene.npz")
+    given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", *METHODS["relu mlp"].options, "budget.steps=2"]
+    cfg = composed([*given, "optimizer.lr=0.5", "callbacks.orbit=null", "threads=1"], tmp_path)
+    cfg.optimizer = {"_target_": f"torch.optim.{optimizer.__name__}", "_partial_": True, "lr": 0.5}
+    train(cfg)
+    recoveries = json.loads((tmp_path / "results.json").read_text())["recoveries"]
+    assert [(one["step"], "0.1 times the learning rate" in one["action"]) for one in recoveries] == [
+        (0, True)
+    ] * lowered

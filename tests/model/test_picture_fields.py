@@ -151,6 +151,16 @@ def test_the_last_octaves_sine_has_four_pixels_a_cycle():
     torch.testing.assert_close(sine_x, cycle.repeat(16), atol=1e-3, rtol=0)
 
 
+def test_octaves_have_as_many_pixels_a_cycle_along_both_sides():
+    field = PictureMLP((64, 16), None, width=8)
+    seen = inputs_of(field, pixel_grid(16, 64)).view(16, 64, -1)
+    along, down = seen[0, :, -4], seen[:, 0, -3]  # of the last octave the sines of x and of y
+    assert field.frequencies == 6
+    torch.testing.assert_close(along[:12], along[4:16], atol=1e-3, rtol=0)
+    torch.testing.assert_close(down[:12], down[4:], atol=1e-3, rtol=0)
+    assert along.std() > 0.5 and down.std() > 0.5
+
+
 def inputs_of(field: PictureField, uv: Tensor) -> Tensor:
     """What the first layer of a field's network sees."""
     seen: list[Tensor] = []
