@@ -66,6 +66,8 @@ def markdown(found: Sequence[Square]) -> str:
     for square in found:
         worst = square.worst
         told = "refused" if worst is None and not square.failed else "-" if worst is None else f"{worst:.1f} dB"
+        if square.condition.hopeless and worst is not None and not square.failed:
+            told += ", alarm"
         if square.failed:
             told += f", {len(square.failed)} of {len(square.outcomes)} failed"
         if square.recovered:

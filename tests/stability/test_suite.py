@@ -129,6 +129,7 @@ def test_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     ]
     bad = replace(GOOD, condition="white, small object", seed=2, psnr=18.0, status="collapsed", diagnosis="no density")
     outcomes += [bad, replace(GOOD, condition="OpenGL poses", psnr=None, status="refused", diagnosis="backs")]
+    outcomes.append(replace(GOOD, condition="shuffled poses", psnr=16.0, alarm="outlines that no body has"))
     folder = folder_of(tmp_path, bad.condition, bad.method, bad.seed)
     folder.mkdir(parents=True)
     write_report(outcomes, "quick", tmp_path)
@@ -137,13 +138,14 @@ def test_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     table = (tmp_path / "stability.md").read_text()
     assert "| clean | the yardstick of all others | 28.0 dB |" in table
     assert "18.0 dB, 1 of 3 failed, 2 recovered" in table and "| refused |" in table
+    assert "| shuffled poses | refused, or an alarm | 16.0 dB, alarm |" in table
     saved = json.loads((tmp_path / "stability.json").read_text())
     assert set(saved["cells"][0]) >= {"condition", "method", "seed", "guard", "psnr", "status", "diagnosis"}
     for name in ("heatmap.png", "worst.png"):
         assert imageio.imread(tmp_path / name).std() > 0 or name == "worst.png"
     assert table.startswith(markdown(squares(outcomes)))
     for text in (told, table):
-        assert "shipped recipes: 1 of 7 cells failed" in text
+        assert "shipped recipes: 1 of 8 cells failed" in text
 
 
 def test_controls_and_what_the_guard_makes_of_them():
