@@ -1,6 +1,6 @@
 """Trains every shipped model for a moment and prints a fingerprint of its weights; run as a process of its own.
 
-python every_model.py FOLDER SEED STOP     (interrupted after STOP steps and resumed; 0: in one go)
+python every_model.py FOLDER SEED STOP [MODEL ...]     (interrupted after STOP steps and resumed; 0: in one go)
 """
 
 import hashlib

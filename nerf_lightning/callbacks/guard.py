@@ -49,10 +49,11 @@ def plain_error(data: RayDataModule | PixelDataModule, system: System) -> float:
 class Guard(L.Callback):
     """Watches the loss, the density and the gradients, and acts where they say that nothing more will be learned.
 
-    What it notices: a loss or weights that are no longer finite; a loss that rose to several times its lowest; a loss that
-    stays at that of one plain colour, told apart by whether there is no density, density everywhere, or no gradient. What it
-    does: back to the last good weights with a lower rate; or, where there was nothing good yet, a new start with fresh weights,
-    with softplus in place of a rectifier that can die, else with a lower rate. Each time is printed and stands in results.json.
+    What it notices: a loss or weights that are no longer finite; a loss that rose, and stays there; a loss that stays at that
+    of one plain colour, told apart by whether there is no density, density everywhere, or no gradient (see `Watch`); before
+    the first step, a learning rate that the field is known not to stand, which it lowers. What else it does: back to the last
+    good weights with a lower rate; or, where there was nothing good yet, a new start with fresh weights, with softplus in
+    place of a rectifier that can die, else with a lower rate. Each time is printed and stands in results.json.
 
     It looks at weights and gradients only now and then, and at gradients only until the field has begun to learn. Of several
     processes none acts alone: there it does nothing.

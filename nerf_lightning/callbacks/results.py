@@ -76,9 +76,10 @@ def gap(trainer: L.Trainer, system: System, quality: float) -> str:
 
 def wild_between(trainer: L.Trainer, system: System, nothing: float) -> str:
     """What it means where a 2D field shows no more than `nothing` (dB) between its pixels; "" where it shows them too."""
-    view = data_of(trainer).held_out(0).to(system.device)
-    if not isinstance(system, NeRF2D) or not isinstance(view, PictureBatch):
+    if not isinstance(system, NeRF2D):
         return ""
+    view = data_of(trainer).held_out(0).to(system.device)
+    assert isinstance(view, PictureBatch)  # what a NeRF2D is fed
     between = system.between(view)
     if between is None or between >= nothing:
         return ""

@@ -105,6 +105,10 @@ class Sighting:
         """A mask wider by the reach."""
         return cv2.dilate(mask.astype(np.uint8), np.ones((2 * self.reach + 1, 2 * self.reach + 1), np.uint8))
 
+    def found_in(self, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "N"]:
+        """Which voxels have a part inside a mask."""
+        return self.inside & (self.grown(mask)[self.row, self.column] > 0)
+
 
 def voxel_centres(aabb: Float[np.ndarray, "2 3"], count: int) -> Float[np.ndarray, "3 count"]:
     """Coordinates of the middles of `count` voxels along each axis of a box."""
@@ -139,7 +143,7 @@ def _carve(
     hits = np.zeros(len(centres), np.int32)
     for mask, sighting in zip(masks, sightings(aabb, GRID, cameras), strict=True):
         seen += sighting.inside
-        hits += sighting.inside & (sighting.grown(mask)[sighting.row, sighting.column] > 0)
+        hits += sighting.found_in(mask)
     kept = centres[(seen >= 0.5 * len(masks)) & (hits >= AGREEMENT * seen)]
     if len(kept) == 0:
         return None

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, focus_point
-from nerf_lightning.dataset.extent import MAX_VIEWS, border_colour, sightings, silhouettes, visible_cube
+from nerf_lightning.dataset.extent import AGREEMENT, MAX_VIEWS, border_colour, sightings, silhouettes, visible_cube
 from nerf_lightning.dataset.scene import Scene, Views
 from nerf_lightning.errors import InputError
 
@@ -28,8 +28,6 @@ Exact poses of the built-in scene and of Lego explain all; shuffled ones 86 and 
 """
 IN_BOX = 0.9
 """The same share of what the box leaves out, where without it the photos fit."""
-MOST_AGREE = 0.95
-"""Share of the views that must find a voxel inside the outlines; the rest forgives dark content on a dark background."""
 CUT = 0.02
 """Share of rays that near or far may cut short inside the box."""
 
@@ -119,11 +117,8 @@ def hull_coverage(masks: Bool[np.ndarray, "V H W"], cameras: Cameras, bounds: Bo
     """How much of the outlines the visual hull covers that they carve out of the bounds, in [0, 1]."""
     seen = list(sightings(bounds.aabb.double().numpy(), HULL, cameras))
     seen_by = sum(sighting.inside.astype(np.int32) for sighting in seen)
-    inside_of = sum(
-        (sighting.inside & (sighting.grown(mask)[sighting.row, sighting.column] > 0)).astype(np.int32)
-        for mask, sighting in zip(masks, seen, strict=True)
-    )
-    hull = (seen_by > 0) & (inside_of >= MOST_AGREE * seen_by)
+    inside_of = sum(sighting.found_in(mask).astype(np.int32) for mask, sighting in zip(masks, seen, strict=True))
+    hull = (seen_by > 0) & (inside_of >= AGREEMENT * seen_by)
     covered = []
     for mask, sighting in zip(masks, seen, strict=True):
         shown = np.zeros(mask.shape, np.uint8)
