@@ -21,7 +21,9 @@ from nerf_lightning.system import NeRF3D, System
 LOWER, MUCH_LOWER = 0.3, 0.2
 """Factors on the learning rate where it is what is to blame: after something was learned, and where nothing was."""
 WARM = 100
-"""Steps in which the rate comes back after a new start, where it was to blame."""
+"""Steps in which the rate comes back after a new start, where it was to blame ..."""
+COOL = 0.1
+"""... and what it has fallen to at the end besides: nobody knows how much lower it ought to be."""
 PIXELS = 8192
 """Drawn to learn how well one plain colour would do."""
 
@@ -77,6 +79,8 @@ class Guard(L.Callback):
         self.watch = Watch(every, patience)
         self.recoveries: list[Recovery] = []
         self.rate = 1.0
+        self.began_at = 0.0
+        """Progress at the last new start."""
         self.softened = False
         self._given_up = False
         self._start: dict[str, Tensor] = {}
@@ -100,9 +104,11 @@ class Guard(L.Callback):
                 self._slow_down(trainer, pl_module)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
-        since = trainer.global_step - self.watch.began
-        warm = min(1.0, (since + 1) / WARM) if self.watch.began and self.rate < 1 else 1.0
-        pl_module.rate = self.rate * warm
+        pl_module.rate = self.rate
+        if self.watch.began and self.rate < 1:
+            since = trainer.global_step - self.watch.began
+            done = (pl_module.progress - self.began_at) / max(1 - self.began_at, 1e-6)
+            pl_module.rate *= min(1.0, (since + 1) / WARM) * COOL**done
 
     def on_after_backward(self, trainer: L.Trainer, pl_module: System) -> None:
         if self.watch.due(trainer.global_step + 1) and not self.watch.learning:
@@ -134,6 +140,7 @@ class Guard(L.Callback):
             **self.watch.state(),
             "recoveries": [asdict(one) for one in self.recoveries],
             "rate": self.rate,
+            "began_at": self.began_at,
             "softened": self.softened,
             "given_up": self._given_up,
         }
@@ -141,7 +148,9 @@ class Guard(L.Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.watch.load(state_dict)
         self.recoveries = [Recovery(**one) for one in state_dict["recoveries"]]
-        self.rate, self.softened, self._given_up = (state_dict[key] for key in ("rate", "softened", "given_up"))
+        for key in ("rate", "began_at", "softened"):
+            setattr(self, key, state_dict[key])
+        self._given_up = state_dict["given_up"]
 
     # What it does
 
@@ -159,6 +168,7 @@ class Guard(L.Callback):
         else:
             action = self._start_again(system, step, found.apart)
             self.watch.start(step)
+            self.began_at = system.progress
         forget(trainer)
         self._record(trainer, found.cause, action)
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerf_lightning.callbacks import Budget, Guard
-from nerf_lightning.callbacks.guard import LOWER, MUCH_LOWER, plain_error, started_anew
+from nerf_lightning.callbacks.guard import COOL, LOWER, MUCH_LOWER, plain_error, started_anew
 from nerf_lightning.callbacks.watch import AS_PLAIN
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.compose import composed
@@ -200,6 +200,13 @@ def test_the_checkpoint_says_what_took_the_rectifiers_place(tmp_path: Path):
     assert activation(torch.tensor([-1.0])) > 0, "a rectifier would give zero"
 
 
+def test_after_a_new_start_the_rate_falls_to_the_end(tmp_path: Path):
+    guard, system = Guard(every=10), Broken("nan loss", 5)
+    run(system, guard, tmp_path, 300)
+    assert guard.began_at == pytest.approx(guard.watch.began / 300, abs=0.01)
+    assert guard.rate < 1 and system.rate == pytest.approx(COOL * guard.rate, rel=0.02)
+
+
 def test_a_recovered_run_resumes_as_it_was(tmp_path: Path):
     guard = Guard(every=10)
     run(Broken("nan loss", 5), guard, tmp_path, 60)
@@ -207,6 +214,7 @@ def test_a_recovered_run_resumes_as_it_was(tmp_path: Path):
     other.load_state_dict(guard.state_dict())
     assert other.state_dict() == guard.state_dict()
     assert other.recoveries == guard.recoveries and other.watch.began == guard.watch.began > 0
+    assert other.began_at == guard.began_at > 0
 
 
 def test_a_resumed_run_goes_back_to_where_it_was_resumed(tmp_path: Path):
