@@ -1,7 +1,7 @@
 """From configuration to objects. Nothing else in the package instantiates from a config."""
 
 import inspect
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -125,7 +125,9 @@ def frame_of(data: RayDataModule | PixelDataModule) -> Frame:
     """What a system takes from the data."""
     if isinstance(data, PixelDataModule):
         return PictureFrame(*data.scene.size)
-    return SceneFrame(data.scene.bounds, data.scene.background)
+    bounds = data.scene.bounds
+    pixel = data.scene.train.cameras.pixel_width(bounds.centre)
+    return SceneFrame(replace(bounds, pixel=pixel or None), data.scene.background)
 
 
 def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, system: System) -> None:
@@ -147,7 +149,7 @@ def build_budget(cfg: DictConfig) -> Budget:
     """The user's limits, or the experiment's own where the user gives none."""
     budget = resolved(cfg.budget)
     default = budget.pop("default")
-    limits = budget if any(value is not None for value in budget.values()) else default
+    limits = budget if any(budget[key] is not None for key in default) else {**budget, **default}
     check_options("budget", Budget, limits)
     return Budget(**limits)
 

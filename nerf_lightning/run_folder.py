@@ -19,7 +19,7 @@ import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.build import Frame, PictureFrame, SceneFrame, build_system, resolved
+from nerf_lightning.build import Frame, PictureFrame, SceneFrame, build_system, frame_of, resolved
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
@@ -106,15 +106,21 @@ def _trusted(target: Any) -> bool:
 
 def save_scene(data: RayDataModule | PixelDataModule, folder: Path) -> None:
     """Writes what rendering needs to know about the scene, without its photos."""
-    scene = data.scene
+    write_json(folder / "scene.json", scene_content(data))
+
+
+def scene_content(data: RayDataModule | PixelDataModule) -> dict[str, Any]:
+    """The same as plain values."""
+    scene, frame = data.scene, frame_of(data)
     content: dict[str, Any] = scene.describe()
-    if isinstance(scene, Scene):
+    if isinstance(scene, Scene) and isinstance(frame, SceneFrame):
         content |= {
-            "background": list(scene.background),
-            "aabb": scene.bounds.aabb.tolist(),
-            "unbounded": scene.bounds.unbounded,
-            "near": scene.bounds.near,
-            "far": scene.bounds.far,
+            "background": list(frame.background),
+            "aabb": frame.bounds.aabb.tolist(),
+            "unbounded": frame.bounds.unbounded,
+            "near": frame.bounds.near,
+            "far": frame.bounds.far,
+            "pixel": frame.bounds.pixel,
             "to_source": scene.to_source.tolist(),
             "orbit": {
                 "K": scene.orbit.K.tolist(),
@@ -123,7 +129,7 @@ def save_scene(data: RayDataModule | PixelDataModule, folder: Path) -> None:
                 "height": scene.orbit.height,
             },
         }
-    write_json(folder / "scene.json", content)
+    return content
 
 
 @dataclass(frozen=True)
@@ -136,6 +142,22 @@ class RunFolder:
     """None for a picture."""
 
 
+def frame_from(scene: dict[str, Any]) -> tuple[Frame, Cameras | None]:
+    """What `scene_content` gave, as a system takes it, and the orbit; None for a picture.
+
+    Raises:
+        ValueError, KeyError, TypeError: where it is not whole.
+    """
+    if "aabb" not in scene:
+        return PictureFrame(*map(int, scene["resolution"])), None
+    near, far, pixel = scene["near"], scene["far"], scene.get("pixel")
+    bounds = Bounds(torch.tensor(scene["aabb"]), scene["unbounded"], near, far, pixel)
+    red, green, blue = map(float, scene["background"])
+    view = scene["orbit"]
+    orbit = Cameras(torch.tensor(view["K"]), torch.tensor(view["c2w"]), view["width"], view["height"])
+    return SceneFrame(bounds, (red, green, blue)), orbit
+
+
 def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
     """Rebuilds a trained system from its folder alone.
 
@@ -145,16 +167,7 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
     cfg = load_config(folder)
     path = folder / "scene.json"
     try:
-        scene = json.loads(path.read_text())
-        frame: Frame
-        if "aabb" not in scene:
-            frame, orbit = PictureFrame(*map(int, scene["resolution"])), None
-        else:
-            bounds = Bounds(torch.tensor(scene["aabb"]), scene["unbounded"], scene["near"], scene["far"])
-            red, green, blue = map(float, scene["background"])
-            frame = SceneFrame(bounds, (red, green, blue))
-            view = scene["orbit"]
-            orbit = Cameras(torch.tensor(view["K"]), torch.tensor(view["c2w"]), view["width"], view["height"])
+        frame, orbit = frame_from(json.loads(path.read_text()))
     except FileNotFoundError as error:
         raise InputError(path, "", "no such file", "the scene of a run") from error
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -134,7 +134,7 @@ def _follows(key: str, other: str, options: Sequence[dict[str, Any]]) -> bool:
 FIGURES = (
     "scene", "background", "method", "seed", "device", "threads", "machine", "load", "versions", "parameters",
     "artifact_bytes", "train_seconds", "steps", "rays_per_second", "psnr", "ssim", "psnr_worst_view",
-    "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "recoveries", "status",
+    "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "plateau", "recoveries", "status",
     "diagnosis",
 )  # fmt: skip
 """What stands in every results.json."""

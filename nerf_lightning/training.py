@@ -57,6 +57,8 @@ def train(cfg: DictConfig, checkpoint: Path | None = None) -> float:
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt)
     system = build_system(cfg, frame_of(data))
+    if system.field.sizing:
+        log.info("model: %s", system.field.sizing)
     check_background(cfg, data, system)
     trainer = build_trainer(cfg, folder)
     results_of(trainer).warnings = doubts

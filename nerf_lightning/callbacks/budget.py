@@ -3,38 +3,56 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from statistics import fmean
 from typing import Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import agreed, attached
+from nerf_lightning.callbacks.attached import agreed, attached, data_of
+from nerf_lightning.callbacks.plateau import HALF_AGAIN, Plateau
 from nerf_lightning.errors import InputError
+from nerf_lightning.evenly import evenly
 from nerf_lightning.machine import Load
 from nerf_lightning.system import System
 
+LOOK_AT = 3
+"""Held-out views that are looked at for a plateau."""
+COOLING = 0.15
+"""Share of what was spent up to the plateau that is spent on cooling down."""
+
 
 class Budget(L.Callback):
-    """Stops training when the budget is spent and tells the system its progress.
+    """Stops training when the budget is spent, or no longer worth spending, and tells the system its progress.
 
     Training time is the wall clock from the first step on, less what runs inside `paused()` (evaluation, pictures). With
     both limits, the first one reached ends the run.
 
+    With `patience` a few held-out views are rendered now and then, with the clock stopped. Where their quality has reached a
+    plateau, a field that still grows is taken to its full size; one that has it cools down in a short time: progress, and the
+    learning rate with it, runs to the end.
+
     Args:
         steps: optimiser steps, or None.
         seconds: seconds of training, or None.
+        patience: dB that half as much time again must bring; None spends the whole budget.
 
     Raises:
-        InputError: where both are None, or one is not positive.
+        InputError: where steps and seconds are None, or one of the three is not positive.
     """
 
-    def __init__(self, steps: int | None = None, seconds: float | None = None):
+    def __init__(self, steps: int | None = None, seconds: float | None = None, patience: float | None = None):
         if steps is None and seconds is None:
             raise InputError("budget", "", "neither steps nor seconds", "budget.steps=N or budget.seconds=S")
-        for key, value in (("steps", steps), ("seconds", seconds)):
+        for key, value in (("steps", steps), ("seconds", seconds), ("patience", patience)):
             if value is not None and value <= 0:
                 raise InputError(f"budget.{key}", "", str(value), "more than 0")
         self.steps = steps
         self.limit_seconds = seconds
+        self.plateau = Plateau(patience) if patience is not None else None
+        self.stopped: dict[str, float] | None = None
+        """The plateau that ends the run: its `seconds` and `step`, and `rest_db`, what the rest of the budget would add."""
+        self._line = (0.0, 0.0, 1.0)
+        """Progress as a function of what was spent: it runs from here (spent, progress) with this slope."""
         self._before = 0.0  # spent up to the last pause or restart
         self._since: float | None = None
         self.load = Load()
@@ -53,12 +71,18 @@ class Budget(L.Callback):
         """Seconds trained so far."""
         return self._before + (0.0 if self._since is None else time.perf_counter() - self._since)
 
-    def progress(self, step: int) -> float:
-        """Fraction of the budget done after `step` steps, in [0, 1]."""
+    def spent(self, step: int) -> float:
+        """Fraction of the limits spent after `step` steps."""
         done = [step / self.steps] if self.steps is not None else []
         if self.limit_seconds is not None:
             done.append(self.seconds / self.limit_seconds)
-        return min(1.0, max(done))
+        return max(done)
+
+    def progress(self, step: int) -> float:
+        """Fraction of the training done after `step` steps, in [0, 1]: that of the limits spent, until a plateau is found."""
+        spent = self.spent(step)
+        start, reached, slope = self._line
+        return min(1.0, max(spent, reached + slope * (spent - start)))
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -95,14 +119,50 @@ class Budget(L.Callback):
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         pl_module.progress = self.shared_progress(trainer)
+        if self.plateau is not None and self.stopped is None and pl_module.progress < 1.0:
+            self._look_for_plateau(trainer, pl_module, self.plateau)
         if pl_module.progress >= 1.0:
             trainer.should_stop = True
+
+    def _look_for_plateau(self, trainer: L.Trainer, system: System, plateau: Plateau) -> None:
+        step = trainer.global_step
+        spent = agreed(trainer, self.spent(step))
+        if not plateau.due(spent):
+            return
+        with self.paused():
+            data = data_of(trainer)
+            chosen = evenly(data.held_out_views, LOOK_AT)
+            flat = plateau.note(spent, fmean(system.evaluate(data.held_out(view)).psnr for view in chosen))
+        if not agreed(trainer, flat):
+            return
+        if system.progress < system.field.grown_after:
+            reached = system.field.grown_after
+            self._line = (spent, reached, (1 - reached) / (1 - spent))
+            plateau.start()
+            return
+        rest, again = plateau.gain(1 / spent) or 0.0, plateau.gain(HALF_AGAIN) or 0.0
+        self._line = (spent, system.progress, (1 - system.progress) / (COOLING * spent))
+        self.stopped = {"seconds": round(self.seconds, 3), "step": step, "rest_db": round(rest, 3)}
+        print(
+            f"budget: plateau after {self.seconds:.1f} s: half as much time again would bring {again:.2f} dB, the rest of the"
+            f" budget {rest:.2f} dB; cooling down",
+            flush=True,
+        )
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
         self._stop()
 
-    def state_dict(self) -> dict[str, float]:
-        return {"seconds": self.seconds}
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "seconds": self.seconds,
+            "line": list(self._line),
+            "stopped": self.stopped,
+            "plateau": None if self.plateau is None else self.plateau.state(),
+        }
 
-    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._before = state_dict["seconds"]
+        self._line = tuple(state_dict["line"])
+        self.stopped = state_dict["stopped"]
+        if self.plateau is not None and state_dict["plateau"] is not None:
+            self.plateau.load(state_dict["plateau"])

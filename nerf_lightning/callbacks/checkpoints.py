@@ -10,8 +10,9 @@ import lightning as L
 
 from nerf_lightning.callbacks.attached import agreed, attached
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.heldout import HeldOut, evenly
+from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.errors import InputError
+from nerf_lightning.evenly import evenly
 from nerf_lightning.files import atomic
 from nerf_lightning.system import System
 

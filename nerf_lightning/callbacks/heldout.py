@@ -8,14 +8,8 @@ import lightning as L
 from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.errors import InputError
+from nerf_lightning.evenly import evenly
 from nerf_lightning.system import System, ViewResult
-
-
-def evenly(total: int, count: int | None) -> list[int]:
-    """`count` indices spread over range(total); all of them for None."""
-    if count is None or count >= total:
-        return list(range(total))
-    return [round((i + 0.5) * total / count - 0.5) for i in range(count)]
 
 
 class HeldOut(L.Callback):

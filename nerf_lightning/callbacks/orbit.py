@@ -7,11 +7,11 @@ import lightning as L
 import numpy as np
 
 from nerf_lightning.callbacks.attached import attached, data_of
-from nerf_lightning.callbacks.heldout import evenly
 from nerf_lightning.callbacks.panels import panel, to_bytes
 from nerf_lightning.callbacks.progress import Progress
 from nerf_lightning.dataset import Scene
 from nerf_lightning.errors import InputError
+from nerf_lightning.evenly import evenly
 from nerf_lightning.files import atomic
 from nerf_lightning.system import NeRF3D
 

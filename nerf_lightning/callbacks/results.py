@@ -190,6 +190,7 @@ class Results(L.Callback):
             "peak_memory_bytes": peak_memory_bytes(),
             "curve": curve,
             "warnings": self.warnings,
+            "plateau": budget.stopped,
             "recoveries": [asdict(one) for one in guard.recoveries] if guard is not None else [],
             "status": status,
             "diagnosis": diagnosis,

@@ -1,5 +1,6 @@
 """Bounds: where the scene's content is, and how world positions map to the unit cube that grids live in."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,6 +27,8 @@ class Bounds:
     near: float | None = None
     """Overrides the distance along the ray where sampling starts; None takes it from the box."""
     far: float | None = None
+    pixel: float | None = None
+    """Width of what one pixel of the photos shows at the content, world units; None where that is not known."""
 
     @property
     def centre(self) -> Float[Tensor, "3"]:
@@ -34,6 +37,14 @@ class Bounds:
     @property
     def half_size(self) -> Float[Tensor, "3"]:
         return (self.aabb[1] - self.aabb[0]) / 2
+
+    @property
+    def pixels_across(self) -> float:
+        """How many pixels lie side by side along the unit cube's longest edge, if all showed what those in the box show."""
+        if self.pixel is None:
+            return math.inf
+        # The contraction leaves the middle half of the unit cube to the box.
+        return (4 if self.unbounded else 2) * float(self.half_size.max()) / self.pixel
 
     def to(self, device: torch.device | str) -> "Bounds":
         return replace(self, aabb=self.aabb.to(device))

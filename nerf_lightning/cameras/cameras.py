@@ -58,6 +58,10 @@ class Cameras:
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=self.K.dtype)
         return replace(self, K=self.K * scale[:, None].to(self.K.device), width=width, height=height)
 
+    def pixel_width(self, place: Float[Tensor, "3"]) -> float:
+        """Width of what one pixel shows at a place, world units: the median over the views."""
+        return float(((self.centres - place).norm(dim=1) / self.K[:, 0, 0]).median())
+
     def rays(self, view: Int[Tensor, "R"], row: Int[Tensor, "R"], col: Int[Tensor, "R"]) -> Rays:
         """Rays through the centres of the given pixels."""
         u, v = col.to(self.K.dtype) + 0.5, row.to(self.K.dtype) + 0.5

@@ -18,6 +18,10 @@ def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
     parameter.data = data
 
 
+PER_PIXEL = 2.0
+"""Cells that the width of a pixel may hold: many views tell more of a place than one, but finer ones are noise."""
+
+
 class Field(InBounds):
     """A radiance field in world coordinates. Subclasses define `features` and `colour`, or `density` and `forward`.
 
@@ -27,10 +31,34 @@ class Field(InBounds):
 
     fastest: float = math.inf
     """Adam's learning rate above which training comes apart, as measured by the stability suite; infinite where not known."""
+    grown_after: float = 0.0
+    """Progress after which the field keeps its size."""
 
     def __init__(self, bounds: Bounds):
         super().__init__(bounds)
         self.unit_length = float(bounds.half_size.max())
+        self.sizing = ""
+        """How the field's size follows from the data, in one line; "" where it does not."""
+
+    def grid_sizes(self, coarsest: int, finest: int, size: str) -> tuple[int, int]:
+        """Cells along a side of the coarsest and the finest grid: as asked, or for size "auto" no more than photos can show.
+
+        Raises:
+            InputError: where coarsest > finest, or for another size than "auto" and "fixed".
+        """
+        if not 0 < coarsest <= finest:
+            raise InputError("model.coarsest", "", f"{coarsest} with model.finest={finest}", "0 < coarsest <= finest")
+        if size not in ("auto", "fixed"):
+            raise InputError("model.size", "", repr(size), "auto or fixed")
+        across = self.bounds.pixels_across
+        if size == "fixed" or across == math.inf:
+            return coarsest, finest
+        shown = max(math.ceil(PER_PIXEL * across), 2)
+        self.sizing = (
+            f"the content is {across:.0f} pixels wide in the photos, which show {shown} cells a side at most:"
+            f" {min(finest, shown)} of the {finest} asked for"
+        )
+        return min(coarsest, shown), min(finest, shown)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         """World positions -> density (1 / half-size, not negative) and what `colour` needs."""
@@ -75,12 +103,17 @@ class PictureField(torch.nn.Module):
         InputError: where rate is not above 0.
     """
 
+    grown_after: float = 0.0
+    """As of `Field`: it does not grow."""
+
     def __init__(self, size: tuple[int, int], rate: float = 1.0):
         super().__init__()
         if not rate > 0:
             raise InputError("model.rate", "", str(rate), "above 0")
         self.size = size
         self.rate = rate
+        self.sizing = ""
+        """How the field's size follows from the picture, in one line; "" where it does not."""
 
     @property
     def nyquist(self) -> float:

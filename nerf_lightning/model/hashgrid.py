@@ -70,6 +70,10 @@ class HashGridField(Field):
         levels, log2_entries, features, coarsest, finest: the grid, see `HashGrid`.
         width: neurons of the hidden layers (one for density, two for colour).
         density: "relu", "softplus" or "exp".
+        size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
+
+    Raises:
+        InputError: where coarsest > finest, or for another `size`.
     """
 
     GEOMETRY = 15  # features handed from density to colour network, Instant-NGP section 5.4
@@ -86,9 +90,10 @@ class HashGridField(Field):
         finest: Count = 256,
         width: Count = 64,
         density: str = "exp",
+        size: str = "fixed",
     ):
         super().__init__(bounds)
-        self.grid = HashGrid(levels, log2_entries, features, coarsest, finest)
+        self.grid = HashGrid(levels, log2_entries, features, *self.grid_sizes(coarsest, finest, size))
         self.activation = density_activation(density)
         self.density_net = layers(self.grid.width, width, 1 + self.GEOMETRY)
         self.colour_net = layers(self.GEOMETRY + 16, width, width, 3)

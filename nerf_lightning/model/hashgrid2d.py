@@ -55,6 +55,10 @@ class HashGrid2DField(PictureField):
             numbers = SHARE * 3 * size[0] * size[1]
             fitting = [e for e in range(4, 25) if sum(level_sizes(self.resolutions, 2**e)) * features <= numbers]
             log2_entries = max(fitting, default=4)
+            self.sizing = (
+                f"grids up to the picture's {size[0]} x {size[1]} pixels, of at most 2^{log2_entries} entries: together half"
+                " as many numbers as the picture"
+            )
         if log2_entries > 24:
             raise InputError("model.log2_entries", "", str(log2_entries), "at most 24")
         self.sizes = level_sizes(self.resolutions, 2**log2_entries)

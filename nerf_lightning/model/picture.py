@@ -38,6 +38,7 @@ class PictureMLP(PictureField):
             # The last octave has 2^(L-1) / 2 cycles over the picture, and `nyquist` is the most that its pixels can show.
             # At that limit a sine has one value at all pixels, up to its sign, and whatever it likes between them.
             frequencies = 1 + max(0, round(math.log2(self.nyquist)))
+            self.sizing = f"{frequencies} octaves, up to about half of what {max(size)} pixels can show"
         if frequencies < 0:
             raise InputError(
                 "model.frequencies", "", str(frequencies), "0 or more, or null to take them from the picture"

@@ -77,9 +77,10 @@ class TensoRFField(Field):
         grown: fraction of the budget after which the planes have their finest size; the stages before are equally long.
         width: neurons of the hidden layer.
         density: "relu", "softplus" or "exp".
+        size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
 
     Raises:
-        InputError: where coarsest > finest, for a single stage of two sizes, or `grown` outside [0, 1].
+        InputError: where coarsest > finest, for another `size`, for a single stage of two sizes, or `grown` outside [0, 1].
     """
 
     fastest = 0.2
@@ -95,16 +96,17 @@ class TensoRFField(Field):
         grown: float = 0.3,
         width: Count = 32,
         density: str = "exp",
+        size: str = "fixed",
     ):
         super().__init__(bounds)
-        if coarsest > finest:
-            raise InputError("model.coarsest", "", f"{coarsest} with model.finest={finest}", "coarsest <= finest")
+        coarsest, finest = self.grid_sizes(coarsest, finest, size)
         if stages == 1 and coarsest < finest:
             raise InputError("model.stages", "", f"1 with sizes {coarsest} and {finest}", "at least 2, or one size")
         if not 0 <= grown <= 1:
             raise InputError("model.grown", "", str(grown), "between 0 and 1")
         self.resolutions = level_resolutions(stages, coarsest, finest)
         self.grown = grown
+        self.grown_after = grown if coarsest < finest else 0.0
         self.density_volume = VectorMatrix(coarsest, density_components)
         self.colour_volume = VectorMatrix(coarsest, colour_components)
         self.activation = density_activation(density)

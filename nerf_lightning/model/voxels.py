@@ -57,10 +57,11 @@ class VoxelField(Field):
         degree: of the spherical harmonics, 0 to 3; those above 0 depend on the direction.
         density_rate: factor on the learning rate of the log-densities, relative to the colours'.
         smoothness: weight of the log-densities' squared differences between neighbours (Plenoxels, eq. 3, without the root).
+        size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
 
     Raises:
-        InputError: where coarsest > finest, for a degree above 3, a rate that is not positive, a negative smoothness, or
-            `grown` outside (0, 1].
+        InputError: where coarsest > finest, for another `size`, for a degree above 3, a rate that is not positive, a negative
+            smoothness, or `grown` outside (0, 1].
     """
 
     index: Tensor
@@ -80,10 +81,10 @@ class VoxelField(Field):
         degree: int = 1,
         density_rate: float = 6.0,
         smoothness: float = 1e-4,
+        size: str = "fixed",
     ):
         super().__init__(bounds)
-        if coarsest > finest:
-            raise InputError("model.coarsest", "", f"{coarsest} with model.finest={finest}", "coarsest <= finest")
+        coarsest, finest = self.grid_sizes(coarsest, finest, size)
         if not 0 <= degree <= 3:
             raise InputError("model.degree", "", str(degree), "0 to 3")
         if not 0 < grown <= 1:
@@ -96,6 +97,7 @@ class VoxelField(Field):
         self.resolutions = [round(coarsest * (finest / coarsest) ** (i / intervals)) for i in range(stages)]
         # Early stages are short: a coarse grid learns what it can in a few steps a vertex.
         self.times = [grown * (i / intervals) ** 2 for i in range(stages)]
+        self.grown_after = self.times[-1]
         self.terms = (degree + 1) ** 2 - 1
         self.density_rate = density_rate
         # Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog before cameras.

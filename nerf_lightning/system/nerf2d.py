@@ -24,6 +24,8 @@ class NeRF2D(System):
         optimizer, schedule, seed: see `System`.
     """
 
+    field: PictureField
+
     def __init__(self, field: PictureField, optimizer: MakeOptimizer, schedule: Schedule, seed: int = 0):
         super().__init__(optimizer, schedule, seed)
         self.field = field

@@ -25,6 +25,8 @@ class NeRF3D(System):
         optimizer, schedule, seed: see `System`.
     """
 
+    field: Field
+
     def __init__(
         self,
         field: Field,

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system.metrics import psnr, ssim
 
 MakeOptimizer = Callable[[Iterable[torch.nn.Parameter]], torch.optim.Optimizer]
@@ -51,6 +52,8 @@ class System(L.LightningModule):
         schedule: factor on its learning rate by progress.
         seed: of all chance in training steps.
     """
+
+    field: Field | PictureField
 
     def __init__(self, optimizer: MakeOptimizer, schedule: Schedule, seed: int):
         super().__init__()

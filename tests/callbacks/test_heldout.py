@@ -1,8 +1,8 @@
 import pytest
 
 from nerf_lightning.callbacks import Budget, HeldOut
-from nerf_lightning.callbacks.heldout import evenly
 from nerf_lightning.errors import InputError
+from nerf_lightning.evenly import evenly
 
 
 @pytest.mark.parametrize(

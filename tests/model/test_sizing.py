@@ -1,0 +1,89 @@
+"""Grids no finer than the photos can show."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.compose import composed
+from nerf_lightning.dataset import save_npz
+from nerf_lightning.errors import InputError
+from nerf_lightning.model import Field, HashGrid2DField, HashGridField, PictureMLP, TensoRFField, VoxelField
+from nerf_lightning.run_folder import load_run
+from nerf_lightning.stability.toys import MARBLE, around, toy
+from nerf_lightning.training import train
+
+BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 1.0]])
+
+
+def hashgrid(bounds: Bounds, coarsest: int, finest: int, size: str) -> list[int]:
+    field = HashGridField(bounds, levels=3, log2_entries=8, coarsest=coarsest, finest=finest, size=size)
+    return field.grid.resolutions
+
+
+def tensorf(bounds: Bounds, coarsest: int, finest: int, size: str) -> list[int]:
+    return TensoRFField(bounds, 2, 2, coarsest, finest, size=size).resolutions
+
+
+def voxels(bounds: Bounds, coarsest: int, finest: int, size: str) -> list[int]:
+    return VoxelField(bounds, coarsest, finest, size=size).resolutions
+
+
+GRIDS = pytest.mark.parametrize("resolutions", [hashgrid, tensorf, voxels])
+Resolutions = Callable[[Bounds, int, int, str], list[int]]
+
+
+def test_a_pixel_shows_its_share_of_the_distance():
+    cameras = around(9, size=40, distance=4.0)
+    assert cameras.pixel_width(torch.zeros(3)) == pytest.approx(4 / float(cameras.K[0, 0, 0]))
+
+
+@pytest.mark.parametrize(("unbounded", "across"), [(False, 20), (True, 40)])
+def test_pixels_across_are_those_of_the_unit_cube(unbounded: bool, across: int):
+    assert Bounds(BOX, unbounded, pixel=0.1).pixels_across == pytest.approx(across)
+    # A step of one pixel along the longest axis is one part in so many of the unit cube.
+    bounds = Bounds(BOX, unbounded, pixel=0.1)
+    step = bounds.to_unit(torch.tensor([0.1, 0, 0])) - bounds.to_unit(torch.zeros(3))
+    assert float(step[0]) == pytest.approx(1 / across)
+
+
+@GRIDS
+def test_grids_are_no_finer_than_two_cells_a_pixel(resolutions: Resolutions):
+    bounds = Bounds(BOX, pixel=0.1)
+    auto, fixed = resolutions(bounds, 16, 100, "auto"), resolutions(bounds, 16, 100, "fixed")
+    assert auto[0] == fixed[0] == 16 and auto[-1] == 40 and fixed[-1] == 100
+    assert resolutions(bounds, 16, 30, "auto") == resolutions(bounds, 16, 30, "fixed")
+
+
+@GRIDS
+def test_a_subject_of_few_pixels_lowers_the_coarsest_too(resolutions: Resolutions):
+    assert set(resolutions(Bounds(BOX, pixel=0.5), 16, 100, "auto")) == {8}
+
+
+@GRIDS
+def test_without_photos_sizes_are_as_asked(resolutions: Resolutions):
+    assert resolutions(Bounds(BOX), 16, 100, "auto") == resolutions(Bounds(BOX), 16, 100, "fixed")
+
+
+@GRIDS
+def test_a_size_is_auto_or_fixed(resolutions: Resolutions):
+    with pytest.raises(InputError, match=r"model\.size: found 'large', expected auto or fixed"):
+        resolutions(Bounds(BOX), 16, 100, "large")
+
+
+def test_fields_say_in_a_line_what_their_size_follows_from():
+    assert "20 pixels wide" in TensoRFField(Bounds(BOX, pixel=0.1), size="auto").sizing
+    assert Field(Bounds(BOX)).sizing == ""
+    assert "64 x 48 pixels" in HashGrid2DField((64, 48)).sizing
+    assert PictureMLP((64, 48)).sizing.startswith("6 octaves") and PictureMLP((64, 48), frequencies=3).sizing == ""
+
+
+def test_a_run_folder_knows_the_size_without_its_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    save_npz(toy(MARBLE, size=16, views=6, held_out=1), tmp_path / "scene.npz")
+    given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_small", "budget.steps=3"]
+    train(composed([*given, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "~logger"], tmp_path / "run"))
+    (tmp_path / "scene.npz").unlink()
+    field = load_run(tmp_path / "run").system.field
+    assert isinstance(field, TensoRFField) and field.resolutions[-1] < 16
