@@ -65,13 +65,26 @@ def load_config(folder: Path) -> DictConfig:
         raise InputError(path, "", "no such file", "the folder of a run", "look below outputs/") from error
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(path, "", str(error), "a run's configuration in YAML") from error
+    return OmegaConf.create(check_config(plain, path))
+
+
+def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
+    """Refuses a configuration from outside that is not plain, or names a target that is not trusted.
+
+    Args:
+        plain: as it was read.
+        path: where from, for the message.
+
+    Raises:
+        InputError: as said.
+    """
     if not isinstance(plain, dict):
         raise InputError(path, "", type(plain).__name__, "a mapping")
     _check(path, "", plain)
-    return OmegaConf.create(plain)
+    return plain
 
 
-def _check(path: Path, key: str, node: Any) -> None:
+def _check(path: Path | str, key: str, node: Any) -> None:
     if isinstance(node, dict):
         for name, value in node.items():
             _check(path, f"{key}.{name}" if key else str(name), value)

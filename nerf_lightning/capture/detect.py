@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from nerf_lightning.capture.layout import SQUARE
-from nerf_lightning.capture.progress import tracked
 from nerf_lightning.dataset.decode import read_pixels
 from nerf_lightning.errors import InputError
+from nerf_lightning.progress import tracked
 
 COMMON = (
     "DICT_4X4_50",

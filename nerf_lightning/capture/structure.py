@@ -18,7 +18,6 @@ from nerf_lightning.cameras import focus_point
 from nerf_lightning.capture.geometry import inverse
 from nerf_lightning.capture.outputs import Packing, Placed, lens_entry, write_scene
 from nerf_lightning.capture.photos import find_photos, of_one_size
-from nerf_lightning.capture.progress import tracked
 from nerf_lightning.dataset.decode import read_pixels
 from nerf_lightning.dataset.extent import viewing_distance
 from nerf_lightning.dataset.lens import Lens
@@ -26,6 +25,7 @@ from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic
+from nerf_lightning.progress import tracked
 
 if TYPE_CHECKING:
     import pycolmap

@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, InBounds
@@ -80,6 +80,21 @@ class Field(InBounds):
         """What training adds to the squared error, if anything."""
         return None
 
+    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
+        """Empties what no position in the reached cells of the unit cube reads: there the field stays what it is."""
+
+    def packed(self) -> dict[str, Tensor]:
+        """All that rendering needs, as little of it as there can be: what `unpack` takes."""
+        return dict(self.state_dict())
+
+    def unpack(self, packed: dict[str, Tensor]) -> None:
+        """Becomes the field that `packed` told of.
+
+        Raises:
+            RuntimeError, KeyError: where that was another kind of field, or one of another size.
+        """
+        self.load_state_dict(packed)
+
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """World positions -> density, 1 / world unit."""
         return self.features(positions)[0] / self.unit_length
@@ -123,6 +138,14 @@ class PictureField(torch.nn.Module):
     def centred(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:
         """Places with the picture's centre at the origin and its longer side from -1 to 1: pixels stay square."""
         return (2 * uv - 1) * uv.new_tensor([side / max(self.size) for side in self.size])
+
+    def packed(self) -> dict[str, Tensor]:
+        """As of `Field`."""
+        return dict(self.state_dict())
+
+    def unpack(self, packed: dict[str, Tensor]) -> None:
+        """As of `Field`."""
+        self.load_state_dict(packed)
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         """Places in [0, 1]^2 (x right, y down) -> rgb, in [0, 1] or near it."""

@@ -3,14 +3,16 @@
 from itertools import pairwise
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import hash_interpolate, mlp, mlp_heads, spherical_harmonics
+from nerf_lightning.kernels.hashgrid import corners
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field
+from nerf_lightning.model.pruning import vertices_in
 from nerf_lightning.options import Count
 
 
@@ -50,6 +52,19 @@ class HashGrid(torch.nn.Module):
 
     def forward(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N LF"]:
         return hash_interpolate(self.tables, unit, self.resolutions, self.sizes)
+
+    def rows(self, vertices: Int[Tensor, "3 N"], level: int) -> Int[Tensor, "N"]:
+        """Rows of `tables` that a level keeps its vertices in."""
+        entry, _ = corners(vertices, torch.zeros_like(vertices), self.resolutions[level], self.sizes[level])
+        return sum(self.sizes[:level]) + entry[0]
+
+    @torch.no_grad()
+    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
+        """Zeroes entries that no position in the reached cells reads."""
+        read = torch.zeros(len(self.tables), dtype=torch.bool, device=reached.device)
+        for level, resolution in enumerate(self.resolutions):
+            read[self.rows(vertices_in(reached, resolution).nonzero().T.int(), level)] = True
+        self.tables[~read] = 0
 
 
 def layers(*widths: int) -> torch.nn.ModuleList:
@@ -105,6 +120,9 @@ class HashGridField(Field):
         """The layers have drawn theirs. From dense fog training may throw all density away, and with it all gradient."""
         if self.starts_thin:
             self.density_net[-1].get_parameter("bias")[0] = self.START
+
+    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
+        self.grid.prune(reached)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         encoded = self.grid(self.bounds.to_unit(positions))

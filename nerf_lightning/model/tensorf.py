@@ -3,16 +3,18 @@
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import mlp, plane_line_products, plane_line_sum, spherical_harmonics
+from nerf_lightning.kernels.planes import PLANE_AXES
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field, replace_data
 from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
+from nerf_lightning.model.pruning import vertices_in
 from nerf_lightning.options import Count
 
 
@@ -54,6 +56,15 @@ class VectorMatrix(torch.nn.Module):
         lines = interpolate(lines, cells + 1, mode="linear", align_corners=True)
         replace_data(self.planes, planes.permute(0, 2, 3, 1).contiguous())
         replace_data(self.lines, lines.transpose(1, 2).contiguous())
+
+    @torch.no_grad()
+    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
+        """Zeroes what no position in the reached cells reads."""
+        read = vertices_in(reached, self.cells)
+        for mode in range(3):
+            self.planes[mode][~read.any(mode)] = 0
+            a, b = PLANE_AXES[mode]
+            self.lines[mode][~read.any(b).any(a)] = 0
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         """Takes the size of what is loaded, which may be of another stage of training."""
@@ -122,6 +133,10 @@ class TensoRFField(Field):
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         return torch.sigmoid(mlp(features, weights(self.colour_net), spherical_harmonics(directions)))
+
+    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
+        self.density_volume.prune(reached)
+        self.colour_volume.prune(reached)
 
     def resolution_at(self, progress: float) -> int:
         """Cells along a side that the planes should have after this fraction of the budget."""

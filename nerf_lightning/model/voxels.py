@@ -1,5 +1,6 @@
 """A sparse grid of densities and spherical-harmonics colours, without any network (Plenoxels, Fridovich-Keil et al. 2022)."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from nerf_lightning.kernels import (
 )
 from nerf_lightning.model.activation import truncated_exp
 from nerf_lightning.model.field import Field, replace_data
+from nerf_lightning.model.pruning import vertices_in, widened
 from nerf_lightning.options import Count
 
 EMPTY = -8.0
@@ -29,16 +31,6 @@ PIECES = 4
 """Steps that share one look at the roughness of all vertices."""
 CHUNK = 1 << 16
 """Vertices interpolated together when growing: bounds the memory."""
-
-
-def widened(mask: Bool[Tensor, "S S S"]) -> Bool[Tensor, "S S S"]:
-    """True also at all neighbours, diagonal ones too."""
-    for axis in range(3):
-        wide, last = mask.clone(), mask.shape[axis] - 1
-        wide.narrow(axis, 0, last).logical_or_(mask.narrow(axis, 1, last))
-        wide.narrow(axis, 1, last).logical_or_(mask.narrow(axis, 0, last))
-        mask = wide
-    return mask
 
 
 class VoxelField(Field):
@@ -157,15 +149,36 @@ class VoxelField(Field):
         values = torch.cat([table.view(len(table), -1) for table in self.tables], dim=1)
         parts = (keep.nonzero() / (keep.shape[0] - 1)).split(CHUNK)
         new = torch.cat([values[:1], *(interpolate_rows(values, *locate(self.index, part)) for part in parts)])
-        for table, columns in zip(self.tables, new.split([1, 3, 3 * self.terms], dim=1), strict=True):
-            replace_data(table, columns.reshape(len(new), *table.shape[1:]).contiguous())
-        flat = keep.flatten()
-        self.index = torch.where(flat, flat.cumsum(0), 0).int()
-        self.find_vertices()
-        self.seen = torch.zeros(len(new), dtype=torch.int32, device=flat.device)
+        self.hold(keep.flatten(), new.split([1, 3, 3 * self.terms], dim=1))
         self.stage.fill_(wanted)
         self.started.copy_(self.steps)
         return list(self.tables)
+
+    def hold(self, keep: Bool[Tensor, "V"], tables: Sequence[Tensor]) -> None:
+        """Takes other tables: the rows of the kept vertices, in their order, behind that of all others."""
+        for table, columns in zip(self.tables, tables, strict=True):
+            replace_data(table, columns.reshape(len(columns), *table.shape[1:]).contiguous())
+        self.index = torch.where(keep, keep.cumsum(0), 0).int()
+        self.find_vertices()
+        self.seen = torch.zeros(len(self.vertex), dtype=torch.int32, device=keep.device)
+
+    @torch.no_grad()
+    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
+        cells = round(len(self.index) ** (1 / 3)) - 1
+        keep = vertices_in(reached, cells).flatten() & (self.index > 0)
+        rows = torch.cat([self.index.new_zeros(1), self.index[keep]]).long()
+        self.hold(keep, [table.detach()[rows] for table in self.tables])
+
+    def packed(self) -> dict[str, Tensor]:
+        tables = zip(("log_density", "colours", "views"), self.tables, strict=True)
+        return {"kept": self.index > 0, **{name: table.detach() for name, table in tables}}
+
+    @torch.no_grad()
+    def unpack(self, packed: dict[str, Tensor]) -> None:
+        keep, tables = packed["kept"], [packed[name] for name in ("log_density", "colours", "views")]
+        if any(len(table) != int(keep.sum()) + 1 for table in tables):
+            raise RuntimeError("tables of another length than there are vertices")
+        self.hold(keep, tables)
 
     def find_vertices(self) -> None:
         """Makes `vertex`, the inverse of `index`: rows stand in the order of their vertices."""

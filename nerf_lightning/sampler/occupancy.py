@@ -144,6 +144,14 @@ class OccupancySampler(Sampler):
         self.occupied &= self.allowed
         self.lit &= self.allowed
 
+    def packed(self) -> dict[str, Tensor]:
+        return {"occupied": self.occupied}
+
+    def unpack(self, packed: dict[str, Tensor]) -> None:
+        if packed["occupied"].shape != self.occupied.shape:
+            raise RuntimeError(f"an occupancy grid of {len(packed['occupied'])} cells, not {len(self.occupied)}")
+        self.occupied.copy_(packed["occupied"])
+
     def restart(self, step: int) -> None:
         self.first_step = step
 

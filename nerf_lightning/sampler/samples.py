@@ -66,6 +66,17 @@ class Sampler(InBounds):
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         raise TypeError(f"{type(self).__name__} must define forward(rays, density, generator) -> Samples")
 
+    def packed(self) -> dict[str, Tensor]:
+        """All that rendering needs: what `unpack` takes."""
+        return {}
+
+    def unpack(self, packed: dict[str, Tensor]) -> None:
+        """Becomes the sampler that `packed` told of.
+
+        Raises:
+            RuntimeError, KeyError: where that was one of another size or kind.
+        """
+
     def look_through(self, cameras: Cameras) -> None:
         """Called before training with the cameras of the photos; samplers that leave out what none has in view do so here."""
 

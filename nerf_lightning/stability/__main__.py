@@ -30,7 +30,7 @@ def stability(
     Raises:
         InputError: for a suite or a method that is not known.
     """
-    from nerf_lightning.capture.progress import tracked
+    from nerf_lightning.progress import tracked
     from nerf_lightning.stability.conditions import CONDITIONS
     from nerf_lightning.stability.methods import METHODS
     from nerf_lightning.stability.report import write_report

@@ -1,4 +1,4 @@
-"""A progress bar for work on photos."""
+"""A progress bar for work on many things, one after the other."""
 
 from collections.abc import Iterable, Iterator
 from typing import TypeVar

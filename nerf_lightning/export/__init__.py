@@ -1,0 +1,1 @@
+"""Run folders as something else: a small file, ready to render."""

@@ -1,0 +1,35 @@
+"""Masks over grids in the unit cube: neighbours, and which vertices positions in some cells of another grid read."""
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+
+def widened(mask: Bool[Tensor, "S S S"]) -> Bool[Tensor, "S S S"]:
+    """True also at all neighbours, diagonal ones too."""
+    for axis in range(3):
+        wide, last = mask.clone(), mask.shape[axis] - 1
+        wide.narrow(axis, 0, last).logical_or_(mask.narrow(axis, 1, last))
+        wide.narrow(axis, 1, last).logical_or_(mask.narrow(axis, 0, last))
+        mask = wide
+    return mask
+
+
+def vertices_in(reached: Bool[Tensor, "G G G"], cells: int) -> Bool[Tensor, "V V V"]:
+    """Vertices, V = cells + 1 along an axis, of all cells of a grid that overlap reached ones."""
+    mask = reached
+    for axis in range(3):
+        count = mask.shape[axis]
+        first = torch.arange(cells, device=mask.device) * count // cells
+        beyond = -(-torch.arange(1, cells + 1, device=mask.device) * count // cells)
+        sums = mask.int().cumsum(axis)
+        sums = torch.cat([torch.zeros_like(sums.narrow(axis, 0, 1)), sums], dim=axis)
+        mask = sums.index_select(axis, beyond) > sums.index_select(axis, first)
+    for axis in range(3):
+        wide = list(mask.shape)
+        wide[axis] += 1
+        ends = mask.new_zeros(wide)
+        ends.narrow(axis, 0, mask.shape[axis]).logical_or_(mask)
+        ends.narrow(axis, 1, mask.shape[axis]).logical_or_(mask)
+        mask = ends
+    return mask
