@@ -76,6 +76,12 @@ class Field(InBounds):
         """
         return []
 
+    def take(self, smaller: "Field") -> None:
+        """Becomes the function that a smaller field of the same kind is, as far as it can, with room for more.
+
+        What is not taken over starts anew; here, that is all.
+        """
+
     def penalty(self) -> Float[Tensor, ""] | None:
         """What training adds to the squared error, if anything."""
         return None
@@ -138,6 +144,9 @@ class PictureField(torch.nn.Module):
     def centred(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:
         """Places with the picture's centre at the origin and its longer side from -1 to 1: pixels stay square."""
         return (2 * uv - 1) * uv.new_tensor([side / max(self.size) for side in self.size])
+
+    def take(self, smaller: "PictureField") -> None:
+        """As of `Field`."""
 
     def packed(self) -> dict[str, Tensor]:
         """As of `Field`."""

@@ -13,6 +13,7 @@ from nerf_lightning.kernels.hashgrid import corners
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field
 from nerf_lightning.model.pruning import vertices_in
+from nerf_lightning.model.widening import widen_all
 from nerf_lightning.options import Count
 
 
@@ -55,8 +56,32 @@ class HashGrid(torch.nn.Module):
 
     def rows(self, vertices: Int[Tensor, "3 N"], level: int) -> Int[Tensor, "N"]:
         """Rows of `tables` that a level keeps its vertices in."""
-        entry, _ = corners(vertices, torch.zeros_like(vertices), self.resolutions[level], self.sizes[level])
+        entry, _ = corners(vertices, torch.zeros(vertices.shape), self.resolutions[level], self.sizes[level])
         return sum(self.sizes[:level]) + entry[0]
+
+    @torch.no_grad()
+    def take(self, smaller: "HashGrid") -> Int[Tensor, "I"]:
+        """Takes over the levels that have a resolution of its own, in tables that are as large or larger.
+
+        Returns:
+            The place in this grid's features of each of the smaller one's that was taken over; -1 for the others.
+        """
+        features = self.tables.shape[1]
+        places = torch.full((len(smaller.sizes) * features,), -1)
+        for theirs, resolution in enumerate(smaller.resolutions):
+            if resolution not in self.resolutions:
+                continue
+            mine = self.resolutions.index(resolution)
+            # Hashes differ in how many of their bits count: an entry of a larger table has one it came from.
+            if (resolution + 1) ** 3 == self.sizes[mine]:
+                vertices = torch.cartesian_prod(*[torch.arange(resolution + 1, dtype=torch.int32)] * 3).T
+                rows = self.rows(vertices, mine), smaller.rows(vertices, theirs)
+            else:
+                entries, start = torch.arange(self.sizes[mine]), (sum(self.sizes[:mine]), sum(smaller.sizes[:theirs]))
+                rows = start[0] + entries, start[1] + entries % smaller.sizes[theirs]
+            self.tables[rows[0]] = smaller.tables[rows[1]]
+            places[theirs * features : (theirs + 1) * features] = mine * features + torch.arange(features)
+        return places
 
     @torch.no_grad()
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
@@ -120,6 +145,15 @@ class HashGridField(Field):
         """The layers have drawn theirs. From dense fog training may throw all density away, and with it all gradient."""
         if self.starts_thin:
             self.density_net[-1].get_parameter("bias")[0] = self.START
+
+    @torch.no_grad()
+    def take(self, smaller: Field) -> None:
+        """Takes over both networks, and all of the grid where no level of it is missing here."""
+        assert isinstance(smaller, HashGridField)  # of the same kind, as said
+        columns = self.grid.take(smaller.grid)
+        if (columns >= 0).all():
+            widen_all(self.density_net, smaller.density_net, columns)
+            widen_all(self.colour_net, smaller.colour_net, torch.arange(self.GEOMETRY + 16))
 
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
         self.grid.prune(reached)

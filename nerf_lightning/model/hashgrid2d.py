@@ -8,6 +8,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import hash_interpolate_2d, mlp
 from nerf_lightning.model.field import PictureField
 from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
+from nerf_lightning.model.widening import widen_all
 from nerf_lightning.options import Count
 
 SHARE = 0.5
@@ -31,6 +32,7 @@ class HashGrid2DField(PictureField):
             the most with which all levels together hold half as many numbers as the picture.
         features: numbers an entry.
         coarsest: cells along the longer side of the first level; a smaller picture has as many as pixels.
+        finest: of the last level, at most as fine as the pixels; None takes that.
         width: neurons of the hidden layer.
         rate: factor on the learning rate.
     """
@@ -42,14 +44,15 @@ class HashGrid2DField(PictureField):
         log2_entries: Count | None = None,
         features: Count = 2,
         coarsest: Count = 16,
+        finest: Count | None = None,
         width: Count = 64,
         rate: float = 1.0,
     ):
         super().__init__(size, rate)
         cells = [max(side - 1, 1) for side in size]
-        finest = max(cells)
+        pixels, finest = max(cells), min(max(cells), finest or max(cells))
         first = finest if levels == 1 else min(coarsest, finest)
-        scaled = [[max(1, round(c * r / finest)) for c in cells] for r in level_resolutions(levels, first, finest)]
+        scaled = [[max(1, round(c * r / pixels)) for c in cells] for r in level_resolutions(levels, first, finest)]
         self.resolutions = list(dict.fromkeys((across, down) for across, down in scaled))  # a small picture has fewer
         if log2_entries is None:
             numbers = SHARE * 3 * size[0] * size[1]
@@ -64,6 +67,22 @@ class HashGrid2DField(PictureField):
         self.sizes = level_sizes(self.resolutions, 2**log2_entries)
         self.tables = torch.nn.Parameter(torch.empty(sum(self.sizes), features).uniform_(-1e-4, 1e-4))
         self.net = layers(len(self.sizes) * features, width, 3)
+
+    @torch.no_grad()
+    def take(self, smaller: PictureField) -> None:
+        """Takes over the levels whose grids and tables are the same here, and the network where all are."""
+        assert isinstance(smaller, HashGrid2DField)  # of the same kind, as said
+        features, places = self.tables.shape[1], []
+        for theirs, resolution in enumerate(smaller.resolutions):
+            mine = self.resolutions.index(resolution) if resolution in self.resolutions else -1
+            if mine < 0 or self.sizes[mine] != smaller.sizes[theirs]:
+                return
+            rows, others = (
+                slice(sum(s[:i]), sum(s[: i + 1])) for s, i in ((self.sizes, mine), (smaller.sizes, theirs))
+            )
+            self.tables[rows] = smaller.tables[others]
+            places += [mine * features + one for one in range(features)]
+        widen_all(self.net, smaller.net, torch.tensor(places))
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         width, height = self.size

@@ -9,6 +9,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import Field
+from nerf_lightning.model.widening import widen, widen_all
 from nerf_lightning.options import Count
 
 
@@ -57,6 +58,34 @@ class MLPField(Field):
             torch.nn.ReLU(),
             torch.nn.Linear(width // 2, 3),
         )
+
+    @torch.no_grad()
+    def take(self, smaller: Field) -> None:
+        """Takes over a network with the same encodings and skip; further layers of the trunk hand on what comes in."""
+        assert isinstance(smaller, MLPField)  # of the same kind, as said
+        like = ("skip", "position_frequencies", "direction_frequencies")
+        if any(getattr(self, key) != getattr(smaller, key) for key in like) or len(smaller.trunk) > len(self.trunk):
+            return
+        wide, narrow = self.bottleneck.in_features, smaller.bottleneck.in_features
+        encoded = torch.arange(3 * (1 + 2 * self.position_frequencies))
+        directions = torch.arange(3 * (1 + 2 * self.direction_frequencies))
+        hidden = torch.arange(narrow)
+        for layer, mine in enumerate(self.trunk):
+            assert isinstance(mine, torch.nn.Linear)
+            if layer >= len(smaller.trunk):  # rectified before, so rectifying again changes nothing
+                mine.weight[:narrow] = torch.eye(mine.in_features)[:narrow]
+                mine.bias[:narrow] = 0
+                continue
+            its = smaller.trunk[layer]
+            assert isinstance(its, torch.nn.Linear)
+            again = torch.cat([hidden, wide + encoded]) if layer == self.skip else hidden
+            widen(mine, its, encoded if layer == 0 else again)
+        widen(self.density_head, smaller.density_head, hidden)
+        widen(self.bottleneck, smaller.bottleneck, hidden)
+        head, its_head = (
+            torch.nn.ModuleList([field.colour_head[0], field.colour_head[2]]) for field in (self, smaller)
+        )
+        widen_all(head, its_head, torch.cat([hidden, wide + directions]))
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         x = sinusoidal(self.bounds.to_unit(positions) * 2 - 1, self.position_frequencies)

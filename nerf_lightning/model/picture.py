@@ -10,6 +10,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import PictureField
 from nerf_lightning.model.hashgrid import layers
+from nerf_lightning.model.widening import widen_all
 from nerf_lightning.options import Count
 
 
@@ -45,6 +46,13 @@ class PictureMLP(PictureField):
             )
         self.frequencies = frequencies
         self.net = rectified([2 * (1 + 2 * frequencies), *[width] * depth, 3])
+
+    def take(self, smaller: PictureField) -> None:
+        """Takes over a network with as many layers and at most as many octaves: those are the first of these."""
+        assert isinstance(smaller, PictureMLP)  # of the same kind, as said
+        mine, its = ([layer for layer in net if isinstance(layer, torch.nn.Linear)] for net in (self.net, smaller.net))
+        if len(mine) == len(its) and smaller.frequencies <= self.frequencies:
+            widen_all(torch.nn.ModuleList(mine), torch.nn.ModuleList(its), torch.arange(its[0].in_features))
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         places = 0.5 + 0.5 * self.centred(uv)  # pixels stay square: octaves that suit the longer side suit the shorter

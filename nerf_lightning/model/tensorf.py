@@ -15,6 +15,7 @@ from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field, replace_data
 from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
 from nerf_lightning.model.pruning import vertices_in
+from nerf_lightning.model.widening import widen_all
 from nerf_lightning.options import Count
 
 
@@ -56,6 +57,21 @@ class VectorMatrix(torch.nn.Module):
         lines = interpolate(lines, cells + 1, mode="linear", align_corners=True)
         replace_data(self.planes, planes.permute(0, 2, 3, 1).contiguous())
         replace_data(self.lines, lines.transpose(1, 2).contiguous())
+
+    @torch.no_grad()
+    def take(self, smaller: "VectorMatrix", silent: bool) -> None:
+        """Takes over another volume's components, and its size; further ones are new.
+
+        Args:
+            smaller: with at most as many components.
+            silent: whether the new ones shall add nothing: their lines are zero then.
+        """
+        new = self.lines.shape[2] - smaller.lines.shape[2]
+        planes, lines = (self.SPREAD * torch.randn(*old.shape[:-1], new) for old in (smaller.planes, smaller.lines))
+        if silent:
+            lines.zero_()
+        replace_data(self.planes, torch.cat([smaller.planes, planes], dim=3))
+        replace_data(self.lines, torch.cat([smaller.lines, lines], dim=2))
 
     @torch.no_grad()
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
@@ -142,6 +158,21 @@ class TensoRFField(Field):
         """Cells along a side that the planes should have after this fraction of the budget."""
         last = len(self.resolutions) - 1
         return self.resolutions[last if progress >= self.grown else int(progress / self.grown * last)]
+
+    @torch.no_grad()
+    def take(self, smaller: Field) -> None:
+        """Takes over all of it, and refines it to the finest size at once: the coarse sizes have done their work."""
+        assert isinstance(smaller, TensoRFField)  # of the same kind, as said
+        # Densities are a plain sum. New components of the colour stay unheard as long as their weights are zero.
+        self.density_volume.take(smaller.density_volume, silent=True)
+        self.colour_volume.take(smaller.colour_volume, silent=False)
+        for volume in (self.density_volume, self.colour_volume):
+            if volume.cells < self.resolutions[-1]:
+                volume.resize(self.resolutions[-1])
+        has, had = (volume.lines.shape[2] for volume in (self.colour_volume, smaller.colour_volume))
+        products = [mode * has + one for mode in range(3) for one in range(had)]
+        columns = torch.tensor([*products, *range(3 * has, 3 * has + 16)])
+        widen_all(self.colour_net, smaller.colour_net, columns)
 
     def grow(self, progress: float) -> list[torch.nn.Parameter]:
         """Refines planes and lines where `progress` asks for more than they have; they never shrink."""

@@ -33,6 +33,11 @@ CHUNK = 1 << 16
 """Vertices interpolated together when growing: bounds the memory."""
 
 
+def stage_sizes(coarsest: int, finest: int, stages: int) -> list[int]:
+    """Cells along a side at each stage, growing geometrically."""
+    return [round(coarsest * (finest / coarsest) ** (i / max(stages - 1, 1))) for i in range(stages)]
+
+
 class VoxelField(Field):
     """Vertices of a cubic grid over the bounds, each with a log-density, a colour, and what the direction adds to it.
 
@@ -86,7 +91,7 @@ class VoxelField(Field):
         if not smoothness >= 0:
             raise InputError("model.smoothness", "", str(smoothness), "at least 0")
         intervals = max(stages - 1, 1)
-        self.resolutions = [round(coarsest * (finest / coarsest) ** (i / intervals)) for i in range(stages)]
+        self.resolutions = stage_sizes(coarsest, finest, stages)
         # Early stages are short: a coarse grid learns what it can in a few steps a vertex.
         self.times = [grown * (i / intervals) ** 2 for i in range(stages)]
         self.grown_after = self.times[-1]
@@ -161,6 +166,20 @@ class VoxelField(Field):
         self.index = torch.where(keep, keep.cumsum(0), 0).int()
         self.find_vertices()
         self.seen = torch.zeros(len(self.vertex), dtype=torch.int32, device=keep.device)
+
+    @torch.no_grad()
+    def take(self, smaller: Field) -> None:
+        """Takes over all of it; from there it grows to its finest size in the usual stages."""
+        assert isinstance(smaller, VoxelField)  # of the same kind, as said
+        cells = round(len(smaller.index) ** (1 / 3)) - 1
+        if cells > self.resolutions[-1]:
+            return
+        self.resolutions = stage_sizes(cells, self.resolutions[-1], len(self.resolutions))
+        views = smaller.views.view(len(smaller.views), 3, smaller.terms)[..., : self.terms]
+        wider = views.new_zeros(len(views), 3, self.terms)
+        wider[..., : views.shape[2]] = views
+        density = smaller.log_density * (smaller.density_rate / self.density_rate)
+        self.hold(smaller.index > 0, [density, smaller.colours.detach(), wider.flatten(1)])
 
     @torch.no_grad()
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:

@@ -77,6 +77,10 @@ class Sampler(InBounds):
             RuntimeError, KeyError: where that was one of another size or kind.
         """
 
+    def take(self, other: "Sampler") -> None:
+        """Goes on from what another sampler of its kind and size has found out."""
+        self.load_state_dict(other.state_dict())
+
     def look_through(self, cameras: Cameras) -> None:
         """Called before training with the cameras of the photos; samplers that leave out what none has in view do so here."""
 

@@ -41,6 +41,11 @@ class NeRF3D(System):
         self.sampler = sampler
         self.renderer = renderer
 
+    def take(self, smaller: System) -> None:
+        super().take(smaller)
+        assert isinstance(smaller, NeRF3D)  # its field was of this kind
+        self.sampler.take(smaller.sampler)
+
     def on_fit_start(self) -> None:
         self.sampler.look_through(self.trainer.datamodule.scene.train.cameras)  # type: ignore[attr-defined]
 

@@ -66,6 +66,11 @@ class System(L.LightningModule):
         """Factor on the learning rate beside the schedule's; the Guard callback lowers it where training broke down."""
         self.stats = StepStats(float("nan"), 0, 0)
 
+    def take(self, smaller: "System") -> None:
+        """Goes on from what a system with a smaller field of the same kind has learned."""
+        field: Any = self.field
+        field.take(smaller.field)
+
     def configure_optimizers(self) -> torch.optim.Optimizer:
         optimizer = self.make_optimizer(self.parameters())
         for group in optimizer.param_groups:

@@ -1,0 +1,125 @@
+"""Larger fields that take up what smaller ones have learned: the same function, and then more of it."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.model import (
+    Field,
+    HashGrid2DField,
+    HashGridField,
+    MLPField,
+    PictureField,
+    PictureMLP,
+    TensoRFField,
+    VoxelField,
+)
+
+BOX = Bounds(torch.tensor([[-1.0, -0.5, 0.2], [1.5, 2.0, 1.0]]))
+
+
+def hashgrid(entries: int = 6, width: int = 8, **options: int) -> Field:
+    field = HashGridField(BOX, levels=3, log2_entries=entries, coarsest=3, finest=12, width=width, **options)
+    torch.nn.init.normal_(field.grid.tables)
+    return field
+
+
+def tensorf(components: int = 2, colours: int = 2, finest: int = 6, width: int = 8) -> Field:
+    return TensoRFField(BOX, components, colours, finest, finest, stages=1, width=width)
+
+
+def voxels(finest: int = 6, degree: int = 1, coarsest: int = 6) -> Field:
+    field = VoxelField(BOX, coarsest, finest, degree=degree)
+    for table in field.tables:
+        torch.nn.init.normal_(table)
+    return field
+
+
+def mlp(width: int = 8, depth: int = 2, skip: int | None = None) -> Field:
+    return MLPField(BOX, depth, width, skip, position_frequencies=3, direction_frequencies=2, density="exp")
+
+
+SAME = [
+    (hashgrid, {}, {"width": 16}),
+    (hashgrid, {}, {"entries": 9}),
+    (hashgrid, {}, {"entries": 13, "width": 12}),
+    (tensorf, {}, {"components": 4}),
+    (tensorf, {}, {"colours": 5}),
+    (tensorf, {}, {"finest": 12, "width": 16, "components": 3, "colours": 3}),
+    (voxels, {}, {"degree": 2}),
+    (voxels, {}, {"finest": 12}),
+    (mlp, {}, {"width": 24}),
+    (mlp, {}, {"depth": 4}),
+    (mlp, {"depth": 4, "skip": 2}, {"depth": 4, "skip": 2, "width": 16}),
+]
+
+
+@pytest.mark.parametrize(("make", "small", "large"), SAME)
+def test_it_is_the_same_function_and_learns_with_all_it_has(make: Callable[..., Field], small: dict, large: dict):
+    smaller, larger = make(**small), make(**large)
+    positions = BOX.to_world(torch.rand(60, 3))
+    directions = normalize(torch.randn(60, 3), dim=1)
+    wanted = smaller(positions, directions)
+    assert (larger(positions, directions)[1] - wanted[1]).abs().max() > 1e-3, "it was another one"
+    larger.take(smaller)
+    for found, was in zip(larger(positions, directions), wanted, strict=True):
+        torch.testing.assert_close(found, was, rtol=1e-4, atol=1e-5)
+    optimizer = torch.optim.Adam(larger.parameters(), lr=1e-2)
+    before = [parameter.detach().clone() for parameter in larger.parameters()]
+    for _ in range(3):
+        optimizer.zero_grad()
+        density, rgb = larger(positions, directions)
+        (density.square().mean() + rgb.square().mean()).backward()
+        optimizer.step()
+    for (name, parameter), old in zip(larger.named_parameters(), before, strict=True):
+        moved = (parameter.detach() - old).abs().flatten(1 if parameter.ndim > 1 and "net" in name else 0).amax(-1)
+        assert (moved > 0).any(), name
+        if "net" in name or "trunk" in name:
+            assert (moved > 0).float().mean() > 0.5, f"{name}: new neurons learn too"
+
+
+def test_voxels_go_on_growing_from_the_size_they_took():
+    smaller, larger = voxels(finest=6), voxels(coarsest=4, finest=12)
+    larger.take(smaller)
+    assert isinstance(larger, VoxelField)
+    assert larger.resolutions[0] == 6 and larger.resolutions[-1] == 12
+    larger.grow(1.0)
+    assert len(larger.index) == 13**3
+
+
+def hashgrid2d(levels: int = 2, finest: int = 8, width: int = 8) -> PictureField:
+    field = HashGrid2DField((32, 24), levels=levels, log2_entries=10, coarsest=4, finest=finest, width=width)
+    torch.nn.init.normal_(field.tables)
+    return field
+
+
+def picture_mlp(frequencies: int = 2, width: int = 8) -> PictureField:
+    return PictureMLP((32, 24), frequencies, width, depth=2)
+
+
+@pytest.mark.parametrize(
+    ("make", "large"),
+    [
+        (hashgrid2d, {"levels": 3, "finest": 16}),
+        (hashgrid2d, {"width": 16}),
+        (picture_mlp, {"frequencies": 4}),
+        (picture_mlp, {"width": 20, "frequencies": 3}),
+    ],
+)
+def test_pictures_are_the_same_too(make: Callable[..., PictureField], large: dict):
+    smaller, larger = make(), make(**large)
+    uv = torch.rand(50, 2)
+    larger.take(smaller)
+    torch.testing.assert_close(larger(uv), smaller(uv), rtol=1e-4, atol=1e-5)
+
+
+def test_what_does_not_fit_starts_anew():
+    """A level that is missing, other encodings: nothing is half taken over in a network."""
+    larger, smaller = hashgrid(), HashGridField(BOX, levels=2, log2_entries=6, coarsest=5, finest=7, width=8)
+    before = larger.density_net[0].weight.detach().clone()
+    larger.take(smaller)
+    assert torch.equal(larger.density_net[0].weight, before)
+    assert Field(BOX).take(Field(BOX)) is None
