@@ -53,8 +53,7 @@ def squares(outcomes: Sequence[Outcome]) -> list[Square]:
         for method in methods:
             seeds = tuple(one for one in outcomes if (one.condition, one.method) == (condition.name, method))
             if seeds:
-                clean = _clean(outcomes, method)
-                failed = tuple(one for one in seeds if not passes(one, condition, clean))
+                failed = tuple(one for one in seeds if not passes(one, condition, _clean(outcomes, method, one.seed)))
                 found.append(Square(condition, method, seeds, failed))
     return found
 
@@ -99,8 +98,10 @@ def rescues(outcomes: Sequence[Outcome]) -> list[Rescue]:
     return found
 
 
-def _clean(outcomes: Sequence[Outcome], method: str) -> float | None:
-    return _undisturbed(outcomes, CLEAN, method)
+def _clean(outcomes: Sequence[Outcome], method: str, seed: int | None = None) -> float | None:
+    """dB of the clean run of a seed, as seeds differ among themselves; the median of all where that is not there."""
+    alike = [one for one in outcomes if one.seed == seed]
+    return _undisturbed(alike, CLEAN, method) or _undisturbed(outcomes, CLEAN, method)
 
 
 def _undisturbed(outcomes: Sequence[Outcome], conditions: Sequence[str], method: str) -> float | None:

@@ -169,3 +169,11 @@ def test_controls_and_what_the_guard_makes_of_them():
 def test_unknown_names_are_told(suite: str, methods: list[str] | None, words: str, tmp_path: Path):
     with pytest.raises(InputError, match=words):
         stability(suite, methods, 1, 10, 1, str(tmp_path))
+
+
+def test_a_seed_is_held_against_its_own_clean_run():
+    """Seeds differ among themselves: a low one is no failure where the same seed is as low without the condition."""
+    clean = [replace(GOOD, seed=seed, psnr=psnr) for seed, psnr in enumerate((30.0, 27.0, 30.0))]
+    scaled = [replace(one, condition="world x10") for one in clean]
+    assert [len(square.failed) for square in squares([*clean, *scaled])] == [0, 0]
+    assert [len(square.failed) for square in squares([*clean, *scaled[:2], replace(scaled[2], psnr=28.5)])] == [0, 1]
