@@ -5,7 +5,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
@@ -30,6 +30,23 @@ def conf_dir() -> Path:
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
+def by_path(arguments: Sequence[str], folder: Path) -> list[str]:
+    """A command line whose +experiment=PATH.yaml Hydra finds: as a name relative to its own experiments.
+
+    Args:
+        arguments: of the command line.
+        folder: where conf/ is.
+    """
+    found = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        path = Path(value).expanduser()
+        if key == "+experiment" and path.suffix == ".yaml" and path.is_file():
+            argument = f"{key}={os.path.relpath(path.with_suffix(''), folder / 'experiment')}"
+        found.append(argument)
+    return found
+
+
 def run(config: str, task: Callable[[DictConfig], object]) -> None:
     """Composes `conf/<config>.yaml` with the command line and calls `task`; exits with 2 on bad input.
 
@@ -37,6 +54,7 @@ def run(config: str, task: Callable[[DictConfig], object]) -> None:
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
 
+    sys.argv[1:] = by_path(sys.argv[1:], conf_dir())
     started = False
 
     @functools.wraps(task)

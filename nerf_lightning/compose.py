@@ -9,10 +9,10 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from nerf_lightning import cli
 
 
-def composed(overrides: list[str], folder: Path) -> DictConfig:
-    """The configuration a command line would give, with `folder` as the run's."""
+def composed(overrides: list[str], folder: Path, config: str = "config") -> DictConfig:
+    """The configuration a command line would give to the verb of that primary config, with `folder` as the run's."""
     with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
-        cfg = compose("config", overrides, return_hydra_config=True)
+        cfg = compose(config, overrides, return_hydra_config=True)
     with open_dict(cfg):
         cfg.hydra.runtime.output_dir = str(folder)
     HydraConfig.instance().set_config(cfg)

@@ -35,17 +35,18 @@ log = logging.getLogger(__name__)
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
-def train(cfg: DictConfig, checkpoint: Path | None = None) -> float:
+def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None = None) -> float:
     """Builds, fits, tests, writes. Returns the held-out PSNR in dB.
 
     Args:
         cfg: the configuration; with `resume`, that of the run resumed takes its place.
         checkpoint: state of a run with the same configuration, to go on from.
+        folder: where to write; None takes the one that Hydra made.
 
     Raises:
         InputError: on bad input, most of it before anything is written into the run's folder.
     """
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    folder = folder or Path(HydraConfig.get().runtime.output_dir)
     if cfg.resume is not None:
         cfg, checkpoint = resume(cfg, folder)
     quiet()

@@ -115,7 +115,7 @@ def decode(content: bytes, path: Path | str) -> RunFolder:
         tensors = {key: _decoded(key, arrays, one["code"], one["shape"]) for key, one in header["arrays"].items()}
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         raise InputError(path, "", f"{type(error).__name__}: {error}", expected) from error
     cfg = OmegaConf.create(check_config(config, path))
     system = build_system(cfg, frame)

@@ -1,45 +1,62 @@
 """Where the light of some cameras ends up: all that a scene seen from around them can show."""
 
-from collections.abc import Iterable
+import math
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerf_lightning.cameras import Rays
+from nerf_lightning.cameras import Cameras
 from nerf_lightning.model.pruning import widened
 from nerf_lightning.sampler import OccupancySampler
-from nerf_lightning.system import NeRF3D
+from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.system.nerf3d import RENDER_RAYS
 
 NOTHING = 1e-3
 """Opacity of a step below which there is nothing in it."""
+FINEST = 8
+"""Most rays along a pixel's side."""
+
+Cells = Bool[Tensor, "G G G"]
+"""A mask over the cells of a sampler's grid."""
+
+
+def occupied_cells(system: System) -> Cells | None:
+    """Cells in which the sampler looks for something; None for a sampler without a grid."""
+    if not isinstance(system, NeRF3D) or not isinstance(system.sampler, OccupancySampler):
+        return None
+    return system.sampler.occupied.view(*[system.sampler.resolution] * 3)
 
 
 @torch.no_grad()
-def reached_cells(system: NeRF3D, views: Iterable[Rays]) -> Bool[Tensor, "G G G"] | None:
-    """Cells of the sampler's grid in which light along rays meets anything, and their neighbours.
+def seen_cells(system: System, cameras: Cameras) -> Cells | None:
+    """Of the occupied cells those in which light towards the cameras comes from anything, and their neighbours.
 
-    None for a sampler without such a grid.
+    Rays are as close to each other at the content as cells are.
     """
-    sampler = system.sampler
-    if not isinstance(sampler, OccupancySampler):
+    occupied = occupied_cells(system)
+    if occupied is None:
         return None
-    n = sampler.resolution
-    reached = torch.zeros(n**3, dtype=torch.bool, device=system.device)
-    for rays in views:
+    assert isinstance(system, NeRF3D)  # as it has cells
+    bounds, n = system.sampler.bounds, len(occupied)
+    cell = 2 * float(bounds.half_size.max()) / n
+    times = min(FINEST, math.ceil(cameras.pixel_width(bounds.centre.cpu()) / cell))
+    fine = cameras.resized(times * cameras.width, times * cameras.height)
+    seen = torch.zeros(n**3, dtype=torch.bool, device=system.device)
+    for view in range(len(fine)):
+        rays = fine.view_rays(view)
         for start in range(0, len(rays), RENDER_RAYS):
             chunk = rays[start : start + RENDER_RAYS].to(system.device)
-            samples = sampler(chunk, system.field.density)
+            samples = system.sampler(chunk, system.field.density)
             positions = samples.positions(chunk)
-            cells = (sampler.bounds.to_unit(positions) * n).long().clamp(0, n - 1)
             opacity = 1 - torch.exp(-system.field.density(positions) * samples.dt)
-            x, y, z = cells[opacity > NOTHING].unbind(1)
-            reached[(x * n + y) * n + z] = True
-    return widened(reached.view(n, n, n)) & sampler.occupied.view(n, n, n)
+            x, y, z = (bounds.to_unit(positions[opacity > NOTHING]) * n).long().clamp(0, n - 1).unbind(1)
+            seen[(x * n + y) * n + z] = True
+    return widened(seen.view(n, n, n)) & occupied
 
 
-def confine(system: NeRF3D, reached: Bool[Tensor, "G G G"]) -> None:
-    """Leaves a system only what the reached cells need."""
-    system.field.prune(reached)
-    system.sampler.unpack({"occupied": reached.flatten()})
+def confine(system: System, cells: Cells) -> None:
+    """Leaves a system only what some cells need."""
+    assert isinstance(system, NeRF3D)  # as it has cells
+    system.field.prune(cells)
+    system.sampler.unpack({"occupied": cells.flatten()})

@@ -1,19 +1,22 @@
 """The smallest compact file of a run that still shows what the run shows."""
 
-from collections.abc import Iterator, Sequence
+import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
-from nerf_lightning.cameras import Rays
+import torch
+
+from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.evenly import evenly
 from nerf_lightning.export.compact import decode, encode
-from nerf_lightning.export.reach import confine, reached_cells
+from nerf_lightning.export.reach import Cells, confine, occupied_cells, seen_cells
 from nerf_lightning.progress import tracked
 from nerf_lightning.run_folder import scene_content
-from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.system import System
 
 MOST_VIEWS = 60
 """Training views whose light is followed to learn which cells matter."""
@@ -44,11 +47,19 @@ def held_out_psnr(system: System, data: RayDataModule | PixelDataModule, views: 
     return fmean(system.evaluate(data.held_out(view)).psnr for view in tracked(chosen, len(chosen), "held-out views"))
 
 
-def training_rays(data: RayDataModule) -> Iterator[Rays]:
-    """The rays of training views, spread over all."""
+def some_cameras(data: RayDataModule, most: int = MOST_VIEWS) -> Cameras:
+    """Those of training views spread over all."""
     cameras = data.scene.train.cameras
-    for view in evenly(len(cameras), MOST_VIEWS):
-        yield cameras.view_rays(view)
+    return cameras[torch.tensor(evenly(len(cameras), most))]
+
+
+def confined_to(system: System, cells: Cells | None) -> System:
+    """A copy of a system with only what some cells need; the system itself for None."""
+    if cells is None:
+        return system
+    part = copy.deepcopy(system)
+    confine(part, cells)
+    return part
 
 
 def smallest(
@@ -59,10 +70,10 @@ def smallest(
     precision: str | None = None,
     views: Sequence[int] | None = None,
 ) -> Compact:
-    """Confines a system to what its photos' cameras see, and codes it in the fewest bytes that lose no more than allowed.
+    """Codes a system in the fewest bytes that lose no more than allowed: what its photos' cameras see, or all there is.
 
     Args:
-        system: trained. It is left confined.
+        system: trained.
         data: of its run.
         config: of its run, as plain values.
         most_loss: dB on held-out views.
@@ -73,18 +84,17 @@ def smallest(
         InputError: where every precision asked for loses more.
     """
     before = held_out_psnr(system, data, views)
-    if isinstance(system, NeRF3D) and isinstance(data, RayDataModule):
-        reached = reached_cells(system, training_rays(data))
-        if reached is not None:
-            confine(system, reached)
+    seen = seen_cells(system, some_cameras(data)) if isinstance(data, RayDataModule) else None
+    confined = [confined_to(system, cells) for cells in ([None] if seen is None else [seen, occupied_cells(system)])]
     scene = scene_content(data)
     tried: list[Compact] = []
     for one in PRECISIONS if precision is None else (precision,):
-        content = encode(system, one, config, scene)
-        small = decode(content, "compact").system.to(system.device)
-        tried.append(Compact(content, one, held_out_psnr(small, data, views), before))
-        if tried[-1].loss <= most_loss:
-            return tried[-1]
+        for part in confined:  # few photos do not see all that held-out views do
+            content = encode(part, one, config, scene)
+            small = decode(content, "compact").system.to(system.device)
+            tried.append(Compact(content, one, held_out_psnr(small, data, views), before))
+            if tried[-1].loss <= most_loss:
+                return tried[-1]
     best = min(tried, key=lambda compact: compact.loss)
     found = f"{best.loss:.2f} dB lost with precision={best.precision}"
     advice = f"allow it with loss={best.loss + 0.005:.2f}" + (", or precision=half" if precision == "byte" else "")

@@ -1,0 +1,109 @@
+"""When to stop climbing, and which rung is enough: decisions on figures alone."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from nerf_lightning.errors import InputError
+
+SHARE = 3.0
+"""A rung is worth climbing to where it gains a `SHARE`th of what the choice may be below the best, for twice the bytes."""
+IDLE = 2
+"""Rungs in a row that are not worth it, after which climbing stops: one may be chance."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is good enough: a figure, or a distance from the best that can be reached. Exactly one of the two."""
+
+    psnr: float | None = None
+    within_db: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.psnr is None) == (self.within_db is None):
+            raise InputError("config", "target", f"psnr={self.psnr} and within_db={self.within_db}", "one of the two")
+        if self.within_db is not None and not self.within_db >= 0:
+            raise InputError("config", "target.within_db", str(self.within_db), "at least 0")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a rung came to."""
+
+    psnr: float
+    """dB held out."""
+    size: int
+    """Bytes of the compact file."""
+
+
+def worth(before: Measured, after: Measured, slack: float, noise: float) -> bool:
+    """Whether the step from one rung to the next gains enough for its bytes, and more than chance.
+
+    Args:
+        slack: dB that the choice may be below the best.
+        noise: dB by which seeds differ.
+    """
+    doublings = max(math.log2(after.size / before.size), 1.0)
+    return after.psnr - before.psnr > max(noise, slack / SHARE * doublings)
+
+
+def climbed_enough(rungs: Sequence[Measured], target: Target, noise: float) -> str:
+    """Why there is no point in climbing further; "" where there is one."""
+    if target.psnr is not None:
+        return "the target is reached" if rungs[-1].psnr >= target.psnr else ""
+    assert target.within_db is not None  # exactly one of the two
+    if len(rungs) <= IDLE:
+        return ""
+    # The best before counts, not the last: two rungs that fall and rise again have gained nothing.
+    base = max(rungs[:-IDLE], key=lambda one: one.psnr)
+    if any(worth(base, one, target.within_db, noise) for one in rungs[-IDLE:]):
+        return ""
+    return f"the last {IDLE} rungs gained less than they cost"
+
+
+def candidate(rungs: Sequence[Measured], target: Target) -> int:
+    """The smallest rung that seems good enough; the best one where none does."""
+    best = max(one.psnr for one in rungs)
+    enough = target.psnr if target.psnr is not None else best - (target.within_db or 0.0)
+    return next((index for index, one in enumerate(rungs) if one.psnr >= enough), best_of(rungs))
+
+
+def best_of(rungs: Sequence[Measured]) -> int:
+    """The rung with the highest PSNR, the smallest of equals."""
+    return max(range(len(rungs)), key=lambda index: rungs[index].psnr)
+
+
+def next_to_train(tried: dict[int, float], first: int, best: int, last: int, target: Target, most: int) -> int | None:
+    """Which rung to train in full next, to be sure of the choice; None where it is sure, or `most` are trained.
+
+    Args:
+        tried: dB by rung of those trained in full.
+        first: the candidate.
+        best: the best rung climbed to.
+        last: the highest rung there is.
+        target: see `Target`.
+        most: trainings there may be.
+    """
+    if first not in tried:
+        return first
+    if len(tried) >= most:
+        return None
+    if target.psnr is None:
+        wanted = [best, *range(first + 1, best)]
+        return (
+            next((rung for rung in wanted if rung not in tried), None) if chosen(tried, best, target) != first else None
+        )
+    met = [rung for rung, psnr in tried.items() if psnr >= target.psnr]
+    following = min(met) - 1 if met else max(tried) + 1
+    return following if 0 <= following <= last and following not in tried else None
+
+
+def chosen(tried: dict[int, float], best: int, target: Target) -> int | None:
+    """The smallest rung that full trainings have shown to be good enough; None where none was."""
+    if target.psnr is not None:
+        enough = target.psnr
+    elif best not in tried:
+        return None
+    else:
+        enough = max(tried.values()) - (target.within_db or 0.0)
+    return min((rung for rung, psnr in tried.items() if psnr >= enough), default=None)

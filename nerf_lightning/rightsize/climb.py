@@ -1,0 +1,179 @@
+"""Climbing a ladder: one training that starts small and grows, keeping what was learned."""
+
+import copy
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from nerf_lightning.build import build_system, build_trainer, frame_of, resolved
+from nerf_lightning.callbacks import Budget
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.evenly import evenly
+from nerf_lightning.export.compact import encode
+from nerf_lightning.export.reach import seen_cells
+from nerf_lightning.export.smallest import confined_to, some_cameras
+from nerf_lightning.rightsize.choose import Measured
+from nerf_lightning.rightsize.ladder import Options
+from nerf_lightning.run_folder import plain_config, scene_content
+from nerf_lightning.seeding import step_generator
+from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.training import prepare_process, warm_up
+
+Data = RayDataModule | PixelDataModule
+SEARCH = 0.75
+"""Share of the budget that climbing the whole ladder takes."""
+VIEWS = 8
+"""Held-out views that a rung is judged by, and training views that say what its file must hold."""
+EXTRA_SEEDS = 2
+"""Further trainings of the smallest rung, from which the spread over seeds is told."""
+AS_GOOD = 0.05
+"""dB by which a sampler may be worse than the best, of one and the same field."""
+LOOKS = 4
+"""Looks at every cell that a sampler needs to know a field."""
+BARE = ("guard",)
+"""Callbacks of a rung's training."""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A rung that was climbed to."""
+
+    options: Options
+    system: System
+    parameters: int
+    measured: Measured
+    seconds: float
+    """Of training on this rung."""
+
+
+def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
+    """A copy of a configuration with other options in a group.
+
+    Raises:
+        omegaconf errors are told by `build`: options that the group's target does not know.
+    """
+    changed = copy.deepcopy(cfg)
+    for key, value in options.items():
+        OmegaConf.update(changed, f"{group}.{key}", value, force_add=True)
+    return changed
+
+
+def share_of_budget(cfg: DictConfig, share: float) -> DictConfig:
+    """A configuration with a part of its budget, however it was given."""
+    budget = resolved(cfg.budget)
+    limits = budget["default"] if all(budget[key] is None for key in budget["default"]) else budget
+    changed = copy.deepcopy(cfg)
+    for key, round_up in (("steps", True), ("seconds", False)):
+        limit = limits.get(key)
+        value = None if limit is None else max(1, round(limit * share)) if round_up else limit * share
+        OmegaConf.update(changed, f"budget.{key}", value)
+    OmegaConf.update(changed, "budget.patience", None)
+    return changed
+
+
+def bare(cfg: DictConfig) -> DictConfig:
+    """A configuration without what makes pictures, files and curves."""
+    changed = copy.deepcopy(cfg)
+    kept: dict[str, Any] = {name: node for name, node in resolved(cfg.callbacks).items() if name in BARE}
+    OmegaConf.update(changed, "callbacks", kept, merge=False)
+    OmegaConf.update(changed, "logger", None)
+    return changed
+
+
+def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = None) -> tuple[System, float]:
+    """Trains a system, from what a smaller one has learned.
+
+    Returns:
+        The system, and the seconds it took.
+    """
+    prepare_process(cfg.seed, cfg.threads, cfg.kernels)
+    if isinstance(data, RayDataModule):
+        data.rays = data.first_rays
+    system = build_system(cfg, frame_of(data))
+    if start is not None:
+        system.take(start)
+    trainer = build_trainer(cfg, folder)
+    warm_up(system, data)
+    trainer.fit(system, data)
+    return system.eval(), Budget.of(trainer).seconds
+
+
+def quality(system: System, data: Data) -> float:
+    """Mean dB over a few held-out views."""
+    views = evenly(data.held_out_views, VIEWS)
+    return fmean(system.evaluate(data.held_out(view)).psnr for view in views)
+
+
+def compact_bytes(cfg: DictConfig, system: System, data: Data) -> int:
+    """Size of the compact file of a system, about: as few views tell what it must hold."""
+    seen = seen_cells(system, some_cameras(data, VIEWS)) if isinstance(data, RayDataModule) else None
+    part = confined_to(system, seen)
+    return len(encode(part, "byte", plain_config(cfg), scene_content(data)))
+
+
+def climb(cfg: DictConfig, data: Data, rungs: list[Options], folder: Path) -> Iterator[Rung]:
+    """Trains the smallest rung, then goes on with each next larger one, for equal shares of the budget."""
+    start: System | None = None
+    part = bare(share_of_budget(cfg, SEARCH / len(rungs)))
+    for options in rungs:
+        with_options = set_options(part, "model", options)
+        system, seconds = trained(with_options, data, folder, start)
+        parameters = sum(p.numel() for p in system.parameters() if p.requires_grad)
+        measured = Measured(quality(system, data), compact_bytes(with_options, system, data))
+        yield Rung(options, system, parameters, measured, seconds)
+        start = system
+
+
+def spread(cfg: DictConfig, data: Data, rungs: list[Options], first: Rung, folder: Path) -> tuple[float, float]:
+    """How far seeds differ: the standard deviation, dB, of the smallest rung over a few of them.
+
+    Returns:
+        It, and the seconds of training it took.
+    """
+    part = set_options(bare(share_of_budget(cfg, SEARCH / len(rungs))), "model", first.options)
+    found, spent = [first.measured.psnr], 0.0
+    for extra in range(1, EXTRA_SEEDS + 1):
+        another = copy.deepcopy(part)
+        another.seed = cfg.seed + extra
+        system, seconds = trained(another, data, folder)
+        found.append(quality(system, data))
+        spent += seconds
+    return stdev(found), spent
+
+
+def settle(system: NeRF3D) -> None:
+    """Lets a new sampler find out where the field is dense."""
+    for look in range(LOOKS):
+        step = look * getattr(system.sampler, "update_every", 1)
+        system.sampler.update(step, system.field.density, step_generator(system.seed, 4, look))
+
+
+def coarsest_sampler(
+    cfg: DictConfig, data: Data, system: System, samplers: list[Options], told: Callable[[str], None]
+) -> Options:
+    """The coarsest of some samplers with which a trained field looks as good as with the finest.
+
+    Args:
+        cfg: with whose sampler the field was trained.
+        data: to judge by.
+        system: the field.
+        samplers: options, coarsest first.
+        told: gets a line for each.
+    """
+    if not samplers or not isinstance(system, NeRF3D) or not isinstance(data, RayDataModule):
+        return {}
+    scores = []
+    for options in samplers:
+        probe = build_system(set_options(cfg, "sampler", options), frame_of(data))
+        assert isinstance(probe, NeRF3D)  # of the same data
+        probe.field = system.field
+        probe.sampler.look_through(data.scene.train.cameras)
+        settle(probe)
+        scores.append(quality(probe.eval(), data))
+        told(f"sampler {options}: {scores[-1]:.2f} dB")
+    enough = max(scores) - AS_GOOD
+    return next(options for options, score in zip(samplers, scores, strict=True) if score >= enough)

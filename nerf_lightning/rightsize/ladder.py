@@ -1,0 +1,57 @@
+"""Ladders: the sizes a kind of field comes in, smallest first. Configuration, read from YAML."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from nerf_lightning.errors import InputError
+
+Options = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """What there is to choose from."""
+
+    rungs: list[Options]
+    """Options of the model, smallest first."""
+    samplers: list[Options]
+    """Options of the sampler, coarsest first; none for pictures."""
+
+
+def read_ladder(name: str, folder: Path) -> Ladder:
+    """Reads a ladder.
+
+    Args:
+        name: one of those in the folder, or a YAML file of one's own.
+        folder: where the shipped ones are.
+
+    Raises:
+        InputError: where there is none of that name, or it holds something else.
+    """
+    own = name.endswith((".yaml", ".yml"))
+    path = Path(name).expanduser() if own else folder / f"{name}.yaml"
+    try:
+        plain = yaml.safe_load(path.read_text())
+    except FileNotFoundError as error:
+        known = ", ".join(sorted(one.stem for one in folder.glob("*.yaml")))
+        raise InputError("config", "ladder", repr(name), f"one of {known}, or a YAML file with `rungs`") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(path, "", str(error), "a ladder in YAML") from error
+    if not isinstance(plain, dict) or not _options(plain.get("rungs")) or len(plain["rungs"]) < 2:
+        raise InputError(path, "rungs", "something else", "a list of two or more mappings of model options")
+    samplers = plain.get("samplers", [])
+    if not _options(samplers):
+        raise InputError(path, "samplers", "something else", "a list of mappings of sampler options")
+    return Ladder(plain["rungs"], samplers)
+
+
+def _options(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(one, dict) for one in value)
+
+
+def overrides(group: str, options: Options) -> list[str]:
+    """Options as a command line would give them."""
+    return [f"{group}.{key}={'null' if value is None else value}" for key, value in options.items()]

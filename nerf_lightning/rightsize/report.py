@@ -1,0 +1,146 @@
+"""What a search leaves: rightsize.json, chart.png, and best.yaml, an experiment of its own."""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from matplotlib.figure import Figure
+from omegaconf import DictConfig
+
+from nerf_lightning.callbacks.panels import write_png
+from nerf_lightning.files import atomic, write_json
+from nerf_lightning.ink import BLUE, DPI, GREY, ORANGE, VERMILLION, pixels_of
+from nerf_lightning.rightsize.climb import Rung, set_options
+from nerf_lightning.rightsize.ladder import overrides
+from nerf_lightning.rightsize.search import Found, Full, figures
+from nerf_lightning.run_folder import plain_config
+
+CHOSEN_FROM = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "callbacks", "logger", "trainer")
+"""Groups whose option best.yaml names ..."""
+WRITTEN = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule")
+"""... and those whose values it holds."""
+
+
+def write_report(found: Found, cfg: DictConfig, choices: dict[str, Any], output: Path) -> None:
+    """Writes all files, and says what was found.
+
+    Args:
+        found: by the search.
+        cfg: the run's configuration, before options of a rung.
+        choices: which option of each Hydra group was taken.
+        output: the folder.
+    """
+    write_json(output / "rightsize.json", as_json(found))
+    write_png(output / "chart.png", pixels_of(chart(found)))
+    with atomic(output / "best.yaml") as temporary:
+        temporary.write_text(experiment(found, cfg, choices))
+    one = found.full[found.choice]
+    print(found.reason)
+    print(
+        f"{output}/compact.npz: {figures(found.compact.psnr, len(found.compact.content))}; the search took"
+        f" {found.seconds:.0f} s of training, {found.seconds / one.seconds:.1f} times that of the choice"
+    )
+    print(
+        f"again: python -m nerf_lightning +experiment={output}/best.yaml; all rungs: {output}/chart.png, rightsize.json"
+    )
+
+
+def as_json(found: Found) -> dict[str, Any]:
+    """The search as plain values."""
+    rungs = []
+    for index, options in enumerate(found.ladder.rungs):
+        full = found.full.get(index)
+        grown = found.rungs[index] if index < len(found.rungs) else None
+        if grown is None and full is None:
+            break
+        rungs.append(
+            {
+                "overrides": overrides("model", options),
+                **(_of_full(full) if full is not None else {}),
+                **(_of_grown(grown) if grown is not None and full is None else {}),
+                "grown_psnr": None if grown is None else grown.measured.psnr,
+                "run": None if full is None else str(full.folder),
+            }
+        )
+    chosen = found.full[found.choice]
+    return {
+        "target": {"psnr": found.target.psnr, "within_db": found.target.within_db},
+        "reached": found.reached,
+        "reason": found.reason,
+        "noise_db": round(found.noise, 4),
+        "search_seconds": round(found.seconds, 3),
+        "wall_seconds": round(found.wall_seconds, 3),
+        "chosen": {
+            "rung": found.choice,
+            "overrides": [*overrides("model", found.ladder.rungs[found.choice]), *overrides("sampler", found.sampler)],
+            "artifact_bytes": len(found.compact.content),
+            "psnr": found.compact.psnr,
+            "train_seconds": chosen.seconds,
+            "run": str(chosen.folder),
+        },
+        "rungs": rungs,
+    }
+
+
+def _of_full(one: Full) -> dict[str, Any]:
+    return {"parameters": one.parameters, "artifact_bytes": one.size, "psnr": one.psnr, "train_seconds": one.seconds}
+
+
+def _of_grown(one: Rung) -> dict[str, Any]:
+    size, psnr = one.measured.size, one.measured.psnr
+    return {"parameters": one.parameters, "artifact_bytes": size, "psnr": psnr, "train_seconds": one.seconds}
+
+
+def experiment(found: Found, cfg: DictConfig, choices: dict[str, Any]) -> str:
+    """The choice as an experiment: all that sets it apart from the defaults."""
+    best = set_options(cfg, "model", found.ladder.rungs[found.choice])
+    plain = plain_config(set_options(best, "sampler", found.sampler) if found.sampler else best)
+    content: dict[str, Any] = {
+        "defaults": [{f"override /{group}": choices.get(group)} for group in CHOSEN_FROM],
+        "name": f"{plain['name']}_rightsized",
+    }
+    for group in WRITTEN:
+        if plain.get(group) is not None:
+            content[group] = {key: value for key, value in plain[group].items() if not key.startswith("_")}
+    content["budget"] = plain["budget"]
+    return f"# @package _global_\n# {found.reason}\n{yaml.safe_dump(content, sort_keys=False)}"
+
+
+def chart(found: Found) -> Figure:
+    """Bytes against PSNR: the climb, the full trainings, the target, and the choice."""
+    figure = Figure(figsize=(7.2, 4.6), dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    sizes = [rung.measured.size / 1000 for rung in found.rungs]
+    axes.plot(sizes, [rung.measured.psnr for rung in found.rungs], "o-", color=BLUE, mfc="white", label="while growing")
+    for index, size in enumerate(sizes):
+        axes.annotate(
+            str(index), (size, found.rungs[index].measured.psnr), (0, -13), textcoords="offset points", ha="center"
+        )
+    whole = found.full.values()
+    axes.plot(
+        [one.size / 1000 for one in whole],
+        [one.psnr for one in whole],
+        "s",
+        color=ORANGE,
+        ms=8,
+        label="trained in full",
+    )
+    chosen = found.full[found.choice]
+    axes.plot(
+        chosen.size / 1000,
+        chosen.psnr,
+        "o",
+        ms=19,
+        mfc="none",
+        mec=VERMILLION,
+        mew=2,
+        label=f"chosen: rung {found.choice}",
+    )
+    enough = found.target.psnr
+    if enough is None:
+        enough = max(one.psnr for one in whole) - (found.target.within_db or 0.0)
+    axes.axhline(enough, color=GREY, lw=1, ls="--", label=f"enough: {enough:.2f} dB")
+    axes.set(xscale="log", xlabel="compact file, kB", ylabel="held-out PSNR, dB", title="What each size is worth")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right")
+    return figure

@@ -1,0 +1,158 @@
+"""The whole search: climb, choose, confirm, and write down why."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from nerf_lightning.build import build_data
+from nerf_lightning.dataset import RayDataModule
+from nerf_lightning.dataset.plausible import check_scene
+from nerf_lightning.export.smallest import Compact, smallest
+from nerf_lightning.files import atomic
+from nerf_lightning.kernels import use_kernels
+from nerf_lightning.rightsize.choose import Target, best_of, candidate, chosen, climbed_enough, next_to_train
+from nerf_lightning.rightsize.climb import Rung, climb, coarsest_sampler, compact_bytes, set_options, spread
+from nerf_lightning.rightsize.ladder import Ladder, Options
+from nerf_lightning.run_folder import load_run, plain_config
+from nerf_lightning.runs import read_run
+from nerf_lightning.training import quiet, train
+
+MOST_FULL = 2
+"""Trainings in full: the candidate, and what it is held against."""
+COMPACT_LOSS = 0.1
+"""dB that the small file may lose."""
+
+
+@dataclass(frozen=True)
+class Full:
+    """A rung trained with the whole budget."""
+
+    folder: Path
+    psnr: float
+    """dB over all held-out views."""
+    seconds: float
+    size: int
+    """Bytes of its compact file."""
+    parameters: int
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search came to."""
+
+    target: Target
+    ladder: Ladder
+    rungs: Sequence[Rung]
+    full: dict[int, Full]
+    """By rung."""
+    choice: int
+    reached: bool
+    reason: str
+    noise: float
+    sampler: Options
+    seconds: float
+    """Of training, climbing and all."""
+    wall_seconds: float
+    compact: Compact
+
+
+def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Found:
+    """Finds the smallest rung that is good enough, and leaves it trained in full, with its compact file.
+
+    Raises:
+        InputError: where the data, or an option of the ladder, is no good.
+    """
+    began = time.perf_counter()
+    quiet()
+    use_kernels(cfg.kernels)
+    data = build_data(cfg)
+    for doubt in check_scene(data.scene) if isinstance(data, RayDataModule) else []:
+        print(f"{data.scene.name}: {doubt}", flush=True)
+    rungs: list[Rung] = []
+    noise = seconds = 0.0
+    why = "the ladder ends there"
+    for rung in climb(cfg, data, ladder.rungs, output):
+        rungs.append(rung)
+        seconds += rung.seconds
+        print(
+            f"rung {len(rungs) - 1}: {told(rung.options)}: {figures(rung.measured.psnr, rung.measured.size)}",
+            flush=True,
+        )
+        if len(rungs) == 1:
+            noise, spent = spread(cfg, data, ladder.rungs, rung, output)
+            seconds += spent
+            print(f"seeds differ by {noise:.2f} dB", flush=True)
+        stop = climbed_enough([one.measured for one in rungs], target, noise)
+        if stop:
+            why = stop
+            break
+    measured = [one.measured for one in rungs]
+    first, best = candidate(measured, target), best_of(measured)
+    print(f"climbed to rung {len(rungs) - 1}: {why}; rung {first} seems enough", flush=True)
+    model = set_options(cfg, "model", rungs[first].options)
+    sampler = coarsest_sampler(model, data, rungs[first].system, ladder.samplers, lambda line: print(line, flush=True))
+    full: dict[int, Full] = {}
+    while True:
+        tried = {index: one.psnr for index, one in full.items()}
+        following = next_to_train(tried, first, best, len(ladder.rungs) - 1, target, MOST_FULL)
+        if following is None:
+            break
+        print(f"rung {following} in full", flush=True)
+        full[following] = train_in_full(cfg, ladder.rungs[following], sampler, data, output / f"rung_{following}")
+        seconds += full[following].seconds
+    tried = {index: one.psnr for index, one in full.items()}
+    found = chosen(tried, best, target)
+    choice = found if found is not None else max(tried, key=lambda index: tried[index])
+    run = load_run(full[choice].folder)
+    compact = smallest(run.system, data, plain_config(run.cfg), COMPACT_LOSS)
+    with atomic(output / "compact.npz") as temporary:
+        temporary.write_bytes(compact.content)
+    reason = in_words(target, tried, choice, found is not None, why, noise)
+    wall = time.perf_counter() - began
+    return Found(target, ladder, rungs, full, choice, found is not None, reason, noise, sampler, seconds, wall, compact)
+
+
+def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Any, folder: Path) -> Full:
+    """A run of its own, with the whole budget."""
+    whole = (
+        set_options(set_options(cfg, "model", model), "sampler", sampler)
+        if sampler
+        else set_options(cfg, "model", model)
+    )
+    train(whole, folder=folder)
+    results = read_run(folder).results
+    run = load_run(folder)
+    size = compact_bytes(run.cfg, run.system, data)
+    return Full(folder, results["psnr"], results["train_seconds"], size, results["parameters"])
+
+
+def told(options: Options) -> str:
+    """Options in one line."""
+    return ", ".join(f"{key}={value}" for key, value in options.items())
+
+
+def figures(psnr: float, size: int) -> str:
+    """A rung's figures in one line."""
+    return f"{psnr:.2f} dB in {size / 1000:,.1f} kB"
+
+
+def in_words(target: Target, tried: dict[int, float], choice: int, reached: bool, why: str, noise: float) -> str:
+    """Why this rung."""
+    mine = f"rung {choice} reaches {tried[choice]:.2f} dB trained in full"
+    others = {index: psnr for index, psnr in tried.items() if index != choice}
+    if target.psnr is not None:
+        if not reached:
+            return f"{mine}, the most of those tried: the target of {target.psnr:g} dB was not reached"
+        smaller = [f"rung {index} only {psnr:.2f} dB" for index, psnr in others.items() if index < choice]
+        rest = "; ".join(smaller) or ("it is the smallest" if choice == 0 else "a smaller one was not tried in full")
+        return f"{mine}, the target is {target.psnr:g} dB; {rest}"
+    largest = [
+        f"rung {index}, the best while growing, {psnr:.2f} dB" for index, psnr in others.items() if index > choice
+    ]
+    smaller = [f"rung {index} only {psnr:.2f} dB" for index, psnr in others.items() if index < choice]
+    held = "; ".join([*largest, *smaller]) or "no larger one was better while growing"
+    return f"{mine}; {held}; {target.within_db:g} dB below the best are allowed, and seeds differ by {noise:.2f} dB ({why})"

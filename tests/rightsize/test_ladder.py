@@ -1,0 +1,83 @@
+"""Ladders are configuration, and what they hold fits the models."""
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf_lightning import cli
+from nerf_lightning.build import PictureFrame, SceneFrame, build_system
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.compose import composed
+from nerf_lightning.errors import InputError
+from nerf_lightning.rightsize.climb import set_options, share_of_budget
+from nerf_lightning.rightsize.ladder import overrides, read_ladder
+
+SHIPPED = cli.conf_dir() / "ladders"
+SCENE = SceneFrame(Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])), (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in SHIPPED.glob("*.yaml")))
+def test_every_rung_of_the_shipped_ladders_can_be_built_and_is_larger_than_the_last(name: str, tmp_path: Path):
+    ladder = read_ladder(name, SHIPPED)
+    flat = not ladder.samplers
+    given = ["+experiment=picture", f"model={name}"] if flat else [f"recipe={name}_medium"]
+    cfg = composed(given, tmp_path)
+    sizes = []
+    for options in ladder.rungs:
+        system = build_system(set_options(cfg, "model", options), PictureFrame(640, 480) if flat else SCENE)
+        system.field.grow(1.0) if hasattr(system.field, "grow") else None
+        sizes.append(sum(parameter.numel() for parameter in system.parameters()))
+    assert sizes == sorted(set(sizes))
+    for options in ladder.samplers:
+        build_system(set_options(cfg, "sampler", options), SCENE)
+
+
+def test_a_ladder_of_ones_own(tmp_path: Path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("rungs: [{width: 8}, {width: 16}]")
+    assert read_ladder(str(path), SHIPPED).rungs == [{"width": 8}, {"width": 16}]
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("[]", "rungs"),
+        ("rungs: [{width: 8}]", "rungs"),
+        ("rungs: [8, 9]", "rungs"),
+        ("rungs: [{}, {}]\nsamplers: 3", "samplers"),
+    ],
+)
+def test_something_else_is_told(text: str, key: str, tmp_path: Path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=f"mine.yaml: {key}: found something else"):
+        read_ladder(str(path), SHIPPED)
+
+
+@pytest.mark.parametrize("name", ["fourier", "no/such.yaml"])
+def test_an_unknown_ladder_is_told(name: str):
+    with pytest.raises(InputError, match="ladder: found .* expected one of .*tensorf"):
+        read_ladder(name, SHIPPED)
+
+
+def test_options_as_a_command_line_gives_them():
+    assert overrides("model", {"width": 8, "skip": None}) == ["model.width=8", "model.skip=null"]
+
+
+@pytest.mark.parametrize(
+    ("given", "steps", "seconds"),
+    [
+        ([], None, 45.0),
+        (["budget.seconds=10"], None, 5.0),
+        (["budget.steps=10"], 5, None),
+        (["budget.steps=10", "budget.seconds=8"], 5, 4),
+    ],
+)
+def test_a_share_of_the_budget(given: list[str], steps: int | None, seconds: float | None, tmp_path: Path):
+    cfg = composed(given, tmp_path)
+    before = copy.deepcopy(cfg)
+    part = share_of_budget(cfg, 0.5)
+    assert (part.budget.steps, part.budget.seconds) == (steps, seconds)
+    assert cfg == before

@@ -1,0 +1,127 @@
+"""The verb as a user meets it, on small scenes."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from nerf_lightning import cli
+from nerf_lightning.compose import composed
+from nerf_lightning.dataset import save_npz
+from nerf_lightning.export.compact import load_compact
+from nerf_lightning.rightsize.__main__ import task
+from nerf_lightning.stability.toys import PILE, toy
+
+RUNGS = [
+    {"density_components": 2, "colour_components": 2, "coarsest": 4, "finest": 4, "width": 8, "stages": 1},
+    {"density_components": 8, "colour_components": 8, "coarsest": 8, "finest": 16, "width": 16},
+    {"density_components": 8, "colour_components": 8, "coarsest": 8, "finest": 24, "width": 16},
+]
+
+
+@pytest.fixture
+def given(tmp_path: Path) -> list[str]:
+    save_npz(toy(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
+    ladder = {"rungs": RUNGS, "samplers": [{"samples": 32, "resolution": 8}, {"samples": 64, "resolution": 16}]}
+    (tmp_path / "ladder.yaml").write_text(yaml.safe_dump(ladder))
+    return [
+        "dataset=photos",
+        f"dataset.path={tmp_path}/scene.npz",
+        "recipe=tensorf_medium",
+        f"ladder={tmp_path}/ladder.yaml",
+        "budget.steps=120",
+        "threads=1",
+        "callbacks.orbit=null",
+        "callbacks.snapshots.steps=[]",
+        f"output={tmp_path}/found",
+    ]
+
+
+def search(given: list[str], folder: Path) -> dict:
+    task(composed(given, folder, "rightsize"))
+    return json.loads((folder / "found" / "rightsize.json").read_text())
+
+
+def test_a_search_leaves_the_smallest_that_is_enough(
+    given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    found = search([*given, "target.psnr=14"], tmp_path)
+    assert found["target"] == {"psnr": 14, "within_db": None} and found["reached"]
+    mine = found["rungs"][found["chosen"]["rung"]]
+    assert mine["psnr"] >= 14 and all(
+        rung["psnr"] < 14 for rung in found["rungs"][: found["chosen"]["rung"]] if rung["run"]
+    )
+    assert set(mine) >= {"overrides", "parameters", "artifact_bytes", "psnr", "train_seconds"}
+    path = tmp_path / "found"
+    assert (path / "compact.npz").stat().st_size == found["chosen"]["artifact_bytes"]
+    assert (path / "chart.png").stat().st_size > 5000
+    assert found["reason"] in capsys.readouterr().out
+    assert load_compact(path / "compact.npz").system.background == [0.0, 0.0, 0.0]
+
+
+def test_the_choice_is_an_experiment_by_its_path(given: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    found = search([*given, "target.within_db=100"], tmp_path)
+    assert found["chosen"]["rung"] == 0, "a hundred dB below the best is anything"
+    monkeypatch.chdir(tmp_path)
+    (argument,) = cli.by_path(["+experiment=found/best.yaml"], cli.conf_dir())
+    cfg = composed([argument], tmp_path)
+    assert {key: cfg.model[key] for key in RUNGS[0]} == RUNGS[0]
+    assert cfg.sampler.samples == 32 and cfg.dataset.path == f"{tmp_path}/scene.npz" and cfg.budget.steps == 120
+
+
+def test_other_arguments_stay_as_they_are(tmp_path: Path):
+    (tmp_path / "here.yaml").write_text("")
+    given = ["+experiment=lego", f"dataset.path={tmp_path}/here.yaml", f"+experiment={tmp_path}/missing.yaml", "-m"]
+    assert cli.by_path(given, cli.conf_dir()) == given
+
+
+def test_a_target_out_of_reach_is_told(given: list[str], tmp_path: Path):
+    found = search([*given, "target.psnr=90", "budget.steps=20"], tmp_path)
+    assert not found["reached"] and "was not reached" in found["reason"]
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["target.psnr=high"], r"target\.psnr: found 'high', expected a number or null"),
+        (["target.psnr=3", "target.within_db=1"], "one of the two"),
+        (["ladder=none_such"], "ladder: found 'none_such'"),
+        (["output=.."], "something in it already"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(
+    extra: list[str],
+    message: str,
+    given: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sub").mkdir()
+    monkeypatch.chdir(tmp_path / "sub")
+    monkeypatch.setattr(sys, "argv", ["rightsize", *given, *extra])
+    with pytest.raises(SystemExit) as stop:
+        cli.run("rightsize", task)
+    assert stop.value.code == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    import re
+
+    assert re.search(message, line)
+
+
+def test_a_picture_has_a_ladder_too(tmp_path: Path):
+    given = ["+experiment=picture", "model=picture_mlp", "dataset.max_side=32", "budget.steps=60", "threads=1"]
+    quiet = [
+        "callbacks.training_gif=null",
+        "callbacks.charts=null",
+        "callbacks.baselines=null",
+        "callbacks.snapshots.steps=[]",
+    ]
+    torch.manual_seed(0)
+    found = search([*given, *quiet, "target.psnr=8", f"output={tmp_path}/found"], tmp_path)
+    assert found["chosen"]["rung"] == 0 and found["reached"]
