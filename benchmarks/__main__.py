@@ -1,4 +1,4 @@
-"""python -m benchmarks: what methods, kernels, framework, capture and 2D fields cost on this machine, and how well they do."""
+"""python -m benchmarks: what methods, kernels, framework, capture, 2D fields and sizes cost here, and how well they do."""
 
 import argparse
 import os
@@ -10,10 +10,10 @@ from typing import Any
 import torch
 
 import nerf_lightning
-from benchmarks import capture, growth, kernels, methods, overhead, pictures
+from benchmarks import capture, growth, kernels, methods, overhead, pictures, sizes
 from nerf_lightning.files import write_json
 
-PARTS = ("methods", "kernels", "growth", "overhead", "capture", "pictures")
+PARTS = ("methods", "kernels", "growth", "overhead", "capture", "pictures", "sizes")
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -68,6 +68,8 @@ def main() -> None:
             tables = capture.measure(seeds, arguments.output)
         elif part == "pictures":
             tables = pictures.measure(overrides, seeds, arguments.output)
+        elif part == "sizes":
+            tables = sizes.measure(overrides, budgets[0], arguments.output)
         elif part == "methods":
             rows, report["runs"] = methods.measure(experiments, overrides, budgets, seeds, arguments.output)
             tables = {part: rows}

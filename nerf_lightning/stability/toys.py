@@ -67,32 +67,32 @@ class Block:
 Body = Ball | Block
 
 
-def pattern(points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """The colour of a surface: waves of three lengths, lit from one side."""
+def pattern(points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grain: float = 1.0) -> Float[Tensor, "N 3"]:
+    """The colour of a surface: waves of three lengths, lit from one side; the finer, the larger `grain`, and plain for 0."""
     waves = torch.tensor([[5.0, 2.0, 1.0], [-2.0, 6.0, 3.0], [1.0, -3.0, 7.0]])
-    colour = 0.5 + 0.35 * torch.sin(points @ waves.T + torch.tensor([0.0, 1.0, 2.0]))
+    colour = 0.5 + 0.35 * torch.sin(grain * points @ waves.T + torch.tensor([0.0, 1.0, 2.0]))
     light = (normals @ torch.tensor(LIGHT)).clamp_min(0)
     return colour * (0.45 + 0.55 * light[:, None])
 
 
-def trace(bodies: list[Body], rays: Rays) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"]]:
+def trace(bodies: list[Body], rays: Rays, grain: float = 1.0) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"]]:
     """Colour and coverage (0 or 1) along rays."""
     met = [body.meet(rays) for body in bodies]
     nearest, which = torch.stack([t for t, _ in met]).min(0)
     normals = torch.stack([normal for _, normal in met])[which, torch.arange(len(rays))]
     hit = nearest.isfinite()
     points = rays.origins + rays.directions * nearest.nan_to_num(posinf=0)[:, None]
-    return torch.where(hit[:, None], pattern(points, normals), 0.0), hit.to(torch.float32)
+    return torch.where(hit[:, None], pattern(points, normals, grain), 0.0), hit.to(torch.float32)
 
 
 def photograph(
-    bodies: list[Body], cameras: Cameras, background: tuple[float, float, float] | None
+    bodies: list[Body], cameras: Cameras, background: tuple[float, float, float] | None, grain: float = 1.0
 ) -> UInt8[Tensor, "V H W C"]:
     """Pictures on a background, or with alpha where that is None."""
     fine = cameras.resized(FINER * cameras.width, FINER * cameras.height)
     pictures = []
     for view in range(len(cameras)):
-        colour, cover = trace(bodies, fine.view_rays(view))
+        colour, cover = trace(bodies, fine.view_rays(view), grain)
         layers = torch.cat([colour * cover[:, None], cover[:, None]], dim=1).view(fine.height, fine.width, 4)
         mean = layers.view(cameras.height, FINER, cameras.width, FINER, 4).mean((1, 3))
         premultiplied, alpha = mean[..., :3], mean[..., 3:]
@@ -134,6 +134,7 @@ def toy(
     size: int = 40,
     views: int = 24,
     held_out: int = 4,
+    grain: float = 1.0,
 ) -> Scene:
     """A scene of bodies around the origin, with exact cameras and bounds.
 
@@ -142,13 +143,14 @@ def toy(
         background: baked into the pictures; None leaves them their alpha.
         size: pixels along each side.
         views, held_out: how many to train on and to judge by.
+        grain: how fine the pattern on the bodies is.
     """
     train, val = around(views, size), around(held_out, size, phase=0.7)
     return Scene(
         name="toy",
         source="built-in",
-        train=Views(photograph(bodies, train, background), train),
-        val=Views(photograph(bodies, val, background), val),
+        train=Views(photograph(bodies, train, background, grain), train),
+        val=Views(photograph(bodies, val, background, grain), val),
         orbit=around(8, size, phase=0.3),
         bounds=enclosing(bodies),
         background=background or (0.0, 0.0, 0.0),
