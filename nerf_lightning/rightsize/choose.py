@@ -11,6 +11,9 @@ SHARE = 3.0
 IDLE = 2
 """Rungs in a row that are not worth it, after which climbing stops: one may be chance."""
 
+CLOSE = 0.5
+"""dB that an expectation may be wrong by."""
+
 
 @dataclass(frozen=True)
 class Target:
@@ -73,17 +76,29 @@ def best_of(rungs: Sequence[Measured]) -> int:
     return max(range(len(rungs)), key=lambda index: rungs[index].psnr)
 
 
-def next_to_train(tried: dict[int, float], first: int, best: int, last: int, target: Target, most: int) -> int | None:
+def expected(index: int, tried: dict[int, float], rungs: Sequence[Measured]) -> float:
+    """dB that a rung would reach trained in full: as much more than while growing as the nearest one that was.
+
+    Args:
+        tried: dB by rung of those trained in full, one at least of those climbed to.
+    """
+    near = min((one for one in tried if one < len(rungs)), key=lambda one: abs(one - index))
+    return rungs[index].psnr + tried[near] - rungs[near].psnr
+
+
+def next_to_train(
+    tried: dict[int, float], rungs: Sequence[Measured], target: Target, last: int, most: int
+) -> int | None:
     """Which rung to train in full next, to be sure of the choice; None where it is sure, or `most` are trained.
 
     Args:
         tried: dB by rung of those trained in full.
-        first: the candidate.
-        best: the best rung climbed to.
-        last: the highest rung there is.
+        rungs: those climbed to.
         target: see `Target`.
+        last: the highest rung there is.
         most: trainings there may be.
     """
+    first, best = candidate(rungs, target), best_of(rungs)
     if first not in tried:
         return first
     if len(tried) >= most:
@@ -94,8 +109,11 @@ def next_to_train(tried: dict[int, float], first: int, best: int, last: int, tar
             next((rung for rung in wanted if rung not in tried), None) if chosen(tried, best, target) != first else None
         )
     met = [rung for rung, psnr in tried.items() if psnr >= target.psnr]
-    following = min(met) - 1 if met else max(tried) + 1
-    return following if 0 <= following <= last and following not in tried else None
+    if not met:
+        return max(tried) + 1 if max(tried) < last else None
+    smaller = min(met) - 1
+    hopeless = smaller < 0 or smaller in tried or expected(smaller, tried, rungs) < target.psnr - CLOSE
+    return None if hopeless else smaller
 
 
 def chosen(tried: dict[int, float], best: int, target: Target) -> int | None:

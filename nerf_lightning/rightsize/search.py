@@ -14,7 +14,7 @@ from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.export.smallest import Compact, smallest
 from nerf_lightning.files import atomic
 from nerf_lightning.kernels import use_kernels
-from nerf_lightning.rightsize.choose import Target, best_of, candidate, chosen, climbed_enough, next_to_train
+from nerf_lightning.rightsize.choose import Target, best_of, candidate, chosen, climbed_enough, expected, next_to_train
 from nerf_lightning.rightsize.climb import Rung, climb, coarsest_sampler, compact_bytes, set_options, spread
 from nerf_lightning.rightsize.ladder import Ladder, Options
 from nerf_lightning.run_folder import load_run, plain_config
@@ -98,7 +98,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     full: dict[int, Full] = {}
     while True:
         tried = {index: one.psnr for index, one in full.items()}
-        following = next_to_train(tried, first, best, len(ladder.rungs) - 1, target, MOST_FULL)
+        following = next_to_train(tried, measured, target, len(ladder.rungs) - 1, MOST_FULL)
         if following is None:
             break
         print(f"rung {following} in full", flush=True)
@@ -112,6 +112,8 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     with atomic(output / "compact.npz") as temporary:
         temporary.write_bytes(compact.content)
     reason = in_words(target, tried, choice, found is not None, why, noise)
+    if target.psnr is not None and 0 < choice < len(rungs) and choice - 1 not in tried:
+        reason += f"; rung {choice - 1} would be expected at {expected(choice - 1, tried, measured):.1f} dB"
     wall = time.perf_counter() - began
     return Found(target, ladder, rungs, full, choice, found is not None, reason, noise, sampler, seconds, wall, compact)
 
@@ -148,8 +150,9 @@ def in_words(target: Target, tried: dict[int, float], choice: int, reached: bool
         if not reached:
             return f"{mine}, the most of those tried: the target of {target.psnr:g} dB was not reached"
         smaller = [f"rung {index} only {psnr:.2f} dB" for index, psnr in others.items() if index < choice]
-        rest = "; ".join(smaller) or ("it is the smallest" if choice == 0 else "a smaller one was not tried in full")
-        return f"{mine}, the target is {target.psnr:g} dB; {rest}"
+        return "; ".join(
+            [f"{mine}, the target is {target.psnr:g} dB", *smaller, *(["it is the smallest"] if not choice else [])]
+        )
     largest = [
         f"rung {index}, the best while growing, {psnr:.2f} dB" for index, psnr in others.items() if index > choice
     ]

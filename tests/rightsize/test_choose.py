@@ -9,6 +9,7 @@ from nerf_lightning.rightsize.choose import (
     candidate,
     chosen,
     climbed_enough,
+    expected,
     next_to_train,
     worth,
 )
@@ -64,8 +65,10 @@ def test_the_candidate_is_the_smallest_that_seems_enough():
 
 
 def test_a_candidate_is_held_against_the_best():
+    climbed = rungs(20, 27.8, 27.9, 28.0)
+
     def following(tried: dict[int, float], most: int = 3) -> int | None:
-        return next_to_train(tried, 1, 3, 5, NEAR, most)
+        return next_to_train(tried, climbed, NEAR, 5, most)
 
     assert following({}) == 1
     assert following({1: 30.0}) == 3
@@ -73,25 +76,31 @@ def test_a_candidate_is_held_against_the_best():
     assert following({1: 30.0, 3: 31.0}) == 2
     assert following({1: 30.0, 3: 31.0}, most=2) is None
     assert following({1: 30.0, 3: 31.0, 2: 30.8}, most=4) is None
-    assert next_to_train({3: 30.0}, 3, 3, 5, NEAR, 3) is None, "the best itself"
+    assert next_to_train({2: 30.0}, rungs(20, 25, 28), NEAR, 5, 3) is None, "the best itself"
     assert chosen({1: 30.0, 3: 30.2}, 3, NEAR) == 1
     assert chosen({1: 30.0, 3: 31.0}, 3, NEAR) == 3
     assert chosen({1: 30.0}, 3, NEAR) is None
 
 
 def test_a_figure_is_met_by_a_rung_and_not_by_the_next_smaller():
-    target = Target(psnr=28)
+    target, climbed = Target(psnr=28), rungs(26, 27, 28)
 
     def following(tried: dict[int, float], most: int = 3) -> int | None:
-        return next_to_train(tried, 2, 2, 3, target, most)
+        return next_to_train(tried, climbed, target, 3, most)
 
     assert following({}) == 2
-    assert following({2: 28.5}) == 1
-    assert following({2: 28.5, 1: 27.0}) is None
-    assert following({2: 28.5, 1: 28.1}) == 0
-    assert following({2: 28.5, 1: 28.1, 0: 28.0}, most=9) is None
+    assert following({2: 28.6}) == 1, "27.6 are expected, which may be wrong by half a dB"
+    assert following({2: 28.4}) is None, "27.4 are expected"
+    assert following({2: 28.6, 1: 27.0}) is None
+    assert following({2: 28.6, 1: 28.6}) == 0
+    assert following({2: 28.6, 1: 28.6, 0: 28.0}, most=9) is None
     assert following({2: 27.0}) == 3
     assert following({2: 27.0, 3: 27.5}) is None, "there is no larger one"
     assert following({2: 27.0, 3: 28.5}) is None
     assert chosen({2: 28.5, 1: 27.0}, 2, target) == 2
     assert chosen({2: 27.0, 3: 27.5}, 2, target) is None
+
+
+def test_what_is_expected_of_a_rung_is_the_gain_of_the_nearest():
+    assert expected(0, {2: 30.0, 1: 28.5}, rungs(26, 27, 28)) == pytest.approx(27.5)
+    assert expected(1, {2: 30.0}, rungs(26, 27, 28)) == pytest.approx(29.0)
