@@ -145,11 +145,16 @@ def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, sys
         )
 
 
-def build_budget(cfg: DictConfig) -> Budget:
+def budget_options(cfg: DictConfig) -> dict[str, Any]:
     """The user's limits, or the experiment's own where the user gives none."""
     budget = resolved(cfg.budget)
     default = budget.pop("default")
-    limits = budget if any(budget[key] is not None for key in default) else {**budget, **default}
+    return budget if any(budget[key] is not None for key in default) else {**budget, **default}
+
+
+def build_budget(cfg: DictConfig) -> Budget:
+    """How long to train."""
+    limits = budget_options(cfg)
     check_options("budget", Budget, limits)
     return Budget(**limits)
 

@@ -68,7 +68,6 @@ def smallest(
     config: dict[str, Any],
     most_loss: float,
     precision: str | None = None,
-    views: Sequence[int] | None = None,
 ) -> Compact:
     """Codes a system in the fewest bytes that lose no more than allowed: what its photos' cameras see, or all there is.
 
@@ -78,12 +77,11 @@ def smallest(
         config: of its run, as plain values.
         most_loss: dB on held-out views.
         precision: "byte" or "half"; None takes the smaller one that is allowed.
-        views: held-out views to judge by; None takes all.
 
     Raises:
         InputError: where every precision asked for loses more.
     """
-    before = held_out_psnr(system, data, views)
+    before = held_out_psnr(system, data)
     seen = seen_cells(system, some_cameras(data)) if isinstance(data, RayDataModule) else None
     confined = [confined_to(system, cells) for cells in ([None] if seen is None else [seen, occupied_cells(system)])]
     scene = scene_content(data)
@@ -92,7 +90,7 @@ def smallest(
         for part in confined:  # few photos do not see all that held-out views do
             content = encode(part, one, config, scene)
             small = decode(content, "compact").system.to(system.device)
-            tried.append(Compact(content, one, held_out_psnr(small, data, views), before))
+            tried.append(Compact(content, one, held_out_psnr(small, data), before))
             if tried[-1].loss <= most_loss:
                 return tried[-1]
     best = min(tried, key=lambda compact: compact.loss)

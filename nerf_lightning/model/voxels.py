@@ -29,6 +29,7 @@ RECENT = 0.5
 """The last part of a stage: vertices that were read in it stay."""
 PIECES = 4
 """Steps that share one look at the roughness of all vertices."""
+TABLES = ("log_density", "colours", "views")
 CHUNK = 1 << 16
 """Vertices interpolated together when growing: bounds the memory."""
 
@@ -117,6 +118,11 @@ class VoxelField(Field):
         """All that vertices hold, one row a vertex."""
         return self.log_density, self.colours, self.views
 
+    @property
+    def side(self) -> int:
+        """Vertices along each side at present, kept or not."""
+        return round(len(self.index) ** (1 / 3))
+
     def per_length(self, raw: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
         """Densities from what the table holds, 1 / world unit."""
         return truncated_exp(self.density_rate * raw) / self.unit_length
@@ -171,7 +177,7 @@ class VoxelField(Field):
     def take(self, smaller: Field) -> None:
         """Takes over all of it; from there it grows to its finest size in the usual stages."""
         assert isinstance(smaller, VoxelField)  # of the same kind, as said
-        cells = round(len(smaller.index) ** (1 / 3)) - 1
+        cells = smaller.side - 1
         if cells > self.resolutions[-1]:
             return
         self.resolutions = stage_sizes(cells, self.resolutions[-1], len(self.resolutions))
@@ -183,18 +189,17 @@ class VoxelField(Field):
 
     @torch.no_grad()
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
-        cells = round(len(self.index) ** (1 / 3)) - 1
-        keep = vertices_in(reached, cells).flatten() & (self.index > 0)
+        keep = vertices_in(reached, self.side - 1).flatten() & (self.index > 0)
         rows = torch.cat([self.index.new_zeros(1), self.index[keep]]).long()
         self.hold(keep, [table.detach()[rows] for table in self.tables])
 
     def packed(self) -> dict[str, Tensor]:
-        tables = zip(("log_density", "colours", "views"), self.tables, strict=True)
+        tables = zip(TABLES, self.tables, strict=True)
         return {"kept": self.index > 0, **{name: table.detach() for name, table in tables}}
 
     @torch.no_grad()
     def unpack(self, packed: dict[str, Tensor]) -> None:
-        keep, tables = packed["kept"], [packed[name] for name in ("log_density", "colours", "views")]
+        keep, tables = packed["kept"], [packed[name] for name in TABLES]
         if any(len(table) != int(keep.sum()) + 1 for table in tables):
             raise RuntimeError("tables of another length than there are vertices")
         self.hold(keep, tables)
@@ -208,7 +213,7 @@ class VoxelField(Field):
         """Which vertices of a grid of side^3 lie among present vertices that were read of late, or next to such ones."""
         fresh = self.seen > self.steps - 1 - RECENT * (self.steps - self.started)
         fresh[0] = False
-        old = round(len(self.index) ** (1 / 3))
+        old = self.side
         keep = fresh[self.index.long()].view(old, old, old)
         at = torch.arange(side, device=keep.device) * (old - 1) / (side - 1)
         for axis in range(3):
@@ -221,7 +226,7 @@ class VoxelField(Field):
         for name in ("index", "seen"):
             if prefix + name in state_dict:
                 setattr(self, name, torch.empty_like(state_dict[prefix + name], device=self.aabb.device))
-        for name in ("log_density", "colours", "views"):
+        for name in TABLES:
             if prefix + name in state_dict:
                 replace_data(getattr(self, name), torch.empty_like(state_dict[prefix + name], device=self.aabb.device))
         super()._load_from_state_dict(state_dict, prefix, *rest)

@@ -4,18 +4,18 @@ import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import stdev
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.build import build_system, build_trainer, frame_of, resolved
+from nerf_lightning.build import budget_options, build_system, build_trainer, frame_of, resolved
 from nerf_lightning.callbacks import Budget
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.evenly import evenly
 from nerf_lightning.export.compact import encode
 from nerf_lightning.export.reach import seen_cells
-from nerf_lightning.export.smallest import confined_to, some_cameras
+from nerf_lightning.export.smallest import confined_to, held_out_psnr, some_cameras
 from nerf_lightning.rightsize.choose import Measured
 from nerf_lightning.rightsize.ladder import Options
 from nerf_lightning.run_folder import plain_config, scene_content
@@ -51,11 +51,7 @@ class Rung:
 
 
 def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
-    """A copy of a configuration with other options in a group.
-
-    Raises:
-        omegaconf errors are told by `build`: options that the group's target does not know.
-    """
+    """A copy of a configuration with other options in a group; unknown ones are told when the group is built."""
     changed = copy.deepcopy(cfg)
     for key, value in options.items():
         OmegaConf.update(changed, f"{group}.{key}", value, force_add=True)
@@ -64,13 +60,10 @@ def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
 
 def share_of_budget(cfg: DictConfig, share: float) -> DictConfig:
     """A configuration with a part of its budget, however it was given."""
-    budget = resolved(cfg.budget)
-    limits = budget["default"] if all(budget[key] is None for key in budget["default"]) else budget
-    changed = copy.deepcopy(cfg)
-    for key, round_up in (("steps", True), ("seconds", False)):
-        limit = limits.get(key)
-        value = None if limit is None else max(1, round(limit * share)) if round_up else limit * share
-        OmegaConf.update(changed, f"budget.{key}", value)
+    limits, changed = budget_options(cfg), copy.deepcopy(cfg)
+    steps, seconds = limits.get("steps"), limits.get("seconds")
+    OmegaConf.update(changed, "budget.steps", None if steps is None else max(1, round(steps * share)))
+    OmegaConf.update(changed, "budget.seconds", None if seconds is None else seconds * share)
     OmegaConf.update(changed, "budget.patience", None)
     return changed
 
@@ -104,8 +97,7 @@ def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = No
 
 def quality(system: System, data: Data) -> float:
     """Mean dB over a few held-out views."""
-    views = evenly(data.held_out_views, VIEWS)
-    return fmean(system.evaluate(data.held_out(view)).psnr for view in views)
+    return held_out_psnr(system, data, evenly(data.held_out_views, VIEWS))
 
 
 def compact_bytes(cfg: DictConfig, system: System, data: Data) -> int:

@@ -94,7 +94,7 @@ def _of_grown(one: Rung) -> dict[str, Any]:
 def experiment(found: Found, cfg: DictConfig, choices: dict[str, Any]) -> str:
     """The choice as an experiment: all that sets it apart from the defaults."""
     best = set_options(cfg, "model", found.ladder.rungs[found.choice])
-    plain = plain_config(set_options(best, "sampler", found.sampler) if found.sampler else best)
+    plain = plain_config(set_options(best, "sampler", found.sampler))
     content: dict[str, Any] = {
         "defaults": [{f"override /{group}": choices.get(group)} for group in CHOSEN_FROM],
         "name": f"{plain['name']}_rightsized",

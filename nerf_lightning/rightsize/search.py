@@ -120,11 +120,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
 
 def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Any, folder: Path) -> Full:
     """A run of its own, with the whole budget."""
-    whole = (
-        set_options(set_options(cfg, "model", model), "sampler", sampler)
-        if sampler
-        else set_options(cfg, "model", model)
-    )
+    whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
     train(whole, folder=folder)
     results = read_run(folder).results
     run = load_run(folder)
