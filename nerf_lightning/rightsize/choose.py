@@ -76,6 +76,21 @@ def best_of(rungs: Sequence[Measured]) -> int:
     return max(range(len(rungs)), key=lambda index: rungs[index].psnr)
 
 
+def knee(rungs: Sequence[Measured]) -> int:
+    """Where more bytes begin to bring less: the rung farthest above the line from the smallest to the best one, dB over the
+    logarithm of bytes, each from 0 to 1 (Satopaa et al. 2011)."""
+    first, best = rungs[0], rungs[best_of(rungs)]
+    bytes_up, gain = math.log(best.size / first.size), best.psnr - first.psnr
+    if not bytes_up > 0 or not gain > 0:
+        return 0
+
+    def above(index: int) -> float:
+        one = rungs[index]
+        return (one.psnr - first.psnr) / gain - math.log(one.size / first.size) / bytes_up
+
+    return max(range(len(rungs)), key=above)
+
+
 def expected(index: int, tried: dict[int, float], rungs: Sequence[Measured]) -> float:
     """dB that a rung would reach trained in full: as much more than while growing as the nearest one that was.
 

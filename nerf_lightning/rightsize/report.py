@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from nerf_lightning.callbacks.panels import write_png
 from nerf_lightning.files import atomic, write_json
 from nerf_lightning.ink import BLUE, DPI, GREY, ORANGE, VERMILLION, pixels_of
+from nerf_lightning.rightsize.choose import knee
 from nerf_lightning.rightsize.climb import Rung, set_options
 from nerf_lightning.rightsize.ladder import overrides
 from nerf_lightning.rightsize.search import Found, Full, figures
@@ -67,6 +68,7 @@ def as_json(found: Found) -> dict[str, Any]:
         "target": {"psnr": found.target.psnr, "within_db": found.target.within_db},
         "reached": found.reached,
         "reason": found.reason,
+        "knee": knee([rung.measured for rung in found.rungs]),
         "noise_db": round(found.noise, 4),
         "search_seconds": round(found.seconds, 3),
         "wall_seconds": round(found.wall_seconds, 3),
@@ -110,12 +112,13 @@ def chart(found: Found) -> Figure:
     """Bytes against PSNR: the climb, the full trainings, the target, and the choice."""
     figure = Figure(figsize=(7.2, 4.6), dpi=DPI, layout="constrained")
     axes = figure.subplots()
-    sizes = [rung.measured.size / 1000 for rung in found.rungs]
-    axes.plot(sizes, [rung.measured.psnr for rung in found.rungs], "o-", color=BLUE, mfc="white", label="while growing")
-    for index, size in enumerate(sizes):
-        axes.annotate(
-            str(index), (size, found.rungs[index].measured.psnr), (0, -13), textcoords="offset points", ha="center"
-        )
+    grown = [rung.measured for rung in found.rungs]
+    sizes = [one.size / 1000 for one in grown]
+    axes.plot(sizes, [one.psnr for one in grown], "o-", color=BLUE, mfc="white", label="while growing")
+    for index, one in enumerate(grown):
+        axes.annotate(str(index), (sizes[index], one.psnr), (0, -13), textcoords="offset points", ha="center")
+    bend = knee(grown)
+    axes.plot(sizes[bend], grown[bend].psnr, "D", color=BLUE, ms=9, label=f"knee: rung {bend}")
     whole = found.full.values()
     axes.plot(
         [one.size / 1000 for one in whole],

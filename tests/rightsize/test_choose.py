@@ -10,6 +10,7 @@ from nerf_lightning.rightsize.choose import (
     chosen,
     climbed_enough,
     expected,
+    knee,
     next_to_train,
     worth,
 )
@@ -55,6 +56,13 @@ def test_climbing_goes_on_while_it_pays():
 def test_climbing_stops_at_a_figure():
     assert not climbed_enough(rungs(20, 20, 20, 27.9), Target(psnr=28), 1)
     assert "reached" in climbed_enough(rungs(20, 28), Target(psnr=28), 1)
+
+
+def test_the_knee_is_where_more_bytes_begin_to_bring_less():
+    assert knee(rungs(20, 26, 30, 30.5, 30.9, 31)) == 2
+    assert knee(rungs(20, 26, 30, 30.5, 29)) == 2, "what comes after the best does not count"
+    assert knee(rungs(20, 19, 18)) == 0
+    assert knee(rungs(20)) == 0
 
 
 def test_the_candidate_is_the_smallest_that_seems_enough():
