@@ -1,5 +1,6 @@
 """From configuration to objects. Nothing else in the package instantiates from a config."""
 
+import copy
 import inspect
 from dataclasses import dataclass, replace
 from functools import partial
@@ -70,9 +71,16 @@ def resolved(cfg: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in plain.items()}
 
 
-def build_data(cfg: DictConfig) -> RayDataModule | PixelDataModule:
-    """The data module, its scene loaded."""
-    return make(cfg, "dataset")
+def build_data(cfg: DictConfig, path: str | None = None) -> RayDataModule | PixelDataModule:
+    """The data module, its scene loaded; from other photos than the configuration names, where a path is given."""
+    if path is None:
+        return make(cfg, "dataset")
+    elsewhere = copy.deepcopy(cfg)
+    if "path" in inspect.signature(target_of(cfg, "dataset")).parameters:
+        elsewhere.dataset.path = path
+    else:  # a built-in scene
+        elsewhere.dataset = {"_target_": "nerf_lightning.dataset.from_photos", "path": path}
+    return make(elsewhere, "dataset")
 
 
 def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> Any:

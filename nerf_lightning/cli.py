@@ -47,14 +47,33 @@ def by_path(arguments: Sequence[str], folder: Path) -> list[str]:
     return found
 
 
-def run(config: str, task: Callable[[DictConfig], object]) -> None:
+def quoted(arguments: Sequence[str], keys: Sequence[str]) -> list[str]:
+    """A command line in which Hydra reads the values of some keys as texts, whatever is in them.
+
+    Args:
+        arguments: of the command line.
+        keys: whose values are texts; what is quoted or in brackets already stays as it is.
+    """
+    found = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key in keys and value and value[0] not in "'\"[" and value != "null":
+            escaped = value.replace("'", "\\'")
+            argument = f"{key}='{escaped}'"
+        found.append(argument)
+    return found
+
+
+def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] = ()) -> None:
     """Composes `conf/<config>.yaml` with the command line and calls `task`; exits with 2 on bad input.
+
+    The values of the keys in `texts` may hold commas and whatever else means something to Hydra.
 
     Bad input is anything the user can mend: it gets one line. Everything else is a defect and keeps its traceback.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
 
-    sys.argv[1:] = by_path(sys.argv[1:], conf_dir())
+    sys.argv[1:] = quoted(by_path(sys.argv[1:], conf_dir()), texts)
     started = False
 
     @functools.wraps(task)

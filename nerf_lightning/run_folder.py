@@ -17,7 +17,9 @@ from typing import Any
 
 import torch
 import yaml
+from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
 from nerf_lightning.build import Frame, PictureFrame, SceneFrame, build_system, frame_of, resolved
 from nerf_lightning.cameras import Bounds, Cameras
@@ -25,6 +27,9 @@ from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic, write_json
 from nerf_lightning.system import System
+
+FORMAT = 1
+"""Of run folders. Goes up when an older version of this package could no longer make sense of a newer one's runs."""
 
 TRUST = "NERF_LIGHTNING_TRUST"
 """Environment variable: further packages, comma-separated, whose classes a run folder may name."""
@@ -125,7 +130,7 @@ def save_scene(data: RayDataModule | PixelDataModule, folder: Path) -> None:
 def scene_content(data: RayDataModule | PixelDataModule) -> dict[str, Any]:
     """The same as plain values."""
     scene, frame = data.scene, frame_of(data)
-    content: dict[str, Any] = scene.describe()
+    content: dict[str, Any] = {"format": FORMAT, **scene.describe()}
     if isinstance(scene, Scene) and isinstance(frame, SceneFrame):
         content |= {
             "background": list(frame.background),
@@ -153,22 +158,25 @@ class RunFolder:
     system: System
     orbit: Cameras | None
     """None for a picture."""
+    to_source: Float[Tensor, "4 4"] | None
+    """Similarity from the world frame to that of the photos' own file; None for a picture."""
 
 
-def frame_from(scene: dict[str, Any]) -> tuple[Frame, Cameras | None]:
-    """What `scene_content` gave, as a system takes it, and the orbit; None for a picture.
+def frame_from(scene: dict[str, Any]) -> tuple[Frame, Cameras | None, Tensor | None]:
+    """What `scene_content` gave, as a system takes it, then the orbit and the similarity to the source; None for a picture.
 
     Raises:
         ValueError, KeyError, TypeError: where it is not whole.
     """
     if "aabb" not in scene:
-        return PictureFrame(*map(int, scene["resolution"])), None
+        return PictureFrame(*map(int, scene["resolution"])), None, None
     near, far, pixel = scene["near"], scene["far"], scene.get("pixel")
     bounds = Bounds(torch.tensor(scene["aabb"]), scene["unbounded"], near, far, pixel)
     red, green, blue = map(float, scene["background"])
     view = scene["orbit"]
     orbit = Cameras(torch.tensor(view["K"]), torch.tensor(view["c2w"]), view["width"], view["height"])
-    return SceneFrame(bounds, (red, green, blue)), orbit
+    to_source = torch.tensor(scene["to_source"], dtype=torch.float32).view(4, 4)
+    return SceneFrame(bounds, (red, green, blue)), orbit, to_source
 
 
 def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
@@ -180,10 +188,16 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
     cfg = load_config(folder)
     path = folder / "scene.json"
     try:
-        frame, orbit = frame_from(json.loads(path.read_text()))
+        scene = json.loads(path.read_text())
+        if scene.get("format", FORMAT) != FORMAT:
+            found, expected = f"format {scene['format']}", f"format {FORMAT}, which this version reads"
+            raise InputError(path, "format", found, expected, "use the version of nerf_lightning that made the run")
+        frame, orbit, to_source = frame_from(scene)
+    except InputError:
+        raise
     except FileNotFoundError as error:
         raise InputError(path, "", "no such file", "the scene of a run") from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise InputError(path, "", f"{type(error).__name__}: {error}", "the scene of a run, whole") from error
     system = build_system(cfg, frame)
     state = read_checkpoint(folder / "checkpoints" / checkpoint)
@@ -193,7 +207,7 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
         raise InputError(
             folder / "checkpoints" / checkpoint, "state_dict", str(error), "the weights of this run's model"
         ) from error
-    return RunFolder(cfg, system.eval(), orbit)
+    return RunFolder(cfg, system.eval(), orbit, to_source)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -110,3 +110,33 @@ def orbit_like(cameras: Cameras, frames: int = 60) -> Cameras:
         elevation = math.asin(max(-0.95, min(0.95, float((offset @ up).mean()) / max(radius, 1e-9))))
         c2w = orbit_around(centre, up, radius, elevation, frames)
     return Cameras(cameras.K[:1].repeat(frames, 1, 1), c2w, cameras.width, cameras.height)
+
+
+SPIRAL_TURNS, SPIRAL_CLIMB = 2, 0.75
+"""Turns of a spiral, and the share of the way to its axis that it climbs."""
+
+
+def spiral_like(orbit: Cameras, frames: int = 60) -> Cameras:
+    """A closed path that winds from an orbit up to its axis and back, at the same distance, with the same size and intrinsics.
+
+    Args:
+        orbit: a circle of cameras that look at its middle or beside it, as `orbit_like` gives; of a path of another shape,
+            the circle that it resembles counts.
+        frames: how many poses; the last stops one step short of the first.
+    """
+    centre = focus_point(orbit.c2w)
+    up = torch.nn.functional.normalize(-orbit.c2w[:, :3, 1].mean(0), dim=-1)
+    offset = orbit.centres - centre
+    radius = offset.norm(dim=-1).mean()
+    mean = offset.mean(0)
+    axis = torch.linalg.svd(offset - mean).Vh[2]  # across the circle's plane
+    side = mean if mean.norm() > 1e-3 * radius else up  # a circle around the subject's own height has no mean
+    axis = axis * torch.where(axis @ side < 0, -1.0, 1.0)
+    angle = torch.acos((torch.nn.functional.normalize(offset, dim=-1) @ axis).clamp(-1, 1)).mean()
+    first = torch.nn.functional.normalize(offset[0] - (offset[0] @ axis) * axis, dim=-1)
+    second = torch.linalg.cross(axis, first)
+    turn = torch.arange(frames, dtype=axis.dtype)[:, None] * (2 * math.pi / frames)
+    slope = angle * (1 - SPIRAL_CLIMB * (1 - torch.cos(turn)) / 2)
+    around = torch.cos(SPIRAL_TURNS * turn) * first + torch.sin(SPIRAL_TURNS * turn) * second
+    eye = centre + radius * (torch.sin(slope) * around + torch.cos(slope) * axis)
+    return Cameras(orbit.K[:1].repeat(frames, 1, 1), look_at(eye, centre, up), orbit.width, orbit.height)

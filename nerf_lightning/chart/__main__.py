@@ -1,10 +1,8 @@
 """python -m nerf_lightning.chart: which method is worth its time. Heavy imports wait until there is work."""
 
-import sys
 from typing import TYPE_CHECKING
 
 from nerf_lightning import cli
-from nerf_lightning.chart.verb import quoted
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -19,8 +17,7 @@ def task(cfg: "DictConfig") -> None:
 
 def main() -> None:
     """The command line."""
-    sys.argv[1:] = quoted(sys.argv[1:])
-    cli.run("chart", task)
+    cli.run("chart", task, texts=("runs",))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """The chart verb's configuration -> the work. Heavy imports wait until the configuration is checked."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -56,16 +55,3 @@ def split_folders(text: str) -> list[Path]:
         folders.append(Path(",".join(parts[:longest])).expanduser())
         parts = parts[longest:]
     return folders
-
-
-def quoted(arguments: Sequence[str]) -> list[str]:
-    """A command line whose runs=DIR,DIR Hydra reads as one text, whatever is in the names."""
-    return [_quoted(one) if one.startswith("runs=") else one for one in arguments]
-
-
-def _quoted(argument: str) -> str:
-    value = argument.removeprefix("runs=")
-    if not value or value[0] in "'\"[":
-        return argument
-    escaped = value.replace("'", "\\'")
-    return f"runs='{escaped}'"

@@ -8,7 +8,7 @@ import pytest
 from made_runs import MakeRun
 
 from nerf_lightning.chart.__main__ import main
-from nerf_lightning.chart.verb import quoted, split_folders
+from nerf_lightning.chart.verb import split_folders
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -74,8 +74,3 @@ def test_folders_with_commas_in_their_names(tmp_path: Path, monkeypatch: pytest.
     for name in ("a", "b,c=1", "b"):
         (tmp_path / name).mkdir()
     assert [str(one) for one in split_folders("a,b,c=1,b,missing")] == ["a", "b,c=1", "b", "missing"]
-
-
-def test_what_hydra_reads():
-    given = ["runs=a,b=1", "runs=it's", "runs=[a]", "runs='a'", "output=a,b", "runs="]
-    assert quoted(given) == ["runs='a,b=1'", "runs='it\\'s'", "runs=[a]", "runs='a'", "output=a,b", "runs="]

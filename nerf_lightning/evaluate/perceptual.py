@@ -1,0 +1,43 @@
+"""LPIPS (Zhang et al. 2018), where the weights it needs lie on this machine already: nothing is ever fetched."""
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+WEIGHTS = "alexnet-owt-7be5be79.pth"
+"""AlexNet's, as torchvision names them in torch.hub's folder."""
+SMALLEST = 64
+"""Pixels along a side that AlexNet needs."""
+
+Distance = Callable[[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]], float]
+
+
+def weights() -> Path:
+    """Where torchvision looks for AlexNet's weights."""
+    return Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS
+
+
+def perceptual_distance(width: int, height: int) -> tuple[Distance | None, str]:
+    """LPIPS with AlexNet of two pictures in [0, 1]: 0 for the same, smaller is better.
+
+    Returns:
+        It, or None and the reason why it cannot be told.
+    """
+    if min(width, height) < SMALLEST:
+        return None, f"photos of less than {SMALLEST} pixels"
+    if importlib.util.find_spec("torchvision") is None:
+        return None, "torchvision is not installed"
+    if not weights().exists():
+        return None, f"{weights()} is not there"
+
+    from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
+
+    def distance(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
+        first, second = (one.permute(2, 0, 1)[None] for one in (image, truth))
+        return float(learned_perceptual_image_patch_similarity(first, second, net_type="alex", normalize=True))
+
+    return distance, ""

@@ -1,0 +1,144 @@
+"""Meshes, point clouds and voxel grids for other programs, in the place and at the scale of the photos' own file."""
+
+import io
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.surface import Surface, find_surface
+from nerf_lightning.export.volume import ASKED, Volume
+from nerf_lightning.system import NeRF3D
+
+if TYPE_CHECKING:
+    import trimesh
+
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From z up, as tags and most scenes have it, to y up, as glTF wants it: written as the node's transform."""
+
+
+def require_mesh() -> None:
+    """Raises InputError where scikit-image or trimesh, an optional extra, is not installed."""
+    try:
+        import skimage  # noqa: F401
+        import trimesh  # noqa: F401
+    except ModuleNotFoundError as error:
+        if error.name not in ("skimage", "trimesh"):
+            raise
+        todo = "pip install 'nerf_lightning[mesh]'"
+        raise InputError(str(error.name), "", "no such package", "the optional extra for meshes", todo) from error
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A file's content, and what it holds in words."""
+
+    content: bytes
+    words: str
+
+
+@torch.no_grad()
+def colours_at(system: NeRF3D, places: Float[Tensor, "N 3"], outwards: Float[Tensor, "N 3"]) -> UInt8[ndarray, "N 3"]:
+    """What a field shows at some places to one who looks at them straight, world frame."""
+    parts = [
+        system.field(some.to(system.device), -away.to(system.device))[1].cpu()
+        for some, away in zip(places.split(ASKED), outwards.split(ASKED), strict=True)
+    ]
+    return (torch.cat([torch.zeros(0, 3), *parts]).clamp(0, 1) * 255).round().byte().numpy()
+
+
+def coloured_mesh(
+    system: NeRF3D, volume: Volume, threshold: float | None, to_source: Float[Tensor, "4 4"]
+) -> tuple["trimesh.Trimesh", Surface]:
+    """The surface of a field's solid with a colour at each vertex, in the frame of the photos' file.
+
+    Args:
+        to_source: similarity from the world frame to that one.
+    """
+    import trimesh
+
+    surface = find_surface(volume, threshold)
+    normals = torch.from_numpy(surface.normals)
+    places = torch.from_numpy(surface.vertices)
+    # Half a cell inside: at the very surface a colour may still be what nobody saw, in the air.
+    rgb = colours_at(system, places - normals * (volume.cell / 2), normals)
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=rgb, process=False)
+    mesh.apply_transform(to_source.double().numpy())
+    return mesh, surface
+
+
+def mesh_file(system: NeRF3D, volume: Volume, threshold: float | None, to_source: Tensor, suffix: str) -> Shape:
+    """A coloured mesh as .ply or .glb."""
+    import trimesh
+
+    mesh, surface = coloured_mesh(system, volume, threshold, to_source)
+    if suffix == "glb":
+        scene = trimesh.Scene()
+        scene.add_geometry(mesh, transform=Y_UP)
+        content = scene.export(file_type="glb")
+    else:
+        content = mesh.export(file_type=suffix)
+    words = [
+        f"{len(mesh.faces):,} triangles",
+        "watertight" if mesh.is_watertight else f"{open_edges(mesh)} open edges",
+        " x ".join(f"{side:.4g}" for side in mesh.extents) + " in the photos' unit",
+        f"surface at opacity {surface.threshold:.2f}",
+        *([f"{surface.floaters} floating pieces left out"] if surface.floaters else []),
+    ]
+    return Shape(_bytes(content), ", ".join(words))
+
+
+def points_file(system: NeRF3D, volume: Volume, threshold: float | None, to_source: Float[Tensor, "4 4"]) -> Shape:
+    """The mesh's vertices alone, with their colours, as .ply."""
+    import trimesh
+
+    mesh, surface = coloured_mesh(system, volume, threshold, to_source)
+    colours: Any = mesh.visual
+    content = trimesh.PointCloud(mesh.vertices, colours.vertex_colors).export(file_type="ply")
+    return Shape(_bytes(content), f"{len(mesh.vertices):,} points, surface at opacity {surface.threshold:.2f}")
+
+
+def voxels_file(system: NeRF3D, volume: Volume, to_source: Float[Tensor, "4 4"]) -> Shape:
+    """Densities and colours of all cells as .npz.
+
+    `density` [X, Y, Z] is per unit of the photos' file, `rgb` [X, Y, Z, 3] what is seen looking along the density's
+    gradient, `to_source` [4, 4] maps indices (whole numbers are centres of cells) to the frame of the photos' file.
+    """
+    solid = volume.density > 0
+    index = solid.nonzero()
+    gradient = torch.stack(
+        torch.gradient(volume.opacity) if min(solid.shape) > 1 else [torch.zeros(solid.shape)] * 3, -1
+    )
+    outwards = -torch.nn.functional.normalize(gradient[solid], dim=-1)
+    outwards[outwards.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0])  # where density is even, any side would do
+    rgb = np.zeros((*solid.shape, 3), np.uint8)
+    rgb[solid.numpy()] = colours_at(system, volume.places(index.float()), outwards)
+    to_world = torch.eye(4, dtype=torch.float64)
+    to_world[:3, :3] *= volume.cell
+    to_world[:3, 3] = volume.places(torch.zeros(1, 3))[0]
+    scale = float(torch.linalg.det(to_source[:3, :3].double())) ** (1 / 3)
+    file = io.BytesIO()
+    arrays: dict[str, Any] = {
+        "density": (volume.density / scale).numpy().astype(np.float32),
+        "rgb": rgb,
+        "to_source": (to_source.double() @ to_world).numpy(),
+    }
+    np.savez_compressed(file, **arrays)
+    shape = " x ".join(map(str, solid.shape))
+    return Shape(file.getvalue(), f"{shape} cells, {len(index):,} of them not empty")
+
+
+def open_edges(mesh: "trimesh.Trimesh") -> int:
+    """Edges that do not lie between exactly two triangles."""
+    _, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    return int((counts != 2).sum())
+
+
+def _bytes(content: Any) -> bytes:
+    assert isinstance(content, bytes)  # of both formats
+    return content

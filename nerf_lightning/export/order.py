@@ -1,0 +1,21 @@
+"""What the export verb is asked for. Imports nothing heavy."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from nerf_lightning.options import AtLeast, Count
+
+
+@dataclass(frozen=True)
+class Order:
+    """The keys of conf/export.yaml, which says what each means; `photos` is its dataset.path."""
+
+    run: str
+    format: str
+    output: str | None
+    precision: str | None
+    loss: Annotated[float, AtLeast(0)]
+    content: str
+    resolution: Count | None
+    threshold: float | None
+    photos: str | None

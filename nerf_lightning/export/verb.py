@@ -1,0 +1,75 @@
+"""The export verb's options -> a file."""
+
+from pathlib import Path
+
+import torch
+
+from nerf_lightning.build import build_data
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.mesh import mesh_file, points_file, require_mesh, voxels_file
+from nerf_lightning.export.order import Order
+from nerf_lightning.export.smallest import PRECISIONS, smallest
+from nerf_lightning.export.volume import cells_across, sample_volume
+from nerf_lightning.files import atomic
+from nerf_lightning.open_run import beside, open_run, open_scene_run
+from nerf_lightning.run_folder import plain_config
+
+NAMES = {
+    ("compact", "mesh"): "compact.npz",
+    ("npz", "mesh"): "voxels.npz",
+    ("ply", "mesh"): "mesh.ply",
+    ("glb", "mesh"): "mesh.glb",
+    ("ply", "points"): "points.ply",
+}
+"""Where the output goes if nobody says, by format and content."""
+
+
+def export(order: Order) -> None:
+    """Writes a run's last state in another format, and says what became of it.
+
+    Raises:
+        InputError: where an option or the run is no good, photos are missing, or more would be lost than allowed.
+    """
+    formats = sorted({one for one, _ in NAMES})
+    if order.format not in formats:
+        raise InputError("config", "format", repr(order.format), ", ".join(formats))
+    if (order.format, order.content) not in NAMES:
+        raise InputError("config", "content", repr(order.content), "mesh, or points with format=ply")
+    if order.precision not in (None, *PRECISIONS):
+        found, expected = repr(order.precision), "half, byte, or null for the smaller one that is allowed"
+        raise InputError("config", "precision", found, expected)
+    source = Path(order.run).expanduser()
+    output = beside(source) / NAMES[order.format, order.content]
+    if order.output is not None:
+        output = Path(order.output).expanduser()
+    if order.format in ("ply", "glb"):
+        require_mesh()
+    content, words = compacted(order, source) if order.format == "compact" else shaped(order, source)
+    with atomic(output) as temporary:
+        temporary.write_bytes(content)
+    print(f"{output}: {words}")
+
+
+def compacted(order: Order, source: Path) -> tuple[bytes, str]:
+    """A run as one small file."""
+    found = open_run(source)
+    data = build_data(found.cfg, order.photos)
+    before = sum(tensor.numel() * tensor.element_size() for tensor in found.system.state_dict().values())
+    compact = smallest(found.system, data, plain_config(found.cfg), order.loss, order.precision)
+    size = f"{len(compact.content) / 1000:,.1f} kB of {before / 1000:,.1f} kB (precision={compact.precision})"
+    quality = f"held-out PSNR {compact.before:.2f} -> {compact.psnr:.2f} dB, {max(compact.loss, 0):.3f} dB lost"
+    return compact.content, f"{size}, {quality}"
+
+
+def shaped(order: Order, source: Path) -> tuple[bytes, str]:
+    """A run as a mesh, points or voxels."""
+    found = open_scene_run(source)
+    volume = sample_volume(found.system, order.resolution or cells_across(found.system))
+    if order.format == "npz":
+        shape = voxels_file(found.system, volume, found.to_source)
+    elif order.content == "points":
+        shape = points_file(found.system, volume, order.threshold, found.to_source)
+    else:
+        shape = mesh_file(found.system, volume, order.threshold, found.to_source, order.format)
+    scale = float(torch.linalg.det(found.to_source[:3, :3].double())) ** (1 / 3)
+    return shape.content, f"{len(shape.content) / 1e6:,.2f} MB, {shape.words}, cells of {volume.cell * scale:.4g}"

@@ -1,0 +1,55 @@
+"""A run by its path: a folder, or the compact file that was made of one."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtyping import Float
+from omegaconf import DictConfig
+from torch import Tensor
+
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.compact import load_compact
+from nerf_lightning.kernels import use_kernels
+from nerf_lightning.run_folder import RunFolder, load_run
+from nerf_lightning.system import NeRF3D
+from nerf_lightning.training import quiet
+
+
+@dataclass(frozen=True)
+class SceneRun:
+    """A run of a scene, as `RunFolder` has it."""
+
+    cfg: DictConfig
+    system: NeRF3D
+    orbit: Cameras
+    to_source: Float[Tensor, "4 4"]
+
+
+def open_run(path: Path) -> RunFolder:
+    """Reads a trained system, ready to render with the kernels it was trained with.
+
+    Raises:
+        InputError: where there is none, or it is broken, of another version, or names what is not trusted.
+    """
+    quiet()
+    found = load_compact(path) if path.suffix == ".npz" else load_run(path)
+    use_kernels(found.cfg.kernels)
+    return found
+
+
+def open_scene_run(path: Path) -> SceneRun:
+    """As `open_run`, of a scene.
+
+    Raises:
+        InputError: as said, and for a picture's run.
+    """
+    found = open_run(path)
+    if not isinstance(found.system, NeRF3D) or found.orbit is None or found.to_source is None:
+        raise InputError(path, "", "a picture's run", "a scene's run", "final.png shows a picture")
+    return SceneRun(found.cfg, found.system, found.orbit, found.to_source)
+
+
+def beside(path: Path) -> Path:
+    """The folder that what is made of a run goes to: the run's own, or that of its compact file."""
+    return path.parent if path.suffix == ".npz" else path

@@ -1,0 +1,33 @@
+"""python -m nerf_lightning.render: a run along a camera path. Heavy imports wait until there is work."""
+
+import sys
+from typing import TYPE_CHECKING
+
+from nerf_lightning import cli
+from nerf_lightning.options import check_options
+from nerf_lightning.render.order import Order
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+
+def task(cfg: "DictConfig") -> None:
+    """Checks the configuration and renders."""
+    from omegaconf import OmegaConf
+
+    given = {str(key): cfg[key] for key in cfg if key != "dataset" and not OmegaConf.is_missing(cfg, key)}
+    given |= {key: OmegaConf.to_container(value) for key, value in given.items() if OmegaConf.is_config(value)}
+    given["photos"] = cfg.dataset.path
+    check_options("", Order, given)
+
+    from nerf_lightning.render.verb import render
+
+    try:
+        render(Order(**given))
+    except KeyboardInterrupt:
+        print("interrupted: the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    cli.run("render", task, texts=("run", "path", "output", "background", "channels"))

@@ -1,0 +1,132 @@
+"""Films: frames as they come, kept on disk until the film is whole, so that an interrupted one goes on."""
+
+import json
+import shutil
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.files import atomic, write_json
+from nerf_lightning.progress import tracked
+
+Picture = UInt8[ndarray, "H W C"]
+PLAN = "frames.json"
+"""Beside the frames: what they show, so that frames of something else are never taken for them."""
+FILMS = (".gif", ".mp4", ".webp")
+OPAQUE = (".gif", ".mp4")
+"""Kinds that know no partial transparency."""
+QUALITY = 90
+"""Of WebP, out of 100."""
+CRF = 18
+"""Of H.264: smaller is better, 18 looks like the original."""
+
+
+def check_output(output: Path, transparent: bool) -> None:
+    """Raises InputError where no film can be written to a place, before any work is done."""
+    if output.suffix not in ("", *FILMS):
+        raise InputError("config", "output", output.name, f"a name ending in {', '.join(FILMS)}, or a folder for PNGs")
+    if output.suffix and output.is_dir():
+        raise InputError(output, "", "a folder", "a file to write", "give output another name")
+    if not output.suffix and output.exists() and not output.is_dir():
+        raise InputError(output, "", "a file", "a folder for PNGs", "give output another name")
+    if transparent and output.suffix in OPAQUE:
+        raise InputError("config", "background", f"transparent for {output.suffix}", "a colour", "or output=FILE.webp")
+    if output.suffix == ".mp4":
+        require_av()
+
+
+def require_av() -> None:
+    """Raises InputError where PyAV, an optional extra, is not installed."""
+    try:
+        import av  # noqa: F401
+    except ModuleNotFoundError as error:
+        if error.name != "av":
+            raise
+        todo = "pip install 'nerf_lightning[video]', or output=FILE.webp"
+        raise InputError("av", "", "no such package", "the optional extra that writes .mp4", todo) from error
+
+
+def make_film(plan: dict[str, Any], draw: Callable[[int], Picture], count: int, output: Path, fps: float) -> int:
+    """Draws all frames that are not there yet, and joins them.
+
+    Frames stand in the folder itself, or beside a film in a folder of its own until it is written.
+
+    Args:
+        plan: all that the frames depend on, as plain values.
+        draw: makes a frame, all of one size.
+        count: how many.
+        output: a folder, or a file whose suffix says what kind of film.
+        fps: frames a second.
+
+    Returns:
+        How many frames were there already.
+
+    Raises:
+        InputError: where the folder holds something else.
+    """
+    folder = output.with_name(f"{output.name}.frames") if output.suffix else output
+    files = [folder / f"{index:05d}.png" for index in range(count)]
+    prepare(folder, plan, own=bool(output.suffix))
+    left = [index for index in range(count) if not files[index].exists()]
+    for index in tracked(left, len(left), "frames"):
+        with atomic(files[index]) as temporary:
+            imageio.imwrite(temporary, draw(index), compress_level=1)
+    if output.suffix:
+        with atomic(output) as temporary:
+            join(files, temporary, fps)
+        shutil.rmtree(folder)
+    return count - len(left)
+
+
+def prepare(folder: Path, plan: dict[str, Any], own: bool) -> None:
+    """Makes a folder ready for the frames of a plan; those of another plan are thrown away where the folder is our own."""
+    try:
+        found = json.loads((folder / PLAN).read_text())
+    except (OSError, ValueError):
+        found = None
+    if found != plan and folder.exists():
+        if own:
+            shutil.rmtree(folder)
+        elif any(folder.iterdir()):
+            raise InputError(folder, "", "something else in it", "a folder for these frames alone", "give output=DIR")
+    write_json(folder / PLAN, plan)
+
+
+def join(files: list[Path], output: Path, fps: float) -> None:
+    """Frames on disk -> one film, of the kind that its suffix says."""
+    if output.suffix == ".mp4":
+        join_mp4(files, output, fps)
+        return
+    frames = np.stack([imageio.imread(file) for file in files])
+    quality: dict[str, Any] = {"quality": QUALITY} if output.suffix == ".webp" else {}
+    imageio.imwrite(output, frames, plugin="pillow", duration=1000 / fps, loop=0, **quality)
+
+
+def join_mp4(files: list[Path], output: Path, fps: float) -> None:
+    """H.264 with colours at half resolution, which every player knows; odd sizes get one more row or column, never a resize."""
+    import av
+
+    with av.open(str(output), "w", options={"movflags": "faststart"}) as container:
+        stream: Any = container.add_stream(
+            "libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": str(CRF)}
+        )
+        for index, file in enumerate(files):
+            picture = even(imageio.imread(file))
+            if not index:
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode(None))
+
+
+def even(picture: UInt8[ndarray, "H W 3"]) -> UInt8[ndarray, "H2 W2 3"]:
+    """A picture with its last row and column repeated where their number is odd."""
+    height, width, _ = picture.shape
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -1,0 +1,156 @@
+"""The render verb's options -> a film."""
+
+import hashlib
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerf_lightning.build import build_data
+from nerf_lightning.callbacks.panels import panel
+from nerf_lightning.dataset import RayDataModule
+from nerf_lightning.errors import InputError
+from nerf_lightning.open_run import SceneRun, beside, open_scene_run
+from nerf_lightning.render.film import Picture, check_output, make_film
+from nerf_lightning.render.frame import CHANNELS, ERROR_TIMES, Style, depth_range, draw, error_picture
+from nerf_lightning.render.order import Order
+from nerf_lightning.render.route import WITH_PHOTOS, Route, find_route
+from nerf_lightning.renderer.renderer import NAMED
+from nerf_lightning.system import NeRF3D
+
+BLACK = (0.0, 0.0, 0.0)
+
+
+def render(order: Order) -> None:
+    """Renders, and says what came of it.
+
+    Raises:
+        InputError: where the run, an option, or the place for the film is no good.
+    """
+    began = time.perf_counter()
+    source = Path(order.run).expanduser()
+    channels = the_channels(order.channels)
+    output = the_output(order, source)
+    check_output(output, order.background == "transparent")
+    found = open_scene_run(source)
+    route = the_route(order, found)
+    background = the_background(order, found.system, route)
+    found.system.renderer.colour = torch.tensor(background or BLACK)
+    depths = depth_range(found.system, route.cameras) if "depth" in channels else (0.0, 1.0)
+    style = Style(channels, background, depths)
+    plan = the_plan(order, found.system, route, style)
+
+    draw_one = side_by_side if route.photos is None else beside_truth
+    there = make_film(
+        plan, lambda index: draw_one(found.system, route, index, style), len(route.cameras), output, order.fps
+    )
+    seconds = time.perf_counter() - began
+    size = f"{route.cameras.width} x {route.cameras.height}"
+    before = f", {there} of them there already" if there else ""
+    print(f"{output}: {len(route.cameras)} frames of {size} pixels in {seconds:.1f} s{before}")
+
+
+def the_channels(given: str | list[str]) -> tuple[str, ...]:
+    """Their names.
+
+    Raises:
+        InputError: for another name, or one that stands twice.
+    """
+    names = [name.strip() for name in given.split(",")] if isinstance(given, str) else given
+    if not names or any(name not in CHANNELS for name in names) or len(set(names)) < len(names):
+        raise InputError(
+            "config", "channels", repr(given), f"one or more of {', '.join(CHANNELS)}, separated by commas"
+        )
+    return tuple(names)
+
+
+def the_output(order: Order, source: Path) -> Path:
+    """Where the film goes."""
+    if order.output is not None:
+        return Path(order.output).expanduser()
+    return beside(source) / f"render_{Path(order.path).stem}.webp"
+
+
+def the_route(order: Order, found: SceneRun) -> Route:
+    """The views to show, at the size asked for."""
+    scene = None
+    if order.path in WITH_PHOTOS:
+        if order.scale != 1 or order.background == "transparent":
+            key = "scale" if order.scale != 1 else "background"
+            value = order.scale if order.scale != 1 else order.background
+            raise InputError("config", key, str(value), f"scale=1 and a colour beside photos (path={order.path})")
+        data = build_data(found.cfg, order.photos)
+        assert isinstance(data, RayDataModule)  # of a scene's run
+        scene = data.scene
+    route = find_route(order.path, order.frames, found.orbit, scene)
+    if order.scale == 1:
+        return route
+    width, height = (max(1, round(side * order.scale)) for side in (route.cameras.width, route.cameras.height))
+    return Route(route.cameras.resized(width, height), route.views)
+
+
+def the_background(order: Order, system: NeRF3D, route: Route) -> tuple[float, float, float] | None:
+    """What shows where nothing is, in [0, 1]; None for transparency.
+
+    Raises:
+        InputError: for anything else, or where photos have a background that cannot be taken off.
+    """
+    given = order.background
+    own = tuple(system.renderer.colour.tolist())
+    if given == "transparent":
+        return None
+    if given == "scene":
+        colour = own
+    elif isinstance(given, str) and given in NAMED:
+        colour = NAMED[given]
+    else:
+        try:
+            colour = tuple(float(part) for part in (given.split(",") if isinstance(given, str) else given))
+        except ValueError:
+            colour = ()
+    if len(colour) != 3 or not all(0 <= part <= 1 for part in colour):
+        expected = "scene, black, white, transparent, or R,G,B in 0..1"
+        raise InputError("config", "background", repr(given), expected)
+    if route.photos is not None and route.photos.images.shape[-1] == 3 and not np.allclose(colour, own, atol=1e-3):
+        expected = f"scene: these photos have no alpha, and stand on {[round(part, 3) for part in own]}"
+        raise InputError("config", "background", repr(given), expected)
+    red, green, blue = colour
+    return red, green, blue
+
+
+def the_plan(order: Order, system: NeRF3D, route: Route, style: Style) -> dict[str, Any]:
+    """All that frames depend on, as plain values."""
+    digest = hashlib.sha256()
+    for tensor in (*system.state_dict().values(), route.cameras.K, route.cameras.c2w):
+        digest.update(tensor.cpu().contiguous().numpy().tobytes())
+    return {
+        "what": digest.hexdigest(),
+        "path": order.path,
+        "views": route.views,
+        "size": [route.cameras.width, route.cameras.height],
+        "channels": list(style.channels),
+        "background": None if style.background is None else list(style.background),
+    }
+
+
+def side_by_side(system: NeRF3D, route: Route, index: int, style: Style) -> Picture:
+    """The channels of a view."""
+    return np.concatenate(list(draw(system, route.cameras, index, style).values()), axis=1)
+
+
+def beside_truth(system: NeRF3D, route: Route, index: int, style: Style) -> Picture:
+    """The photo, the render, their difference, and the other channels, with a caption."""
+    assert route.photos is not None and style.background is not None  # the verb sees to it
+    photo = route.photos.images[index].numpy()
+    if photo.shape[-1] == 4:
+        alpha = photo[..., 3:] / 255.0
+        photo = np.rint(photo[..., :3] * alpha + 255 * (1 - alpha) * np.array(style.background)).astype(np.uint8)
+    others = [name for name in style.channels if name != "rgb"]
+    drawn = draw(system, route.cameras, index, replace(style, channels=("rgb", *others)))
+    error, psnr = error_picture(drawn["rgb"], photo)
+    names = ["truth", "render", f"{ERROR_TIMES} x error", *others]
+    caption = f"{' | '.join(names)}    view {route.views[index]}, {psnr:.2f} dB"
+    return panel([photo, drawn["rgb"], error, *(drawn[name] for name in others)], caption)

@@ -1,0 +1,92 @@
+"""Meshes, points and voxels, reloaded by another library and held against a ball."""
+
+import io
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from export.balls import CENTRE, DENSE, RADIUS, ball_system
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.mesh import mesh_file, points_file, require_mesh, voxels_file
+from nerf_lightning.export.volume import cells_across, sample_volume
+
+SCALE, SHIFT = 0.02, torch.tensor([5.0, -1.0, 2.0])
+TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+RESOLUTION = 40
+
+
+def to_source() -> torch.Tensor:
+    """Another place, direction and scale: what a capture's own frame is to the one a run works in."""
+    similarity = torch.eye(4)
+    similarity[:3, :3] = SCALE * TURN
+    similarity[:3, 3] = SHIFT
+    return similarity
+
+
+def there(places: torch.Tensor) -> np.ndarray:
+    return (places @ (SCALE * TURN).T + SHIFT).numpy()
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_meshes_stand_in_the_photos_own_frame(suffix: str):
+    system = ball_system()
+    shape = mesh_file(system, sample_volume(system, RESOLUTION), None, to_source(), suffix)
+    assert "watertight" in shape.words
+    mesh = trimesh.load(io.BytesIO(shape.content), file_type=suffix, force="mesh")
+    vertices = np.asarray(mesh.vertices)
+    if suffix == "glb":
+        vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
+    cell = SCALE * 2 / RESOLUTION
+    radius = np.linalg.norm(vertices - there(CENTRE), axis=1)
+    assert np.percentile(np.abs(radius - SCALE * RADIUS), 95) < 1.5 * cell
+    assert mesh.volume == pytest.approx(4 / 3 * math.pi * (SCALE * RADIUS) ** 3, rel=0.2)
+    red, blue = mesh.visual.vertex_colors[:, 0], mesh.visual.vertex_colors[:, 2]
+    top, bottom = vertices[:, 2].argmax(), vertices[:, 2].argmin()
+    assert red[top] > 240 > 20 > blue[top] and blue[bottom] > 240 > 20 > red[bottom], "seen from outside"
+
+
+def test_points_are_the_meshs_vertices():
+    system = ball_system()
+    volume = sample_volume(system, RESOLUTION)
+    cloud = trimesh.load(io.BytesIO(points_file(system, volume, None, to_source()).content), file_type="ply")
+    mesh = trimesh.load(
+        io.BytesIO(mesh_file(system, volume, None, to_source(), "ply").content), file_type="ply", process=False
+    )
+    assert isinstance(cloud, trimesh.PointCloud)
+    np.testing.assert_allclose(np.asarray(cloud.vertices), mesh.vertices, atol=1e-6)
+    assert np.array_equal(cloud.colors, mesh.visual.vertex_colors)
+
+
+def test_voxels_hold_density_and_colour_and_their_place():
+    system = ball_system()
+    with np.load(io.BytesIO(voxels_file(system, sample_volume(system, RESOLUTION), to_source()).content)) as file:
+        density, rgb, place = file["density"], file["rgb"], file["to_source"]
+    assert density.shape == (RESOLUTION,) * 3 and rgb.shape == (*density.shape, 3)
+    index = np.argwhere(density * SCALE > DENSE / 2)
+    places = index @ place[:3, :3].T + place[:3, 3]
+    np.testing.assert_allclose(places.mean(0), there(CENTRE), atol=SCALE * 0.01)
+    assert np.linalg.norm(places - there(CENTRE), axis=1).max() < SCALE * (RADIUS + 0.01)
+    assert density.max() * SCALE == pytest.approx(DENSE, rel=0.01), "per unit of the photos' frame"
+
+
+def test_boxes_of_any_shape_have_cubic_cells():
+    from dataclasses import replace
+
+    system = ball_system()
+    bounds = replace(system.field.bounds, aabb=torch.tensor([[-1.0, -0.5, -0.26], [1.0, 0.5, 0.26]]), pixel=0.02)
+    system.field._bounds, system.field.aabb = bounds, bounds.aabb
+    volume = sample_volume(system, 20)
+    assert volume.density.shape == (20, 10, 6)
+    torch.testing.assert_close(volume.places(torch.tensor([[9.5, 4.5, 2.5]]))[0], torch.zeros(3), atol=1e-6, rtol=0)
+    assert (volume.density[:, :, [0, -1]] == 0).sum() == 0 or float(volume.density[0].max()) == 0
+    assert cells_across(system) == 100
+
+
+def test_without_the_extra_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(InputError, match=r"trimesh: found no such package.*pip install 'nerf_lightning\[mesh\]'"):
+        require_mesh()

@@ -1,0 +1,98 @@
+"""Frames become films, and interrupted ones go on."""
+
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.render.film import check_output, even, make_film
+
+COLOURS = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
+
+
+def plain(index: int, height: int = 9, width: int = 15) -> np.ndarray:
+    return np.full((height, width, 3), COLOURS[index], np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".webp", ".mp4"])
+def test_films_show_the_frames_in_order_and_at_their_size(suffix: str, tmp_path: Path):
+    output = tmp_path / f"film{suffix}"
+    assert make_film({}, plain, 3, output, fps=10) == 0
+    film = imageio.imread(output, plugin="pyav" if suffix == ".mp4" else "pillow", index=...)
+    assert film.shape == (3, *((10, 16) if suffix == ".mp4" else (9, 15)), 3)  # one more row and column, no resize
+    for shown, colour in zip(film, COLOURS, strict=True):
+        assert np.abs(shown.astype(int) - colour).max() <= (0 if suffix == ".gif" else 12)
+    assert [path.name for path in tmp_path.iterdir()] == [output.name]
+
+
+def test_transparency_survives(tmp_path: Path):
+    def half(index: int) -> np.ndarray:
+        return np.concatenate([plain(index), np.full((9, 15, 1), 100, np.uint8)], axis=2)
+
+    make_film({}, half, 3, tmp_path / "film.webp", fps=10)
+    film = imageio.imread(tmp_path / "film.webp", plugin="pillow", mode="RGBA", index=...)
+    assert film.shape == (3, 9, 15, 4) and (np.abs(film[..., 3].astype(int) - 100) < 5).all()
+
+
+def test_an_interrupted_film_goes_on_and_another_one_starts_anew(tmp_path: Path):
+    output, drawn = tmp_path / "film.gif", []
+
+    def failing(index: int) -> np.ndarray:
+        drawn.append(index)
+        if index == 2 and len(drawn) == 3:
+            raise KeyboardInterrupt
+        return plain(index)
+
+    with pytest.raises(KeyboardInterrupt):
+        make_film({"what": 1}, failing, 3, output, fps=10)
+    assert not output.exists()
+    assert make_film({"what": 1}, failing, 3, output, fps=10) == 2
+    assert drawn == [0, 1, 2, 2]
+    with pytest.raises(ZeroDivisionError):
+        make_film({"what": 1}, lambda index: plain(index // (1 - index)), 3, output, fps=10)
+    assert make_film({"what": 2}, plain, 3, output, fps=10) == 0, "frames of something else do not count"
+
+
+def test_a_folder_keeps_its_frames(tmp_path: Path):
+    assert make_film({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 0
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == [
+        "00000.png",
+        "00001.png",
+        "00002.png",
+        "frames.json",
+    ]
+    assert make_film({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 3
+    with pytest.raises(InputError, match="something else in it"):
+        make_film({"what": 2}, plain, 3, tmp_path / "frames", fps=10)
+
+
+@pytest.mark.parametrize(
+    ("name", "transparent", "message"),
+    [
+        ("film.avi", False, "a name ending in .gif, .mp4, .webp, or a folder"),
+        ("film.gif", True, "transparent for .gif"),
+        ("film.mp4", True, "or output=FILE.webp"),
+        ("taken", False, "a file, expected a folder for PNGs"),
+        ("folder.gif", False, "a folder, expected a file"),
+    ],
+)
+def test_places_where_no_film_can_be(name: str, transparent: bool, message: str, tmp_path: Path):
+    (tmp_path / "taken").write_text("")
+    (tmp_path / "folder.gif").mkdir()
+    with pytest.raises(InputError, match=message):
+        check_output(tmp_path / name, transparent)
+
+
+def test_even():
+    assert even(plain(0)).shape == (10, 16, 3)
+    assert np.array_equal(even(plain(0, 8, 4)), plain(0, 8, 4))
+
+
+def test_without_pyav_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[video\]'"):
+        check_output(tmp_path / "film.mp4", False)

@@ -1,0 +1,126 @@
+"""Which views a film shows, against circles whose geometry is known."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf_lightning.cameras import Cameras, orbit_around, spiral_like
+from nerf_lightning.dataset.bricks import bricks
+from nerf_lightning.errors import InputError
+from nerf_lightning.render.route import along, find_route, read_path
+
+UP = torch.tensor([0.0, 0.6, 0.8])
+CENTRE = torch.tensor([1.0, -2.0, 0.5])
+K = torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]])
+
+
+def circle(frames: int = 12, elevation: float = 0.5) -> Cameras:
+    return Cameras(K.repeat(frames, 1, 1), orbit_around(CENTRE, UP, 3.0, elevation, frames), 16, 12)
+
+
+def test_more_frames_stand_between_those_of_the_path():
+    path, fine = circle(12), along(circle(12), 24, closed=True)
+    torch.testing.assert_close(fine.c2w[::2], path.c2w, atol=1e-5, rtol=0)
+    torch.testing.assert_close(fine.K, K.repeat(24, 1, 1))
+    expected = circle(24).c2w
+    torch.testing.assert_close(fine.c2w[:, :3, :3], expected[:, :3, :3], atol=0.02, rtol=0)  # the last one, too
+    assert (fine.centres - expected[:, :3, 3]).norm(dim=1).max() < 3 * (
+        1 - math.cos(math.pi / 12)
+    ) + 1e-4  # a chord's height
+
+
+def test_an_open_path_keeps_its_ends():
+    path = circle(4)
+    fine = along(path, 9, closed=False)
+    torch.testing.assert_close(fine.c2w[[0, -1]], path.c2w[[0, -1]], atol=1e-6, rtol=0)
+    assert len(along(path[:1], 5, closed=True)) == 1
+
+
+def test_fewer_frames_are_spread_over_the_path():
+    assert torch.equal(along(circle(12), 4, closed=True).c2w, circle(12).c2w[torch.tensor([1, 4, 7, 10])])
+
+
+@pytest.mark.parametrize("elevation", [0.0, 0.5, -0.3])
+def test_a_spiral_winds_up_to_the_axis_at_the_same_distance(elevation: float):
+    spiral = spiral_like(circle(36, elevation), 60)
+    offset = spiral.centres - CENTRE
+    torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), 3.0), atol=1e-3, rtol=0)
+    torch.testing.assert_close(spiral.c2w[:, :3, 2], -offset / 3.0, atol=1e-3, rtol=0)  # all look at the middle
+    # From the circle's side of its plane, a quarter of the way to the axis is left at the top.
+    toward = UP if elevation >= 0 else -UP
+    angle = torch.acos((offset @ toward / 3.0).clamp(-1, 1))
+    assert float(angle[0]) == pytest.approx(math.pi / 2 - abs(elevation), abs=0.02)
+    assert float(angle.min()) == pytest.approx((math.pi / 2 - abs(elevation)) / 4, abs=0.02)
+    steps = (spiral.centres.roll(-1, 0) - spiral.centres).norm(dim=1)
+    assert float(steps.max()) < 3 * 2.2 * (2 * math.pi * 2 / 60), "no jump, at the end neither"
+
+
+@pytest.mark.parametrize(
+    ("path", "frames", "count"),
+    [("orbit", None, 6), ("orbit", 9, 9), ("spiral", None, 120), ("test", None, 2), ("train", 3, 3)],
+)
+def test_words(path: str, frames: int | None, count: int):
+    scene = bricks(size=16, train_views=4, val_views=2, orbit_views=6, cache="")
+    route = find_route(path, frames, scene.orbit, scene)
+    assert len(route.cameras) == len(route.views) == count
+    if path == "train":
+        assert route.views == [0, 2, 3] or len(set(route.views)) == 3
+        assert route.photos is not None
+        assert torch.equal(route.photos.images, scene.train.images[torch.tensor(route.views)])
+    else:
+        assert (route.photos is None) == (path != "test")
+
+
+def test_own_files(tmp_path: Path):
+    path = circle(3)
+    own = {"width": 16, "height": 12, "K": K.tolist(), "c2w": path.c2w.tolist()}
+    (tmp_path / "own.json").write_text(json.dumps(own))
+    read = read_path(tmp_path / "own.json")
+    torch.testing.assert_close(read.c2w, path.c2w)
+    torch.testing.assert_close(read.K, path.K)
+    flip = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    views = [
+        {"camera_to_world": (pose @ flip).flatten().tolist(), "fov": math.degrees(2 * math.atan(6 / 50))}
+        for pose in path.c2w
+    ]
+    theirs = {"render_width": 16, "render_height": 12, "camera_path": views}
+    (tmp_path / "theirs.json").write_text(json.dumps(theirs))
+    read = read_path(tmp_path / "theirs.json")
+    torch.testing.assert_close(read.c2w, path.c2w)
+    torch.testing.assert_close(read.K, path.K)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("no json", "Expecting value"),
+        ("[]", "expected width"),
+        ('{"width": 4}', "no 'c2w'"),
+        ('{"width": 4, "height": 4, "K": [[1,0,2],[0,1,2],[0,0,1]], "c2w": []}', "0 views"),
+        ('{"width": 4, "height": 4, "K": [[1,0,2],[0,1,2],[0,0,1]], "c2w": [[1,2]]}', "invalid for input"),
+        (
+            '{"width": 4, "height": 4, "K": [[NaN,0,2],[0,1,2],[0,0,1]], "c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}',
+            "not finite",
+        ),
+        (
+            '{"width": 4, "height": 4, "K": [[1,0,2],[0,1,2],[0,0,1]], "c2w": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}',
+            "no rotation",
+        ),
+    ],
+)
+def test_what_is_no_path_is_refused(content: str, message: str, tmp_path: Path):
+    (tmp_path / "path.json").write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_path(tmp_path / "path.json")
+
+
+def test_other_words_are_refused():
+    with pytest.raises(
+        InputError, match=r"path: found 'dolly', expected one of orbit, spiral, test, train, or a \.json file"
+    ):
+        find_route("dolly", None, circle(), None)
+    with pytest.raises(InputError, match=r"missing\.json: found no such file"):
+        find_route("missing.json", None, circle(), None)
