@@ -20,7 +20,8 @@ from nerf_lightning.cameras import Bounds, Cameras, Rays, pixel_to_camera, trans
 from nerf_lightning.dataset import Scene, Views, save_npz
 from nerf_lightning.dataset.bricks import bricks
 from nerf_lightning.errors import InputError
-from nerf_lightning.scene_drawing import (
+from nerf_lightning.view import view_scene
+from nerf_lightning.viewer.drawing import (
     box_edges,
     frusta,
     one_ray_each,
@@ -30,7 +31,7 @@ from nerf_lightning.scene_drawing import (
     rays_of_one,
     through,
 )
-from nerf_lightning.view import announcement, find_port, view_scene
+from nerf_lightning.viewer.serve import announcement, find_port
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -167,7 +168,7 @@ def test_looking_through_a_frustum_is_looking_as_its_camera_did(scene: Scene):
 @pytest.fixture
 def page(scene: Scene) -> Iterator:
     pytest.importorskip("viser", reason="viser is not installed")
-    from nerf_lightning.scene_page import ScenePage
+    from nerf_lightning.viewer.scene_page import ScenePage
 
     page = ScenePage(scene, "127.0.0.1", find_port("127.0.0.1", 0)[1], 8, 5, 7)
     yield page
@@ -272,7 +273,9 @@ def test_ctrl_c_ends_it_cleanly_and_nothing_is_written(scene: Scene, tmp_path: P
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], ["scene", "nothing", "give scene="]),
+        ([], ["scene and run", "nothing", "give scene=scene.npz or run=DIR"]),
+        (["scene=a.npz", "run=b"], ["scene and run", "found both"]),
+        (["run=nowhere", "port=0"], ["nowhere/config.yaml", "no such file"]),
         (["scene=a.npz", "rays=0"], ["rays", "found 0", "at least 1"]),
         (["scene=a.npz", "+ray=3"], ["ray", "unknown option", "did you mean rays?"]),
         (["scene=missing.npz", "port=0"], ["missing.npz", "nothing there"]),

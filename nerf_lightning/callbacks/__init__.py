@@ -6,6 +6,7 @@ from nerf_lightning.callbacks.checkpoints import Checkpoints
 from nerf_lightning.callbacks.enlarge import Enlarge
 from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
+from nerf_lightning.callbacks.live import Live
 from nerf_lightning.callbacks.orbit import Orbit
 from nerf_lightning.callbacks.picture_charts import PictureCharts
 from nerf_lightning.callbacks.progress import Progress
@@ -21,6 +22,7 @@ __all__ = [
     "Enlarge",
     "Guard",
     "HeldOut",
+    "Live",
     "Orbit",
     "PictureCharts",
     "Progress",

@@ -4,6 +4,7 @@ import bisect
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
@@ -37,6 +38,12 @@ class Samples:
     def directions(self, rays: Rays) -> Float[Tensor, "N 3"]:
         """Unit viewing direction of each sample."""
         return rays.directions[self.ray]
+
+    def between(self, near: float, far: float) -> "Samples":
+        """Those whose midpoints lie within two distances along their rays."""
+        keep = (self.t >= near) & (self.t <= far)
+        before = torch.cat([keep.new_zeros(1, dtype=torch.int64), keep.cumsum(0)])
+        return Samples(self.t[keep], self.dt[keep], self.ray[keep], before[self.offsets].to(self.offsets.dtype))
 
 
 def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Samples:

@@ -1,5 +1,7 @@
 """NeRF3D: fit a radiance field to rays."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -82,12 +84,15 @@ class NeRF3D(System):
         return loss
 
     @torch.no_grad()
-    def render(self, rays: Rays) -> Rendered:
-        """Renders rays without gradient and without chance, a chunk at a time."""
+    def render(self, rays: Rays, near: float = 0.0, far: float = math.inf) -> Rendered:
+        """Renders rays without gradient and without chance, a chunk at a time; what is nearer or farther is cut away."""
         parts = []
         for start in range(0, len(rays), RENDER_RAYS):
             chunk = rays[start : start + RENDER_RAYS]
-            for run, samples in split(self.sampler(chunk, self.field.density), RENDER_SAMPLES):
+            found = self.sampler(chunk, self.field.density)
+            if near > 0 or far < math.inf:
+                found = found.between(near, far)
+            for run, samples in split(found, RENDER_SAMPLES):
                 parts.append(self.renderer(chunk[run], samples, self.field))
         return Rendered(*(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "depth")))
 
