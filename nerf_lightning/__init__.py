@@ -13,10 +13,12 @@ The tree is the data flow, seven stages in order:
     system/     NeRF2D and NeRF3D: LightningModules that hold step, loss, metrics, optimiser
     callbacks/  budget, guard, held-out PSNR, snapshots, orbit, checkpoints, progress, results.json
     build.py    config -> objects, the only place that instantiates
-    view.py     a scene in the browser
+    view.py     a scene, or a trained run, in the browser: viewer/
+    render/     films and pictures of a run; evaluate/ its figures, view by view; export/ files for other programs
     sweep.py    many runs from one command line; gallery.py draws what they made
     stability/  methods tried where they are known to fail
     chart/      speed against accuracy: which method is worth its time
+    rightsize/  the smallest model that is good enough
     __main__.py the command line: compose -> build -> fit -> test -> results.json
 
 Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples

@@ -1,0 +1,139 @@
+"""Every command in docs/ works: each page is run from top to bottom, with scenes and budgets made small."""
+
+import logging
+import re
+import runpy
+import shlex
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from capture.views import SIX, SIZE, SMALL
+
+from nerf_lightning.capture.synthetic import Flaws, write_capture
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+
+SCENE = "dataset.download=false dataset.resize=16 dataset.rays=64 callbacks.orbit.frames=2 budget.seconds=null budget.steps=2"
+PICTURE = "dataset.max_side=16 dataset.pixels=64 budget.seconds=null budget.steps=2"
+SMALLER: list[tuple[str, str]] = [
+    ("experiment=pareto", f"{SCENE} recipe=tensorf_small seed=0"),
+    ("experiment=study_grid", f"{PICTURE} model.frequencies=1 model.width=16"),
+    ("experiment=study_frequencies", f"{PICTURE} model.frequencies=2"),
+    ("experiment=study_rate", f"{PICTURE} optimizer.lr=1e-1"),
+    ("render.scale=2", "dataset.max_side=16 dataset.pixels=64 budget.steps=2"),
+    ("experiment=tune_picture", f"{PICTURE} hydra.sweeper.n_trials=1"),
+    ("experiment=capture", "dataset.rays=64 callbacks.orbit.frames=2 budget.steps=2 budget.seconds=null"),
+    ("nerf_lightning.rightsize", f"{SCENE} ladder=ladder.yaml"),
+    ("best.yaml", "dataset.rays=64 callbacks.orbit.frames=2 budget.seconds=null budget.steps=2"),
+    ("experiment=lego", SCENE),
+    ("experiment=picture", PICTURE),
+    (
+        "model=ball",
+        "dataset.size=16 dataset.train_views=4 dataset.val_views=1 budget.steps=2 callbacks.orbit.frames=2 seed=0",
+    ),
+    ("nerf_lightning.stability", "methods=[tensorf] seeds=1 steps=2 workers=1"),
+    ("capture calibration", f"tags.size={SIZE} resize=60"),
+    ("nerf_lightning.render", "frames=2"),
+    ("format=compact", "loss=100"),
+    ("nerf_lightning.export", "threshold=1e-3 resolution=24"),
+]
+"""What is added to a command that holds some words; the first that fits counts."""
+COMPOSED = ("launcher=joblib", "trainer=ddp", "suite=full", "target.psnr=28")
+"""Commands that start processes of their own, or take long and resemble others: they are composed, no more."""
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def commands(page: Path) -> list[str]:
+    return [line for block in blocks(page, "bash") for line in block.splitlines() if line.strip()]
+
+
+@pytest.fixture
+def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], int]]:
+    """Runs a command line in this process, in an empty folder; returns its exit code."""
+    from nerf_lightning.viewer.field_page import FieldPage
+    from nerf_lightning.viewer.scene_page import ScenePage
+
+    def leave(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    built = ScenePage.__init__
+
+    def build_and_leave(self: ScenePage, *given: Any) -> None:
+        built(self, *given)
+        self.stop()
+        leave()
+
+    monkeypatch.setattr(FieldPage, "run", leave)
+    monkeypatch.setattr(ScenePage, "__init__", build_and_leave)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("NERF_LIGHTNING_TRACEBACK", raising=False)
+
+    def run(line: str) -> int:
+        words = shlex.split(line, comments=True)
+        while "=" in words[0]:
+            key, value = words.pop(0).split("=", 1)
+            monkeypatch.setenv(key, value)
+            if key == "PYTHONPATH":
+                monkeypatch.syspath_prepend(str(tmp_path / value))
+        assert words[:2] == ["python", "-m"], line
+        monkeypatch.setattr(sys, "argv", words[2:])
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", ".*found in sys.modules", RuntimeWarning)  # another test had it
+                runpy.run_module(words[2], run_name="__main__", alter_sys=False)
+        except SystemExit as stop:
+            return int(stop.code or 0)
+        finally:
+            logging.getLogger().handlers.clear()
+        return 0
+
+    yield run
+    sys.modules.pop("ball", None)
+
+
+def smaller(line: str) -> str:
+    if any(words in line for words in COMPOSED):
+        one = re.sub(r"(-m (?=\+))|(\w+=\d(,\d)+)", "", line.partition(" #")[0])  # of a sweep's jobs
+        return f"{one} --cfg job"
+    more = next((more for words, more in SMALLER if words in line), "")
+    return f"{line.partition(' #')[0]} {more}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_command_of_a_page_works(
+    page: Path, shell: Callable[[str], int], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    (tmp_path / "ladder.yaml").write_text("rungs: [{finest: 8, coarsest: 8}, {finest: 12, coarsest: 8}]\n")
+    for block in [*blocks(page, "python"), *blocks(page, "yaml")]:
+        file = tmp_path / block.splitlines()[0].removeprefix("# ")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(block)
+    if "calibration=" in page.read_text():
+        write_capture(tmp_path, SIX, SMALL, 6, 6, Flaws(blur=0.5, noise=2.0), seed=3)
+        (tmp_path / "calibration").rename(tmp_path / "sheet_photos")
+        (tmp_path / "photos").rename(tmp_path / "object_photos")
+    imageio.imwrite(tmp_path / "cat.jpg", np.tile(np.arange(0, 240, 10, np.uint8)[:, None, None], (1, 20, 3)))
+    assert commands(page)
+    for line in commands(page):
+        code = shell(smaller(line))
+        assert code == 0, f"{line}\n{capfd.readouterr().err}"
+
+
+def test_every_page_is_linked_and_every_link_leads_somewhere():
+    readme = (DOCS.parent / "README.md").read_text()
+    for page in PAGES:
+        assert f"docs/{page.name}" in readme, page.name
+        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+            assert (DOCS / target).exists(), f"{page.name}: {target}"
+    for target in re.findall(r"\]\(([^)#:]+)\)", readme):
+        assert (DOCS.parent / target).exists(), target
