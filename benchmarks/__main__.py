@@ -1,4 +1,4 @@
-"""python -m benchmarks: what methods, kernels, framework, capture, 2D fields and sizes cost here, and how well they do."""
+"""python -m benchmarks: what methods, kernels, framework, capture, 2D fields, sizes and shapes cost, and how well they do."""
 
 import argparse
 import os
@@ -10,10 +10,10 @@ from typing import Any
 import torch
 
 import nerf_lightning
-from benchmarks import capture, growth, kernels, methods, overhead, pictures, sizes
+from benchmarks import capture, growth, kernels, methods, overhead, pictures, shapes, sizes
 from nerf_lightning.files import write_json
 
-PARTS = ("methods", "kernels", "growth", "overhead", "capture", "pictures", "sizes")
+PARTS = ("methods", "kernels", "growth", "overhead", "capture", "pictures", "sizes", "shapes")
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -70,6 +70,8 @@ def main() -> None:
             tables = pictures.measure(overrides, seeds, arguments.output)
         elif part == "sizes":
             tables = sizes.measure(overrides, budgets[0], arguments.output)
+        elif part == "shapes":
+            tables = shapes.measure(budgets[0], arguments.output)
         elif part == "methods":
             rows, report["runs"] = methods.measure(experiments, overrides, budgets, seeds, arguments.output)
             tables = {part: rows}

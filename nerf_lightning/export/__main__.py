@@ -15,6 +15,7 @@ def task(cfg: "DictConfig") -> None:
     from omegaconf import OmegaConf
 
     given = {str(key): cfg[key] for key in cfg if key != "dataset" and not OmegaConf.is_missing(cfg, key)}
+    given |= {key: OmegaConf.to_container(value) for key, value in given.items() if OmegaConf.is_config(value)}
     given["photos"] = cfg.dataset.path
     check_options("", Order, given)
 

@@ -10,9 +10,11 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from nerf_lightning.cameras import Cameras
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.surface import Surface, find_surface
+from nerf_lightning.export.surface import Surface, find_surface, lit_cells
 from nerf_lightning.export.volume import ASKED, Volume
+from nerf_lightning.open_run import SceneRun
 from nerf_lightning.system import NeRF3D
 
 if TYPE_CHECKING:
@@ -53,30 +55,26 @@ def colours_at(system: NeRF3D, places: Float[Tensor, "N 3"], outwards: Float[Ten
 
 
 def coloured_mesh(
-    system: NeRF3D, volume: Volume, threshold: float | None, to_source: Float[Tensor, "4 4"]
+    run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None
 ) -> tuple["trimesh.Trimesh", Surface]:
-    """The surface of a field's solid with a colour at each vertex, in the frame of the photos' file.
-
-    Args:
-        to_source: similarity from the world frame to that one.
-    """
+    """The surface of a field's solid, as some cameras see it, with a colour at each vertex, in the photos' frame."""
     import trimesh
 
-    surface = find_surface(volume, threshold)
+    surface = find_surface(volume, lit_cells(run.system, volume, cameras), threshold)
     normals = torch.from_numpy(surface.normals)
     places = torch.from_numpy(surface.vertices)
     # Half a cell inside: at the very surface a colour may still be what nobody saw, in the air.
-    rgb = colours_at(system, places - normals * (volume.cell / 2), normals)
+    rgb = colours_at(run.system, places - normals * (volume.cell / 2), normals)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=rgb, process=False)
-    mesh.apply_transform(to_source.double().numpy())
+    mesh.apply_transform(run.to_source.double().numpy())
     return mesh, surface
 
 
-def mesh_file(system: NeRF3D, volume: Volume, threshold: float | None, to_source: Tensor, suffix: str) -> Shape:
+def mesh_file(run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None, suffix: str) -> Shape:
     """A coloured mesh as .ply or .glb."""
     import trimesh
 
-    mesh, surface = coloured_mesh(system, volume, threshold, to_source)
+    mesh, surface = coloured_mesh(run, cameras, volume, threshold)
     if suffix == "glb":
         scene = trimesh.Scene()
         scene.add_geometry(mesh, transform=Y_UP)
@@ -93,17 +91,17 @@ def mesh_file(system: NeRF3D, volume: Volume, threshold: float | None, to_source
     return Shape(_bytes(content), ", ".join(words))
 
 
-def points_file(system: NeRF3D, volume: Volume, threshold: float | None, to_source: Float[Tensor, "4 4"]) -> Shape:
+def points_file(run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None) -> Shape:
     """The mesh's vertices alone, with their colours, as .ply."""
     import trimesh
 
-    mesh, surface = coloured_mesh(system, volume, threshold, to_source)
+    mesh, surface = coloured_mesh(run, cameras, volume, threshold)
     colours: Any = mesh.visual
     content = trimesh.PointCloud(mesh.vertices, colours.vertex_colors).export(file_type="ply")
     return Shape(_bytes(content), f"{len(mesh.vertices):,} points, surface at opacity {surface.threshold:.2f}")
 
 
-def voxels_file(system: NeRF3D, volume: Volume, to_source: Float[Tensor, "4 4"]) -> Shape:
+def voxels_file(run: SceneRun, volume: Volume) -> Shape:
     """Densities and colours of all cells as .npz.
 
     `density` [X, Y, Z] is per unit of the photos' file, `rgb` [X, Y, Z, 3] what is seen looking along the density's
@@ -117,16 +115,16 @@ def voxels_file(system: NeRF3D, volume: Volume, to_source: Float[Tensor, "4 4"])
     outwards = -torch.nn.functional.normalize(gradient[solid], dim=-1)
     outwards[outwards.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0])  # where density is even, any side would do
     rgb = np.zeros((*solid.shape, 3), np.uint8)
-    rgb[solid.numpy()] = colours_at(system, volume.places(index.float()), outwards)
+    rgb[solid.numpy()] = colours_at(run.system, volume.places(index.float()), outwards)
     to_world = torch.eye(4, dtype=torch.float64)
     to_world[:3, :3] *= volume.cell
     to_world[:3, 3] = volume.places(torch.zeros(1, 3))[0]
-    scale = float(torch.linalg.det(to_source[:3, :3].double())) ** (1 / 3)
+    scale = float(torch.linalg.det(run.to_source[:3, :3].double())) ** (1 / 3)
     file = io.BytesIO()
     arrays: dict[str, Any] = {
         "density": (volume.density / scale).numpy().astype(np.float32),
         "rgb": rgb,
-        "to_source": (to_source.double() @ to_world).numpy(),
+        "to_source": (run.to_source.double() @ to_world).numpy(),
     }
     np.savez_compressed(file, **arrays)
     shape = " x ".join(map(str, solid.shape))

@@ -18,4 +18,5 @@ class Order:
     content: str
     resolution: Count | None
     threshold: float | None
+    box: list[float] | None
     photos: str | None

@@ -1,4 +1,4 @@
-"""From densities to a surface: where a solid begins, without what floats and without what nobody can see inside it."""
+"""From densities to a surface: where light ends, without what floats and without what nobody can see inside a solid."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,17 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy import ndimage
 
+from nerf_lightning.cameras import Cameras
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.volume import Volume
+from nerf_lightning.progress import tracked
+from nerf_lightning.system import NeRF3D
 
 BINS = 128
 EMPTY = 0.02
 """Opacity of a cell below which it is nothing at all, and says nothing about where to draw the line."""
+FAR = 1e9
+"""Distance at which a ray ends that meets nothing."""
 FLOATER = 0.01
 """A piece with fewer cells than this share of the largest one's floats, and is left out."""
 
@@ -49,45 +54,76 @@ def otsu(values: Float[ndarray, "N"]) -> float:
     return float(edges[1:][np.flatnonzero(best >= best.max() * (1 - 1e-9))].mean())
 
 
-def solid_of(opacity: Float[ndarray, "X Y Z"], threshold: float) -> tuple[Bool[ndarray, "X Y Z"], int]:
-    """Which cells are solid, and how many floating pieces were left out; what is enclosed counts as solid."""
-    pieces, count = ndimage.label(opacity > threshold, structure=np.ones((3, 3, 3)))
-    if not count:
-        return np.zeros(opacity.shape, bool), 0
-    sizes = np.bincount(pieces.ravel())[1:]
-    large = np.flatnonzero(sizes >= FLOATER * sizes.max()) + 1
-    return ndimage.binary_fill_holes(np.isin(pieces, large)), count - len(large)
+@torch.no_grad()
+def lit_cells(system: NeRF3D, volume: Volume, cameras: Cameras) -> Bool[ndarray, "X Y Z"]:
+    """Cells that at least one view has in sight, up to the surface it renders there; all others are inside something.
+
+    Args:
+        system: the field that the volume was sampled from.
+        volume: whose cells are asked about.
+        cameras: views from where the field is known.
+    """
+    places = volume.places(
+        torch.stack(torch.meshgrid(*map(torch.arange, volume.density.shape), indexing="ij"), -1).float()
+    )
+    places = places.view(-1, 3)
+    dark = torch.arange(len(places))
+    for view in tracked(range(len(cameras)), len(cameras), "views"):
+        rendered = system.render(cameras.view_rays(view).to(system.device))
+        ends = torch.where(rendered.opacity > 0.5, rendered.depth, FAR).cpu() + volume.cell
+        # At an outline a pixel's depth is a mean of near and far: the nearest of its neighbours' counts.
+        ends = -torch.nn.functional.max_pool2d(-ends.view(1, cameras.height, cameras.width), 3, 1, 1).flatten()
+        offset = places[dark] - cameras.centres[view]
+        local = offset @ cameras.c2w[view, :3, :3]
+        pixels = local @ cameras.K[view].T
+        col, row = (pixels[:, :2] / pixels[:, 2:]).nan_to_num(-1).clamp(-1, 1e6).floor().long().unbind(1)
+        seen = (local[:, 2] > 0) & (col >= 0) & (col < cameras.width) & (row >= 0) & (row < cameras.height)
+        reach = torch.where(seen, ends[row * seen * cameras.width + col * seen], 0.0)
+        dark = dark[offset.norm(dim=1) > reach]
+    lit = torch.ones(len(places), dtype=torch.bool)
+    lit[dark] = False
+    return lit.view(volume.density.shape).numpy()
 
 
-def find_surface(volume: Volume, threshold: float | None = None) -> Surface:
-    """The surface of what is dense, by marching cubes (Lewiner et al. 2003).
+def box_around(mask: Bool[ndarray, "X Y Z"]) -> Bool[ndarray, "X Y Z"]:
+    """The cells of the smallest box that holds all marked ones: what is in the dark beyond it, such as under a floor, is not
+    inside anything."""
+    box = np.zeros(mask.shape, bool)
+    marked = np.argwhere(mask)
+    if len(marked):
+        box[tuple(slice(low, high + 1) for low, high in zip(marked.min(0), marked.max(0), strict=True))] = True
+    return box
+
+
+def find_surface(volume: Volume, lit: Bool[ndarray, "X Y Z"], threshold: float | None = None) -> Surface:
+    """The surface of what is dense or in the dark, by marching cubes (Lewiner et al. 2003).
 
     Args:
         volume: densities.
-        threshold: opacity of a cell at the surface, in (0, 1); None finds it from the histogram.
+        lit: see `lit_cells`; what is not counts as solid, be it empty or a tangle.
+        threshold: opacity of a cell at the surface, in (0, 1); None finds it from the histogram of cells in the light.
 
     Raises:
         InputError: where nothing is as dense as that, or the threshold is none.
     """
     from skimage.measure import marching_cubes
 
-    opacity = volume.opacity.numpy()
-    if threshold is None:
-        threshold = otsu(opacity[opacity > EMPTY])
-    if not 0 < threshold < 1:
+    if threshold is not None and not 0 < threshold < 1:
         raise InputError("config", "threshold", str(threshold), "between 0 and 1")
-    solid, floaters = solid_of(opacity, threshold)
-    if not solid.any():
-        found = f"nothing above an opacity of {threshold:.2f} a cell"
-        raise InputError(
-            "config", "threshold", found, f"at most {opacity.max():.2f}", "train longer, or lower threshold"
-        )
-    # Pieces left out are empty, also around what stays of them; what is enclosed is full. A margin closes the box's sides.
-    near = ndimage.binary_dilation(solid, np.ones((3, 3, 3)))
-    inner = ndimage.binary_erosion(solid, np.ones((3, 3, 3)))
-    level = np.where(near, opacity, 0.0)
-    level[solid] = np.maximum(level[solid], threshold + 1e-3 * (1 - threshold))
-    level[inner] = 1.0
+    level = volume.opacity.numpy()
+    if threshold is None:
+        threshold = otsu(level[lit & (level > EMPTY)])
+    most = level.max()
+    level = np.where(lit | ~box_around(lit & (level > threshold)), level, 1.0)
+    pieces, count = ndimage.label(level > threshold, structure=np.ones((3, 3, 3)))
+    if not most > threshold:
+        found, expected = f"nothing above an opacity of {threshold:.2f} a cell", f"at most {most:.2f}"
+        raise InputError("config", "threshold", found, expected, "train longer, or lower threshold")
+    sizes = np.bincount(pieces.ravel())[1:]
+    floating = np.flatnonzero(sizes < FLOATER * sizes.max()) + 1
+    # A margin closes the box's sides; pieces that float go, with the haze around them.
+    gone = np.isin(pieces, floating)
+    level[ndimage.binary_dilation(gone, np.ones((3, 3, 3))) & (gone | (pieces == 0))] = 0
     vertices, faces, normals, _ = marching_cubes(np.pad(level, 1), threshold)
     places = volume.places(torch.from_numpy(vertices - 1).float()).numpy()
-    return Surface(places, faces[:, ::-1].copy(), normals.astype(np.float32), float(threshold), floaters)
+    return Surface(places, faces[:, ::-1].copy(), normals.astype(np.float32), float(threshold), len(floating))

@@ -1,17 +1,22 @@
 """The export verb's options -> a file."""
 
+from dataclasses import replace
+from operator import lt
 from pathlib import Path
 
 import torch
 
 from nerf_lightning.build import build_data
+from nerf_lightning.cameras import Cameras, spiral_like
+from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.errors import InputError
+from nerf_lightning.evenly import evenly
 from nerf_lightning.export.mesh import mesh_file, points_file, require_mesh, voxels_file
 from nerf_lightning.export.order import Order
-from nerf_lightning.export.smallest import PRECISIONS, smallest
-from nerf_lightning.export.volume import cells_across, sample_volume
+from nerf_lightning.export.smallest import MOST_VIEWS, PRECISIONS, smallest, some_cameras
+from nerf_lightning.export.volume import cells_across, cropped, sample_volume
 from nerf_lightning.files import atomic
-from nerf_lightning.open_run import beside, open_run, open_scene_run
+from nerf_lightning.open_run import SceneRun, beside, open_run, open_scene_run
 from nerf_lightning.run_folder import plain_config
 
 NAMES = {
@@ -38,6 +43,8 @@ def export(order: Order) -> None:
     if order.precision not in (None, *PRECISIONS):
         found, expected = repr(order.precision), "half, byte, or null for the smaller one that is allowed"
         raise InputError("config", "precision", found, expected)
+    if order.box is not None and not (len(order.box) == 6 and all(map(lt, order.box[:3], order.box[3:]))):
+        raise InputError("config", "box", str(order.box), "the lower, then the upper corner: [x,y,z,x,y,z]")
     source = Path(order.run).expanduser()
     output = beside(source) / NAMES[order.format, order.content]
     if order.output is not None:
@@ -65,11 +72,28 @@ def shaped(order: Order, source: Path) -> tuple[bytes, str]:
     """A run as a mesh, points or voxels."""
     found = open_scene_run(source)
     volume = sample_volume(found.system, order.resolution or cells_across(found.system))
+    if order.box is not None:
+        volume = cropped(volume, torch.tensor(order.box).view(2, 3), found.to_source)
     if order.format == "npz":
-        shape = voxels_file(found.system, volume, found.to_source)
+        shape = voxels_file(found, volume)
     elif order.content == "points":
-        shape = points_file(found.system, volume, order.threshold, found.to_source)
+        shape = points_file(found, views_of(found, order.photos), volume, order.threshold)
     else:
-        shape = mesh_file(found.system, volume, order.threshold, found.to_source, order.format)
+        shape = mesh_file(found, views_of(found, order.photos), volume, order.threshold, order.format)
     scale = float(torch.linalg.det(found.to_source[:3, :3].double())) ** (1 / 3)
     return shape.content, f"{len(shape.content) / 1e6:,.2f} MB, {shape.words}, cells of {volume.cell * scale:.4g}"
+
+
+def views_of(run: SceneRun, photos: str | None) -> Cameras:
+    """From where a run's field is known: its photos' cameras, or where these are gone its orbit and what lies above that."""
+    try:
+        data = build_data(run.cfg, photos)
+    except InputError as error:
+        if photos is not None:
+            raise
+        print(f"without the photos' cameras, from the orbit: {error}")
+        spiral, count = spiral_like(run.orbit, MOST_VIEWS // 2), MOST_VIEWS // 2
+        orbit = run.orbit[torch.tensor(evenly(len(run.orbit), count))]
+        return replace(spiral, K=torch.cat([orbit.K, spiral.K]), c2w=torch.cat([orbit.c2w, spiral.c2w]))
+    assert isinstance(data, RayDataModule)  # of a scene's run
+    return some_cameras(data)

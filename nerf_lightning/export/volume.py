@@ -7,12 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.cameras import transform
 from nerf_lightning.export.reach import occupied_cells
 from nerf_lightning.progress import tracked
 from nerf_lightning.system import NeRF3D
 
 COARSEST, FINEST = 64, 256
 """Cells along the box's longest side, where nobody says how many."""
+PIXELS = 1.25
+"""Width of a cell in pixels: at one pixel what a surface has too much is noise."""
 ASKED = 1 << 17
 """Places asked together: bounds the memory of one call."""
 
@@ -38,9 +41,9 @@ class Volume:
 
 
 def cells_across(system: NeRF3D) -> int:
-    """As many cells along the box's longest side as the photos show pixels there, within bounds."""
+    """Cells along the box's longest side, somewhat larger than what a pixel of the photos shows, within bounds."""
     bounds = system.field.bounds
-    across = 2 * float(bounds.half_size.max()) / bounds.pixel if bounds.pixel else math.inf
+    across = 2 * float(bounds.half_size.max()) / (PIXELS * bounds.pixel) if bounds.pixel else math.inf
     return round(min(max(across, COARSEST), FINEST))
 
 
@@ -74,3 +77,16 @@ def sample_volume(system: NeRF3D, resolution: int) -> Volume:
         found[asked] = torch.cat([system.field.density(part) for part in places[asked].split(ASKED)])
         volume.density[start:stop] = found.view(stop - start, *shape[1:]).cpu()
     return replace(volume, density=volume.density.nan_to_num(0.0).clamp_min(0.0))
+
+
+def cropped(volume: Volume, box: Float[Tensor, "2 3"], to_source: Float[Tensor, "4 4"]) -> Volume:
+    """Empty wherever a cell's centre lies outside a box.
+
+    Args:
+        box: lower and upper corner in the frame of the photos' own file.
+        to_source: similarity from the world frame to that one.
+    """
+    index = torch.stack(torch.meshgrid(*[torch.arange(n) for n in volume.density.shape], indexing="ij"), dim=-1)
+    places = transform(to_source, volume.places(index.float()))
+    inside = ((places >= box[0]) & (places <= box[1])).all(-1)
+    return replace(volume, density=volume.density * inside)

@@ -3,11 +3,13 @@
 from pathlib import Path
 
 import torch
+from omegaconf import OmegaConf
 
 from nerf_lightning.build import SceneFrame, build_system
-from nerf_lightning.cameras import Bounds
+from nerf_lightning.cameras import Bounds, Cameras, orbit_around
 from nerf_lightning.compose import composed
 from nerf_lightning.model import Field
+from nerf_lightning.open_run import SceneRun
 from nerf_lightning.system import NeRF3D
 
 DENSE = 80.0
@@ -34,3 +36,12 @@ def ball_system() -> NeRF3D:
     assert isinstance(system, NeRF3D)
     system.field = BallField(bounds)
     return system.eval()
+
+
+def ball_run(to_source: torch.Tensor) -> SceneRun:
+    """The same as a run that was looked at from above and from below."""
+    K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
+    up = torch.tensor([0.0, 0.0, 1.0])
+    poses = torch.cat([orbit_around(CENTRE, up, 3.0, elevation, 8) for elevation in (-0.6, 0.6)])
+    orbit = Cameras(K.repeat(16, 1, 1), poses, 32, 24)
+    return SceneRun(OmegaConf.create(), ball_system(), orbit, to_source)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from export.balls import CENTRE, DENSE, RADIUS, ball_system
+from export.balls import CENTRE, DENSE, RADIUS, ball_run, ball_system
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.mesh import mesh_file, points_file, require_mesh, voxels_file
-from nerf_lightning.export.volume import cells_across, sample_volume
+from nerf_lightning.export.volume import cells_across, cropped, sample_volume
 
 SCALE, SHIFT = 0.02, torch.tensor([5.0, -1.0, 2.0])
 TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -33,8 +33,8 @@ def there(places: torch.Tensor) -> np.ndarray:
 
 @pytest.mark.parametrize("suffix", ["ply", "glb"])
 def test_meshes_stand_in_the_photos_own_frame(suffix: str):
-    system = ball_system()
-    shape = mesh_file(system, sample_volume(system, RESOLUTION), None, to_source(), suffix)
+    run = ball_run(to_source())
+    shape = mesh_file(run, run.orbit, sample_volume(run.system, RESOLUTION), None, suffix)
     assert "watertight" in shape.words
     mesh = trimesh.load(io.BytesIO(shape.content), file_type=suffix, force="mesh")
     vertices = np.asarray(mesh.vertices)
@@ -50,11 +50,11 @@ def test_meshes_stand_in_the_photos_own_frame(suffix: str):
 
 
 def test_points_are_the_meshs_vertices():
-    system = ball_system()
-    volume = sample_volume(system, RESOLUTION)
-    cloud = trimesh.load(io.BytesIO(points_file(system, volume, None, to_source()).content), file_type="ply")
+    run = ball_run(to_source())
+    volume = sample_volume(run.system, RESOLUTION)
+    cloud = trimesh.load(io.BytesIO(points_file(run, run.orbit, volume, None).content), file_type="ply")
     mesh = trimesh.load(
-        io.BytesIO(mesh_file(system, volume, None, to_source(), "ply").content), file_type="ply", process=False
+        io.BytesIO(mesh_file(run, run.orbit, volume, None, "ply").content), file_type="ply", process=False
     )
     assert isinstance(cloud, trimesh.PointCloud)
     np.testing.assert_allclose(np.asarray(cloud.vertices), mesh.vertices, atol=1e-6)
@@ -62,8 +62,8 @@ def test_points_are_the_meshs_vertices():
 
 
 def test_voxels_hold_density_and_colour_and_their_place():
-    system = ball_system()
-    with np.load(io.BytesIO(voxels_file(system, sample_volume(system, RESOLUTION), to_source()).content)) as file:
+    run = ball_run(to_source())
+    with np.load(io.BytesIO(voxels_file(run, sample_volume(run.system, RESOLUTION)).content)) as file:
         density, rgb, place = file["density"], file["rgb"], file["to_source"]
     assert density.shape == (RESOLUTION,) * 3 and rgb.shape == (*density.shape, 3)
     index = np.argwhere(density * SCALE > DENSE / 2)
@@ -71,6 +71,19 @@ def test_voxels_hold_density_and_colour_and_their_place():
     np.testing.assert_allclose(places.mean(0), there(CENTRE), atol=SCALE * 0.01)
     assert np.linalg.norm(places - there(CENTRE), axis=1).max() < SCALE * (RADIUS + 0.01)
     assert density.max() * SCALE == pytest.approx(DENSE, rel=0.01), "per unit of the photos' frame"
+
+
+def test_what_lies_outside_a_box_is_cut_off():
+    run = ball_run(to_source())
+    middle = there(CENTRE)
+    half = torch.tensor(np.stack([middle - SCALE, middle + [SCALE, SCALE, 0]]), dtype=torch.float32)
+    volume = cropped(sample_volume(run.system, RESOLUTION), half, run.to_source)
+    shape = mesh_file(run, run.orbit, volume, 0.5, "ply")
+    mesh = trimesh.load(io.BytesIO(shape.content), file_type="ply")
+    low, high = mesh.bounds
+    cell = SCALE * 2 / RESOLUTION
+    assert abs(high[2] - middle[2]) < cell and abs(low[2] - (middle[2] - SCALE * RADIUS)) < 1.5 * cell
+    assert mesh.is_watertight, "closed where it was cut"
 
 
 def test_boxes_of_any_shape_have_cubic_cells():
@@ -83,7 +96,7 @@ def test_boxes_of_any_shape_have_cubic_cells():
     assert volume.density.shape == (20, 10, 6)
     torch.testing.assert_close(volume.places(torch.tensor([[9.5, 4.5, 2.5]]))[0], torch.zeros(3), atol=1e-6, rtol=0)
     assert (volume.density[:, :, [0, -1]] == 0).sum() == 0 or float(volume.density[0].max()) == 0
-    assert cells_across(system) == 100
+    assert cells_across(system) == 80
 
 
 def test_without_the_extra_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):

@@ -1,0 +1,104 @@
+"""Shapes: meshes of trained fields against the surfaces that were photographed."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+
+from benchmarks.capture import FLAWS, LENS, SHEETS, SIZE, home
+from benchmarks.methods import train
+from nerf_lightning.capture.outputs import Packing
+from nerf_lightning.capture.run import capture
+from nerf_lightning.capture.synthetic import write_capture
+from nerf_lightning.capture.tabletop import Tabletop
+from nerf_lightning.dataset.brickmodel import bulldozer
+from nerf_lightning.export.mesh import mesh_file
+from nerf_lightning.export.verb import views_of
+from nerf_lightning.export.volume import cells_across, cropped, sample_volume
+from nerf_lightning.open_run import SceneRun, open_scene_run
+
+Rows = list[dict[str, Any]]
+PHOTOS, VIEWS = 20, 40
+"""Of the sheet, and of the object."""
+ABOVE = 0.002
+"""Metres above the table from which on the object alone is looked at."""
+
+
+def distance_to_bricks(points: np.ndarray) -> np.ndarray:
+    """Signed distance [N] of points [N, 3] to the built-in scene's solids, negative inside: exact outside of all, and inside
+    at most the depth in the one that a point lies deepest in."""
+    solids = bulldozer()
+    least = np.full(len(points), np.inf)
+    for index in range(len(solids)):
+        local, half = (points - solids.centre[index]) @ solids.axes[index].T, solids.half[index]
+        if solids.cylinder[index]:
+            beyond = np.stack([np.hypot(local[:, 0], local[:, 1]) - half[0], np.abs(local[:, 2]) - half[2]], axis=1)
+        else:
+            beyond = np.abs(local) - half
+        outside, inside = np.linalg.norm(beyond.clip(0), axis=1), beyond.max(1).clip(max=0)
+        least = np.minimum(least, outside + inside)
+    return least
+
+
+def mesh_of(run: SceneRun, box: torch.Tensor | None = None) -> tuple[trimesh.Trimesh, float]:
+    """A run's mesh, read back from its file, and the side of a voxel in the same unit."""
+    volume = sample_volume(run.system, cells_across(run.system))
+    if box is not None:
+        volume = cropped(volume, box, run.to_source)
+    content = mesh_file(run, views_of(run, None), volume, None, "ply").content
+    scale = float(torch.linalg.det(run.to_source[:3, :3].double())) ** (1 / 3)
+    mesh: Any = trimesh.load(io.BytesIO(content), file_type="ply")
+    return mesh, volume.cell * scale
+
+
+def of_bricks(seconds: float, output: Path) -> Rows:
+    """How far the vertices of a mesh are from the built-in scene's surface, in voxels.
+
+    A random background teaches a field the outlines too: before a black one dark things need no density.
+    """
+    rows: Rows = []
+    for recipe in ("tensorf_medium", "voxels_medium", "hashgrid_medium"):
+        folder = output / "shapes" / recipe
+        given = ["dataset=bricks", f"recipe={recipe}", f"budget.seconds={seconds}", "renderer.background=random"]
+        trained = train("lego", given, 0, folder)
+        mesh, voxel = mesh_of(open_scene_run(folder))
+        off = np.abs(distance_to_bricks(np.asarray(mesh.vertices))) / voxel
+        row = {"field": recipe, "psnr": trained["psnr"], "voxel": voxel}
+        row |= {f"p{share}_voxels": float(np.percentile(off, share)) for share in (50, 95, 99)}
+        rows.append({**row, "watertight": mesh.is_watertight, "triangles": len(mesh.faces)})
+    return rows
+
+
+def of_capture(seconds: float, output: Path) -> Rows:
+    """How large the object of a synthetic capture is in its mesh, beside its true size, metres."""
+    folder = output / "shapes" / "capture"
+    layout = SHEETS["six tags"]
+    write_capture(folder, layout, LENS, PHOTOS, VIEWS, FLAWS, 0)
+    found = capture(folder / "calibration", folder / "photos", SIZE, Packing(folder / "scene.npz"))
+    given = [f"dataset.path='{folder}/scene.npz'", "dataset.resize=400", f"budget.seconds={seconds}"]
+    trained = train("capture", given, 0, folder / "run")
+    run = open_scene_run(folder / "run")
+    low, high = (torch.from_numpy(corner).float() for corner in Tabletop(layout).box)
+    # The true world is that of the layout; the run's source is the frame of the tag that the solver took for home.
+    to_truth = torch.from_numpy(home(found.solved, layout)).float()
+    run = SceneRun(run.cfg, run.system, run.orbit, to_truth @ run.to_source)
+    room = 0.2 * (high - low)
+    box = torch.stack([low - room, high + room])
+    box[0, 2] = ABOVE
+    mesh, voxel = mesh_of(run, box)
+    largest = max(mesh.split(only_watertight=False), key=lambda part: len(part.faces))
+    rows: Rows = []
+    for axis, name in enumerate("xyz"):
+        true, start = float(high[axis] - low[axis]), largest.bounds[0, axis]
+        size = largest.bounds[1, axis] - (start if axis < 2 else 0.0)  # what stands on the table begins there
+        row = {"axis": name, "true_m": true, "mesh_m": size, "off_percent": 100 * (size / true - 1)}
+        rows.append({**row, "voxel_m": voxel, "psnr": trained["psnr"]})
+    return rows
+
+
+def measure(seconds: float, output: Path) -> dict[str, Rows]:
+    """Both tables."""
+    return {"shapes": of_bricks(seconds, output), "capture shapes": of_capture(seconds, output)}

@@ -1,0 +1,87 @@
+"""python -m nerf_lightning.evaluate, on a run of seconds."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import imageio.v3 as imageio
+import pytest
+import torch
+
+from nerf_lightning.compose import composed
+from nerf_lightning.dataset import save_npz
+from nerf_lightning.dataset.bricks import bricks
+from nerf_lightning.evaluate import perceptual
+from nerf_lightning.evaluate.__main__ import task
+from nerf_lightning.evaluate.perceptual import perceptual_distance
+from nerf_lightning.evaluate.verb import Judged, averages
+from nerf_lightning.training import train
+
+
+@pytest.fixture
+def run(small_run: Path, tmp_path: Path) -> Path:
+    shutil.copytree(small_run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def evaluated(run: Path, *given: str) -> dict:
+    task(composed([f"run={run}", *given], run, "evaluate"))
+    return json.loads((run / "evaluation" / "views.json").read_text())
+
+
+def test_every_view_is_judged_as_the_run_was(run: Path, capsys: pytest.CaptureFixture[str]):
+    found = evaluated(run)
+    out = capsys.readouterr().out
+    results = json.loads((run / "results.json").read_text())
+    assert len(found["views"]) == results["scene"]["views"]["val"] == 2
+    assert found["mean"]["psnr"] == pytest.approx(results["psnr"], abs=0.02)  # which is rounded
+    assert min(one["psnr"] for one in found["views"]) == pytest.approx(results["psnr_worst_view"], abs=0.02)
+    assert found["mean"]["ssim"] == pytest.approx(results["ssim"], abs=1e-3)
+    assert found["mean"]["lpips"] is None and "no LPIPS: photos of less than 64 pixels" in out
+    assert out.count("<- worst") == 1 and f"{found['mean']['psnr']:.2f} dB over 2 held-out views" in out
+    both = imageio.imread(run / "evaluation" / "worst.png")
+    evaluated(run, "worst=1")
+    assert len(imageio.imread(run / "evaluation" / "worst.png")) == len(both) // 2
+
+
+def test_other_photos_of_the_same_thing(run: Path, tmp_path: Path):
+    save_npz(bricks(size=24, train_views=4, val_views=3, cache=""), tmp_path / "other.npz")
+    found = evaluated(run, f"dataset.path={tmp_path}/other.npz")
+    assert len(found["views"]) == 3 and found["scene"]["resolution"] == [24, 24]
+
+
+def test_pictures_too(tmp_path: Path):
+    given = ["+experiment=smoke_2d", "dataset.max_side=32", "budget.steps=2", "~logger"]
+    train(composed([*given, *(f"callbacks.{one}=null" for one in ("training_gif", "charts", "baselines"))], tmp_path))
+    (view,) = evaluated(tmp_path)["views"]
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert view["psnr"] == pytest.approx(results["psnr"], abs=0.02)
+
+
+def test_means_are_of_what_could_be_told():
+    judged = [Judged(0, 20.0, math.nan, None, 1.0), Judged(1, 30.0, 0.5, None, 3.0)]
+    assert averages(judged) == {"psnr": 25.0, "ssim": None, "lpips": None, "seconds": 2.0}
+
+
+def test_lpips_is_told_where_its_weights_are_and_nothing_is_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: None)
+    assert perceptual_distance(100, 100) == (None, "torchvision is not installed")
+    monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: name)
+    assert perceptual_distance(100, 100) == (None, f"{tmp_path}/checkpoints/alexnet-owt-7be5be79.pth is not there")
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").write_bytes(b"")
+    asked = {}
+
+    def metric(first: torch.Tensor, second: torch.Tensor, net_type: str, normalize: bool) -> torch.Tensor:
+        asked.update(shape=first.shape, net=net_type, normalize=normalize)
+        return (first - second).abs().mean()
+
+    monkeypatch.setattr(
+        "torchmetrics.functional.image.learned_perceptual_image_patch_similarity", metric, raising=False
+    )
+    distance, why = perceptual_distance(100, 80)
+    assert distance is not None and why == ""
+    assert distance(torch.ones(80, 100, 3), torch.zeros(80, 100, 3)) == 1.0
+    assert asked == {"shape": (1, 3, 80, 100), "net": "alex", "normalize": True}, "pictures in [0, 1], channels first"
