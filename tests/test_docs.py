@@ -28,7 +28,6 @@ SMALLER: list[tuple[str, str]] = [
     ("experiment=study_frequencies", f"{PICTURE} model.frequencies=2"),
     ("experiment=study_rate", f"{PICTURE} optimizer.lr=1e-1"),
     ("render.scale=2", "dataset.max_side=16 dataset.pixels=64 budget.steps=2"),
-    ("experiment=tune_picture", f"{PICTURE} hydra.sweeper.n_trials=1"),
     ("experiment=capture", "dataset.rays=64 callbacks.orbit.frames=2 budget.steps=2 budget.seconds=null"),
     ("nerf_lightning.rightsize", f"{SCENE} ladder=ladder.yaml"),
     ("best.yaml", "dataset.rays=64 callbacks.orbit.frames=2 budget.seconds=null budget.steps=2"),
@@ -45,8 +44,8 @@ SMALLER: list[tuple[str, str]] = [
     ("nerf_lightning.export", "threshold=1e-3 resolution=24"),
 ]
 """What is added to a command that holds some words; the first that fits counts."""
-COMPOSED = ("launcher=joblib", "trainer=ddp", "suite=full", "target.psnr=28")
-"""Commands that start processes of their own, or take long and resemble others: they are composed, no more."""
+COMPOSED = ("launcher=joblib", "trainer=ddp", "tune_picture", "suite=full", "target.psnr=28")
+"""Commands that start processes of their own, are tested as such elsewhere, or take long: they are composed, no more."""
 
 
 def blocks(page: Path, language: str) -> list[str]:

@@ -115,7 +115,7 @@ def find_surface(volume: Volume, lit: Bool[ndarray, "X Y Z"], threshold: float |
         threshold = otsu(level[lit & (level > EMPTY)])
     most = level.max()
     level = np.where(lit | ~box_around(lit & (level > threshold)), level, 1.0)
-    pieces, count = ndimage.label(level > threshold, structure=np.ones((3, 3, 3)))
+    pieces, _ = ndimage.label(level > threshold, structure=np.ones((3, 3, 3)))
     if not most > threshold:
         found, expected = f"nothing above an opacity of {threshold:.2f} a cell", f"at most {most:.2f}"
         raise InputError("config", "threshold", found, expected, "train longer, or lower threshold")
