@@ -49,9 +49,8 @@ def mesh_of(run: SceneRun, box: torch.Tensor | None = None) -> tuple[trimesh.Tri
     if box is not None:
         volume = cropped(volume, box, run.to_source)
     content = mesh_file(run, views_of(run, None), volume, None, "ply").content
-    scale = float(torch.linalg.det(run.to_source[:3, :3].double())) ** (1 / 3)
     mesh: Any = trimesh.load(io.BytesIO(content), file_type="ply")
-    return mesh, volume.cell * scale
+    return mesh, volume.cell * run.scale
 
 
 def of_bricks(seconds: float, output: Path) -> Rows:

@@ -8,13 +8,13 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning import names  # noqa: F401  (conf/ uses its resolvers)
@@ -62,6 +62,13 @@ def quoted(arguments: Sequence[str], keys: Sequence[str]) -> list[str]:
             argument = f"{key}='{escaped}'"
         found.append(argument)
     return found
+
+
+def given_of(cfg: DictConfig) -> dict[str, Any]:
+    """The keys of a verb on a run, as plain values: those that have one, and `dataset.path` as `photos`."""
+    given = {str(key): cfg[key] for key in cfg if key != "dataset" and not OmegaConf.is_missing(cfg, key)}
+    given |= {key: OmegaConf.to_container(value) for key, value in given.items() if OmegaConf.is_config(value)}
+    return {**given, "photos": cfg.dataset.path}
 
 
 def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] = ()) -> None:

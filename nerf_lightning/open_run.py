@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
@@ -24,6 +25,11 @@ class SceneRun:
     system: NeRF3D
     orbit: Cameras
     to_source: Float[Tensor, "4 4"]
+
+    @property
+    def scale(self) -> float:
+        """Length of a world unit in the frame of the photos' own file."""
+        return float(torch.linalg.det(self.to_source[:3, :3].double())) ** (1 / 3)
 
 
 def open_run(path: Path) -> RunFolder:

@@ -22,14 +22,19 @@ def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[ndarray, "H W 3"]:
     return (image.clamp(0, 1) * 255).round().byte().numpy()
 
 
+def near_bright(depth: Float[ndarray, "H W"], low: float, high: float) -> UInt8[ndarray, "H W 3"]:
+    """Depths on a scale that is even to the eye: bright at `low` and nearer, dark at `high` and farther."""
+    nearness = 1 - (depth - low) / max(high - low, 1e-9)
+    return cv2.applyColorMap((nearness.clip(0, 1) * 255).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1]
+
+
 def depth_colours(depth: Float[Tensor, "H W"], opacity: Float[Tensor, "H W"]) -> UInt8[ndarray, "H W 3"]:
     """Near bright, far dark, empty black; the range is that of the covered pixels (2nd to 98th percentile)."""
     covered = opacity > 0.5
     if not covered.any():
         return np.zeros((*depth.shape, 3), np.uint8)
     low, high = np.percentile(depth[covered].numpy(), [2, 98])
-    nearness = 1 - (depth.numpy() - low) / max(high - low, 1e-9)
-    colours = cv2.applyColorMap((nearness.clip(0, 1) * 255).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1]
+    colours = near_bright(depth.numpy(), float(low), float(high))
     return (colours * opacity.clamp(0, 1).numpy()[..., None]).astype(np.uint8)
 
 

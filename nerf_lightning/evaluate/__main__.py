@@ -15,10 +15,7 @@ def options(run: str, output: str | None, worst: Count, photos: str | None) -> N
 
 def task(cfg: "DictConfig") -> None:
     """Checks the configuration and evaluates."""
-    from omegaconf import OmegaConf
-
-    given = {str(key): cfg[key] for key in cfg if key != "dataset" and not OmegaConf.is_missing(cfg, key)}
-    given["photos"] = cfg.dataset.path
+    given = cli.given_of(cfg)
     check_options("", options, given)
 
     from nerf_lightning.evaluate.verb import evaluate

@@ -12,11 +12,7 @@ if TYPE_CHECKING:
 
 def task(cfg: "DictConfig") -> None:
     """Checks the configuration and exports."""
-    from omegaconf import OmegaConf
-
-    given = {str(key): cfg[key] for key in cfg if key != "dataset" and not OmegaConf.is_missing(cfg, key)}
-    given |= {key: OmegaConf.to_container(value) for key, value in given.items() if OmegaConf.is_config(value)}
-    given["photos"] = cfg.dataset.path
+    given = cli.given_of(cfg)
     check_options("", Order, given)
 
     from nerf_lightning.export.verb import export

@@ -119,10 +119,9 @@ def voxels_file(run: SceneRun, volume: Volume) -> Shape:
     to_world = torch.eye(4, dtype=torch.float64)
     to_world[:3, :3] *= volume.cell
     to_world[:3, 3] = volume.places(torch.zeros(1, 3))[0]
-    scale = float(torch.linalg.det(run.to_source[:3, :3].double())) ** (1 / 3)
     file = io.BytesIO()
     arrays: dict[str, Any] = {
-        "density": (volume.density / scale).numpy().astype(np.float32),
+        "density": (volume.density / run.scale).numpy().astype(np.float32),
         "rgb": rgb,
         "to_source": (run.to_source.double() @ to_world).numpy(),
     }

@@ -80,8 +80,7 @@ def shaped(order: Order, source: Path) -> tuple[bytes, str]:
         shape = points_file(found, views_of(found, order.photos), volume, order.threshold)
     else:
         shape = mesh_file(found, views_of(found, order.photos), volume, order.threshold, order.format)
-    scale = float(torch.linalg.det(found.to_source[:3, :3].double())) ** (1 / 3)
-    return shape.content, f"{len(shape.content) / 1e6:,.2f} MB, {shape.words}, cells of {volume.cell * scale:.4g}"
+    return shape.content, f"{len(shape.content) / 1e6:,.2f} MB, {shape.words}, cells of {volume.cell * found.scale:.4g}"
 
 
 def views_of(run: SceneRun, photos: str | None) -> Cameras:

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from nerf_lightning.callbacks.panels import near_bright
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.evenly import evenly
 from nerf_lightning.renderer import Rendered
@@ -75,10 +75,7 @@ def colours(rendered: Rendered, channel: str, style: Style) -> Float[Tensor, "R 
 
 def depth_colours(depth: Float[Tensor, "R"], depths: tuple[float, float]) -> Float[Tensor, "R 3"]:
     """Near bright, far dark, by a scale that is even to the eye."""
-    low, high = depths
-    nearness = 1 - (depth.cpu().numpy() - low) / (high - low)
-    table = (nearness.clip(0, 1) * 255).astype(np.uint8)[:, None]
-    painted = cv2.applyColorMap(table, cv2.COLORMAP_INFERNO)[:, 0, ::-1]
+    painted = near_bright(depth.cpu().numpy()[:, None], *depths)[:, 0]
     return torch.from_numpy(painted.copy()).to(depth.device).float() / 255
 
 

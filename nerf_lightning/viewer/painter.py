@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from nerf_lightning.callbacks.panels import to_bytes
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.evenly import evenly
 from nerf_lightning.render.frame import Style, colours, depth_range
@@ -100,6 +101,6 @@ class Painter:
         )
         depths = self.depths() if wish.channel == "depth" else (0.0, 1.0)
         painted = colours(rendered, wish.channel, Style((wish.channel,), wish.background, depths))
-        picture = (painted.clamp(0, 1) * 255).round().byte().view(cameras.height, cameras.width, 3).cpu().numpy()
+        picture = to_bytes(painted.view(cameras.height, cameras.width, 3).cpu())
         self.rate = 0.5 * self.rate + 0.5 * len(rays) / max(time.perf_counter() - began, 1e-4)
         return np.ascontiguousarray(picture)
