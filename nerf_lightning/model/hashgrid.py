@@ -8,11 +8,12 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import hash_interpolate, mlp, mlp_heads, spherical_harmonics
+from nerf_lightning.kernels import hash_interpolate, mlp, mlp_heads
 from nerf_lightning.kernels.hashgrid import corners
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field
 from nerf_lightning.model.pruning import vertices_in
+from nerf_lightning.model.view_dependence import harmonics_up_to, seen_from
 from nerf_lightning.model.widening import widen_all
 from nerf_lightning.options import Count
 
@@ -109,11 +110,12 @@ class HashGridField(Field):
         bounds: the box the grid covers.
         levels, log2_entries, features, coarsest, finest: the grid, see `HashGrid`.
         width: neurons of the hidden layers (one for density, two for colour).
+        degree: see `TensoRFField`.
         density: "relu", "softplus" or "exp".
         size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
 
     Raises:
-        InputError: where coarsest > finest, or for another `size`.
+        InputError: where coarsest > finest, for another `size`, or for a degree above 3.
     """
 
     GEOMETRY = 15  # features handed from density to colour network, Instant-NGP section 5.4
@@ -129,6 +131,7 @@ class HashGridField(Field):
         coarsest: Count = 16,
         finest: Count = 256,
         width: Count = 64,
+        degree: int = 3,
         density: str = "exp",
         size: str = "fixed",
     ):
@@ -136,7 +139,8 @@ class HashGridField(Field):
         self.grid = HashGrid(levels, log2_entries, features, *self.grid_sizes(coarsest, finest, size))
         self.activation = density_activation(density)
         self.density_net = layers(self.grid.width, width, 1 + self.GEOMETRY)
-        self.colour_net = layers(self.GEOMETRY + 16, width, width, 3)
+        self.terms = harmonics_up_to(degree)
+        self.colour_net = layers(self.GEOMETRY + self.terms, width, width, 3)
         self.starts_thin = density == "exp"
         self.reset_parameters()
 
@@ -153,7 +157,7 @@ class HashGridField(Field):
         columns = self.grid.take(smaller.grid)
         if (columns >= 0).all():
             widen_all(self.density_net, smaller.density_net, columns)
-            widen_all(self.colour_net, smaller.colour_net, torch.arange(self.GEOMETRY + 16))
+            widen_all(self.colour_net, smaller.colour_net, torch.arange(self.GEOMETRY + smaller.terms))
 
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
         self.grid.prune(reached)
@@ -164,4 +168,4 @@ class HashGridField(Field):
         return self.activation(raw[:, 0]), geometry
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(mlp(features, weights(self.colour_net), spherical_harmonics(directions)))
+        return torch.sigmoid(mlp(features, weights(self.colour_net), seen_from(directions, self.terms)))

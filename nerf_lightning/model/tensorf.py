@@ -9,12 +9,13 @@ from torch.nn.functional import interpolate
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import mlp, plane_line_products, plane_line_sum, spherical_harmonics
+from nerf_lightning.kernels import mlp, plane_line_products, plane_line_sum
 from nerf_lightning.kernels.planes import PLANE_AXES
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field, replace_data
 from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
 from nerf_lightning.model.pruning import vertices_in
+from nerf_lightning.model.view_dependence import harmonics_up_to, seen_from
 from nerf_lightning.model.widening import widen_all
 from nerf_lightning.options import Count
 
@@ -103,11 +104,14 @@ class TensoRFField(Field):
         stages: how many sizes there are, growing geometrically.
         grown: fraction of the budget after which the planes have their finest size; the stages before are equally long.
         width: neurons of the hidden layer.
+        degree: of the spherical harmonics of the direction that the network sees, 0 to 3; with 0 colours are the same from
+            everywhere. Few photos may be better off with less than 3.
         density: "relu", "softplus" or "exp".
         size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
 
     Raises:
-        InputError: where coarsest > finest, for another `size`, for a single stage of two sizes, or `grown` outside [0, 1].
+        InputError: where coarsest > finest, for another `size`, for a single stage of two sizes, for a degree above 3, or
+            `grown` outside [0, 1].
     """
 
     fastest = 0.2
@@ -122,6 +126,7 @@ class TensoRFField(Field):
         stages: Count = 4,
         grown: float = 0.3,
         width: Count = 32,
+        degree: int = 3,
         density: str = "exp",
         size: str = "fixed",
     ):
@@ -137,7 +142,8 @@ class TensoRFField(Field):
         self.density_volume = VectorMatrix(coarsest, density_components)
         self.colour_volume = VectorMatrix(coarsest, colour_components)
         self.activation = density_activation(density)
-        self.colour_net = layers(3 * colour_components + 16, width, 3)
+        self.terms = harmonics_up_to(degree)
+        self.colour_net = layers(3 * colour_components + self.terms, width, 3)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         unit = self.bounds.to_unit(positions)
@@ -148,7 +154,7 @@ class TensoRFField(Field):
         return self.activation(self.density_volume.total(self.bounds.to_unit(positions))) / self.unit_length
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(mlp(features, weights(self.colour_net), spherical_harmonics(directions)))
+        return torch.sigmoid(mlp(features, weights(self.colour_net), seen_from(directions, self.terms)))
 
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
         self.density_volume.prune(reached)
@@ -171,7 +177,7 @@ class TensoRFField(Field):
                 volume.resize(self.resolutions[-1])
         has, had = (volume.lines.shape[2] for volume in (self.colour_volume, smaller.colour_volume))
         products = [mode * has + one for mode in range(3) for one in range(had)]
-        columns = torch.tensor([*products, *range(3 * has, 3 * has + 16)])
+        columns = torch.tensor([*products, *range(3 * has, 3 * has + smaller.terms)])
         widen_all(self.colour_net, smaller.colour_net, columns)
 
     def grow(self, progress: float) -> list[torch.nn.Parameter]:

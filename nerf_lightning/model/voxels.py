@@ -15,12 +15,12 @@ from nerf_lightning.kernels import (
     mark_rows,
     read_voxels,
     roughness,
-    spherical_harmonics,
     voxel_value,
 )
 from nerf_lightning.model.activation import truncated_exp
 from nerf_lightning.model.field import Field, replace_data
 from nerf_lightning.model.pruning import vertices_in, widened
+from nerf_lightning.model.view_dependence import harmonics_up_to, seen_from
 from nerf_lightning.options import Count
 
 EMPTY = -8.0
@@ -83,8 +83,6 @@ class VoxelField(Field):
     ):
         super().__init__(bounds)
         coarsest, finest = self.grid_sizes(coarsest, finest, size)
-        if not 0 <= degree <= 3:
-            raise InputError("model.degree", "", str(degree), "0 to 3")
         if not 0 < grown <= 1:
             raise InputError("model.grown", "", str(grown), "above 0, at most 1")
         if not density_rate > 0:
@@ -96,7 +94,7 @@ class VoxelField(Field):
         # Early stages are short: a coarse grid learns what it can in a few steps a vertex.
         self.times = [grown * (i / intervals) ** 2 for i in range(stages)]
         self.grown_after = self.times[-1]
-        self.terms = (degree + 1) ** 2 - 1
+        self.terms = harmonics_up_to(degree) - 1  # without the constant one
         self.density_rate = density_rate
         # Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog before cameras.
         self.fastest = 1 / density_rate
@@ -137,7 +135,7 @@ class VoxelField(Field):
         rows, weights = locate(self.index, self.bounds.to_unit(positions))
         if torch.is_grad_enabled():
             mark_rows(self.seen, rows, self.steps)
-        basis = spherical_harmonics(directions)[:, 1 : 1 + self.terms]
+        basis = seen_from(directions, 1 + self.terms)[:, 1:]
         raw, rgb = read_voxels(self.log_density, self.colours, self.views, rows, weights, basis)
         return self.per_length(raw), torch.sigmoid(rgb)
 

@@ -117,11 +117,10 @@ class FieldPage(Page):
             self.channel = gui.add_dropdown("channel", CHANNELS)
             self.background = gui.add_dropdown("background", tuple(self.backgrounds))
             self.most = gui.add_slider("resolution", 64, 2048, 32, min(max(most, 64), 2048), hint="longer side, pixels")
-            step = self.scale / 100
-            self.near = gui.add_slider("near", 0.0, 3 * self.scale, step, 0.0, hint="what is nearer is cut away")
-            self.far = gui.add_slider(
-                "far", 0.0, 3 * self.scale, step, 3 * self.scale, hint="what is farther is cut away"
-            )
+            most_far = float(f"{3 * self.scale:.2g}")
+            step = most_far / 200
+            self.near = gui.add_slider("near", 0.0, most_far, step, 0.0, hint="what is nearer is cut away")
+            self.far = gui.add_slider("far", 0.0, most_far, step, most_far, hint="what is farther is cut away")
             for control in (self.channel, self.background, self.most, self.near, self.far):
                 control.on_update(lambda _: self._want())
         with gui.add_folder("show"):

@@ -1,0 +1,45 @@
+"""How finely colours depend on the direction: what each degree can tell apart."""
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.errors import InputError
+from nerf_lightning.model import HashGridField, TensoRFField
+from nerf_lightning.model.view_dependence import harmonics_up_to, seen_from
+
+BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("kind", [TensoRFField, HashGridField])
+def test_colours_turn_with_the_direction_no_faster_than_their_degree(kind: type, degree: int, kernels: str):
+    """Where no rectifier closes, the logits of a colour are a polynomial of that degree in the direction: around a circle
+    their Fourier series ends there."""
+    field = kind(BOX, degree=degree, width=8)
+    first, *others = field.colour_net
+    first.bias.data += 4.0
+    for layer in others:
+        layer.weight.data -= layer.weight.data.mean(1, keepdim=True)  # so that the 4 is not seen behind it
+        layer.bias.data.fill_(4.0 if layer is not others[-1] else 0.0)
+    turn = torch.arange(16) * (2 * torch.pi / 16)
+    plane = torch.linalg.qr(torch.randn(3, 2)).Q
+    directions = normalize(torch.stack([turn.cos(), turn.sin()], dim=1) @ plane.T, dim=1)
+    logits = torch.special.logit(field(torch.full((16, 3), 0.3), directions)[1].double())
+    waves = torch.fft.rfft(logits - logits.mean(0), dim=0).abs()
+    assert waves[degree + 1 :].max() < 1e-3
+    assert degree == 0 or waves[degree].max() > 1e-2
+
+
+def test_terms_are_the_first_harmonics():
+    directions = normalize(torch.randn(20, 3), dim=1)
+    assert [harmonics_up_to(degree) for degree in range(4)] == [1, 4, 9, 16]
+    assert torch.equal(seen_from(directions, 4), seen_from(directions, 16)[:, :4])
+
+
+@pytest.mark.parametrize("degree", [-1, 4])
+@pytest.mark.parametrize("kind", [TensoRFField, HashGridField])
+def test_degrees_that_there_are_not_are_refused(kind: type, degree: int):
+    with pytest.raises(InputError, match="model.degree.*0 to 3"):
+        kind(BOX, degree=degree)
