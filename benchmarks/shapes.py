@@ -1,6 +1,7 @@
 """Shapes: meshes of trained fields against the surfaces that were photographed."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ def of_capture(seconds: float, output: Path) -> Rows:
     low, high = (torch.from_numpy(corner).float() for corner in Tabletop(layout).box)
     # The true world is that of the layout; the run's source is the frame of the tag that the solver took for home.
     to_truth = torch.from_numpy(home(found.solved, layout)).float()
-    run = SceneRun(run.cfg, run.system, run.orbit, to_truth @ run.to_source)
+    run = replace(run, to_source=to_truth @ run.to_source)
     room = 0.2 * (high - low)
     box = torch.stack([low - room, high + room])
     box[0, 2] = ABOVE

@@ -30,13 +30,10 @@ def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
     Raises:
         InputError: where the key is missing, or its target refuses or does not know an option.
     """
-    node = OmegaConf.select(cfg, path)
-    if node is None:
-        raise InputError("config", path, "nothing", f"one of the options of the group {path}", f"give {path}=NAME")
+    target, node = target_of(cfg, path), OmegaConf.select(cfg, path)
     missing = sorted(OmegaConf.missing_keys(node))
     if missing:
         raise InputError("config", missing[0], "nothing", "a value", f"give {missing[0]}=...")
-    target = target_of(cfg, path)
     late = bool(node.get("_partial_"))
     options = {key: value for key, value in resolved(node).items() if key not in ("_target_", "_partial_")}
     check_options(path, target, options, extra, complete=not late)
@@ -58,8 +55,12 @@ def target_of(cfg: DictConfig, path: str) -> Any:
     Raises:
         InputError: where it names none, or none that can be imported.
     """
+    node = OmegaConf.select(cfg, path)
+    if not isinstance(node, DictConfig):
+        found = "nothing" if node is None else repr(node)
+        raise InputError("config", path, found, f"one of the options of the group {path}", f"give {path}=NAME")
     try:
-        return hydra.utils.get_object(OmegaConf.select(cfg, path)["_target_"])
+        return hydra.utils.get_object(node["_target_"])
     except (ImportError, AttributeError, ValueError, ConfigKeyError) as error:
         raise InputError("config", f"{path}._target_", str(error), "an importable class or function") from error
 

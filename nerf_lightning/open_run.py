@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -25,6 +26,7 @@ class SceneRun:
     system: NeRF3D
     orbit: Cameras
     to_source: Float[Tensor, "4 4"]
+    scene: dict[str, Any]
 
     @property
     def scale(self) -> float:
@@ -53,7 +55,7 @@ def open_scene_run(path: Path) -> SceneRun:
     found = open_run(path)
     if not isinstance(found.system, NeRF3D) or found.orbit is None or found.to_source is None:
         raise InputError(path, "", "a picture's run", "a scene's run", "final.png shows a picture")
-    return SceneRun(found.cfg, found.system, found.orbit, found.to_source)
+    return SceneRun(found.cfg, found.system, found.orbit, found.to_source, found.scene)
 
 
 def beside(path: Path) -> Path:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from nerf_lightning.build import Frame, PictureFrame, SceneFrame, build_system, frame_of, resolved
 from nerf_lightning.cameras import Bounds, Cameras
-from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
+from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic, write_json
 from nerf_lightning.system import System
@@ -34,12 +34,25 @@ FORMAT = 1
 TRUST = "NERF_LIGHTNING_TRUST"
 """Environment variable: further packages, comma-separated, whose classes a run folder may name."""
 
-LIBRARY_TARGETS = {
-    "lightning.Trainer",
-    "lightning.pytorch.loggers.TensorBoardLogger",
-    "torch.optim.Adam",
-    "torch.optim.AdamW",
+TARGETS = {
+    "lightning": ("Trainer",),
+    "lightning.pytorch.loggers": ("TensorBoardLogger",),
+    "nerf_lightning.callbacks": (
+        *("Baselines", "Checkpoints", "Enlarge", "Guard", "HeldOut", "Live", "Orbit", "PictureCharts", "Progress"),
+        *("Snapshots", "Throughput", "TrainingGif"),
+    ),
+    "nerf_lightning.dataset": ("from_bricks", "from_download", "from_photos", "from_picture"),
+    "nerf_lightning.model": (
+        *("FourierField", "HashGrid2DField", "HashGridField", "MLPField", "PictureMLP", "SirenField", "TensoRFField"),
+        "VoxelField",
+    ),
+    "nerf_lightning.renderer": ("VolumeRenderer",),
+    "nerf_lightning.sampler": ("ImportanceSampler", "OccupancySampler", "UniformSampler"),
+    "nerf_lightning.system": ("constant", "cosine", "exponential"),
+    "torch.optim": ("Adam", "AdamW"),
 }
+"""What a run folder may name: a module's names that configurations are made of. Anything else could be called with a
+stranger's arguments."""
 
 
 def plain_config(cfg: DictConfig) -> dict[str, Any]:
@@ -95,7 +108,11 @@ def _check(path: Path | str, key: str, node: Any) -> None:
             _check(path, f"{key}.{name}" if key else str(name), value)
             if name == "_target_" and not _trusted(value):
                 raise InputError(
-                    path, f"{key}._target_", repr(value), "a class of this package", f"set {TRUST} to allow its package"
+                    path,
+                    f"{key}._target_",
+                    repr(value),
+                    "a class of this package that configurations name",
+                    f"set {TRUST} to allow its package",
                 )
     elif isinstance(node, list):
         for index, value in enumerate(node):
@@ -105,16 +122,15 @@ def _check(path: Path | str, key: str, node: Any) -> None:
 
 
 def _trusted(target: Any) -> bool:
-    """Whether a target is one of the library's, or defined (not merely imported) in a trusted package."""
+    """Whether a target is on the list, or defined (not merely imported) in a package that the user trusts."""
     if not isinstance(target, str):
         return False
-    if target in LIBRARY_TARGETS:
-        return True
-    packages = ["nerf_lightning", *filter(None, os.environ.get(TRUST, "").split(","))]
-    package = target.split(".")[0]
-    if package not in packages:
-        return False
     module, _, name = target.rpartition(".")
+    if name in TARGETS.get(module, ()):
+        return True
+    package = target.split(".")[0]
+    if package not in filter(None, os.environ.get(TRUST, "").split(",")):
+        return False
     try:
         found = getattr(importlib.import_module(module), name, None)
     except ImportError:
@@ -131,6 +147,8 @@ def scene_content(data: RayDataModule | PixelDataModule) -> dict[str, Any]:
     """The same as plain values."""
     scene, frame = data.scene, frame_of(data)
     content: dict[str, Any] = {"format": FORMAT, **scene.describe()}
+    if scene.source != BUILT_IN:
+        content["source"] = os.path.abspath(scene.source)
     if isinstance(scene, Scene) and isinstance(frame, SceneFrame):
         content |= {
             "background": list(frame.background),
@@ -160,6 +178,8 @@ class RunFolder:
     """None for a picture."""
     to_source: Float[Tensor, "4 4"] | None
     """Similarity from the world frame to that of the photos' own file; None for a picture."""
+    scene: dict[str, Any]
+    """What scene.json says."""
 
 
 def frame_from(scene: dict[str, Any]) -> tuple[Frame, Cameras | None, Tensor | None]:
@@ -186,19 +206,7 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
         InputError: where a file is missing, broken, or does not fit the others.
     """
     cfg = load_config(folder)
-    path = folder / "scene.json"
-    try:
-        scene = json.loads(path.read_text())
-        if scene.get("format", FORMAT) != FORMAT:
-            found, expected = f"format {scene['format']}", f"format {FORMAT}, which this version reads"
-            raise InputError(path, "format", found, expected, "use the version of nerf_lightning that made the run")
-        frame, orbit, to_source = frame_from(scene)
-    except InputError:
-        raise
-    except FileNotFoundError as error:
-        raise InputError(path, "", "no such file", "the scene of a run") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise InputError(path, "", f"{type(error).__name__}: {error}", "the scene of a run, whole") from error
+    scene, (frame, orbit, to_source) = load_scene(folder)
     system = build_system(cfg, frame)
     state = read_checkpoint(folder / "checkpoints" / checkpoint)
     try:
@@ -207,7 +215,28 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
         raise InputError(
             folder / "checkpoints" / checkpoint, "state_dict", str(error), "the weights of this run's model"
         ) from error
-    return RunFolder(cfg, system.eval(), orbit, to_source)
+    return RunFolder(cfg, system.eval(), orbit, to_source, scene)
+
+
+def load_scene(folder: Path) -> tuple[dict[str, Any], tuple[Frame, Cameras | None, Tensor | None]]:
+    """What a run's scene.json says, and what `frame_from` makes of it.
+
+    Raises:
+        InputError: where it is missing, broken, or of another version.
+    """
+    path = folder / "scene.json"
+    try:
+        scene = json.loads(path.read_text())
+        if scene.get("format", FORMAT) != FORMAT:
+            found, expected = f"format {scene['format']}", f"format {FORMAT}, which this version reads"
+            raise InputError(path, "format", found, expected, "use the version of nerf_lightning that made the run")
+        return scene, frame_from(scene)
+    except InputError:
+        raise
+    except FileNotFoundError as error:
+        raise InputError(path, "", "no such file", "the scene of a run") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        raise InputError(path, "", f"{type(error).__name__}: {error}", "the scene of a run, whole") from error
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -25,7 +25,8 @@ from nerf_lightning.kernels import use_kernels
 from nerf_lightning.machine import CROWDED, crowding
 from nerf_lightning.model import Field
 from nerf_lightning.options import AtLeast, Count, check_options
-from nerf_lightning.run_folder import load_config, read_checkpoint, save_config, save_scene
+from nerf_lightning.run_data import data_again
+from nerf_lightning.run_folder import load_config, load_scene, read_checkpoint, save_config, save_scene
 from nerf_lightning.seeding import step_generator
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 
@@ -47,13 +48,17 @@ def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None =
         InputError: on bad input, most of it before anything is written into the run's folder.
     """
     folder = folder or Path(HydraConfig.get().runtime.output_dir)
-    if cfg.resume is not None:
+    resumed = cfg.resume is not None
+    if resumed:
         cfg, checkpoint = resume(cfg, folder)
     quiet()
     settings = {"seed": cfg.seed, "threads": cfg.threads, "kernels": cfg.kernels}
     check_options("", prepare_process, settings)
     prepare_process(**settings)
-    data = build_data(cfg)
+    if resumed:
+        data = data_again(cfg, load_scene(folder)[0], cfg.dataset.get("path"))
+    else:
+        data = build_data(cfg)
     doubts = check_scene(data.scene) if isinstance(data, RayDataModule) else []
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt)

@@ -107,11 +107,11 @@ def view_run(run: str, photo_side: int, side: int, host: str, port: int) -> None
 
 def photos_of(found: "SceneRun") -> "Scene | None":
     """The photos a run was trained on; None, and a line that says so, where they are no longer there."""
-    from nerf_lightning.build import build_data
     from nerf_lightning.dataset import Scene
+    from nerf_lightning.run_data import data_again
 
     try:
-        scene = build_data(found.cfg).scene
+        scene = data_again(found.cfg, found.scene).scene
     except InputError as error:
         print(f"without photos: {error}", flush=True)
         return None

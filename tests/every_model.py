@@ -1,6 +1,6 @@
 """Trains every shipped model for a moment and prints a fingerprint of its weights; run as a process of its own.
 
-python every_model.py FOLDER SEED STOP [MODEL ...]     (interrupted after STOP steps and resumed; 0: in one go)
+python every_model.py FOLDER STOP     (interrupted after STOP steps and resumed; 0: in one go)
 """
 
 import hashlib
@@ -33,14 +33,15 @@ MODELS = {
     "fourier": [*PICTURE, "model.width=32"],
     "siren": [*PICTURE, "model.width=32"],
 }
-STEPS = 40
+ANOTHER = "siren, another seed"
+STEPS = 24
 
 
 class Stop(Exception):
     """Training is to end here."""
 
 
-def main(folder: Path, seed: int, stop: int, models: list[str]) -> None:
+def main(folder: Path, stop: int) -> None:
     save = Checkpoints.on_train_batch_end
 
     def save_and_stop(self: Checkpoints, trainer: Any, *rest: Any) -> None:
@@ -50,11 +51,10 @@ def main(folder: Path, seed: int, stop: int, models: list[str]) -> None:
             raise Stop
 
     prints = {}
-    for model in models:
-        run = folder / model
-        cfg = composed(
-            [*MODELS[model], f"model={model}", f"seed={seed}", "threads=2", f"budget.steps={STEPS}", "~logger"], run
-        )
+    for name in [*MODELS, ANOTHER]:
+        model, seed, run = name.partition(",")[0], int(name == ANOTHER), folder / name
+        options = [f"model={model}", f"seed={seed}", "threads=2", f"budget.steps={STEPS}", "~logger"]
+        cfg = composed([*MODELS[model], *options], run)
         last = run / "checkpoints" / "last.ckpt"
         if stop:
             Checkpoints.on_train_batch_end = save_and_stop  # type: ignore[method-assign]
@@ -64,7 +64,7 @@ def main(folder: Path, seed: int, stop: int, models: list[str]) -> None:
                 Checkpoints.on_train_batch_end = save  # type: ignore[method-assign]
             assert json.loads((run / "results.json").read_text())["steps"] == stop
         train(cfg, last if stop else None)
-        prints[model] = fingerprint(run / "checkpoints" / "last.ckpt")
+        prints[name] = fingerprint(run / "checkpoints" / "last.ckpt")
     print(json.dumps(prints))
 
 
@@ -79,4 +79,4 @@ def fingerprint(checkpoint: Path) -> str:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:] or list(MODELS))
+    main(Path(sys.argv[1]), int(sys.argv[2]))

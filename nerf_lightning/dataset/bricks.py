@@ -17,7 +17,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras, look_at, orbit_around
 from nerf_lightning.dataset.brickmodel import bulldozer
 from nerf_lightning.dataset.bricktrace import picture, shadow
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.scene import BUILT_IN, Scene, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic
 
@@ -62,7 +62,7 @@ def bricks(
     centre = aabb.mean(0)
     return Scene(
         name="bricks",
-        source="built-in",
+        source=BUILT_IN,
         train=Views(torch.from_numpy(images[0]), train),
         val=Views(torch.from_numpy(images[1]), val),
         orbit=orbit,

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras
 
+BUILT_IN = "built-in"
+"""The source of what this package makes itself."""
+
 
 @dataclass(frozen=True)
 class Views:
@@ -29,7 +32,7 @@ class Scene:
     name: str
     """A short word for file names and captions, "lego" or "bricks"."""
     source: str
-    """Where it came from: a path, an address, or "built-in"."""
+    """Where it came from: a path, or `BUILT_IN`."""
     train: Views
     val: Views
     """Held out: never trained on."""

@@ -17,6 +17,7 @@ from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PixelDataModule
 from nerf_lightning.dataset.rays import RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
+from nerf_lightning.dataset.scene import BUILT_IN
 from nerf_lightning.files import atomic
 from nerf_lightning.options import Count
 
@@ -85,7 +86,7 @@ def from_download(
             except OSError as error:
                 problem += f" and {url} could not be fetched ({error})"
         if problem:
-            log.warning("%s: training on the built-in scene 'bricks' instead", problem)
+            log.warning("%s: the built-in scene 'bricks' stands in for it", problem)
             return from_bricks(size=resize or 200, rays=rays, samples=samples, seed=seed)
         path = str(local)
     return from_photos(path, resize=resize, near=near, far=far, rays=rays, samples=samples, seed=seed)
@@ -113,9 +114,7 @@ def from_picture(
     """
     if path is None:
         # Square, and drawn from formulas: it is known at any size.
-        picture = Picture(
-            "sunset", "built-in", builtin_picture(max_side or 256), lambda width, _: builtin_picture(width)
-        )
+        picture = Picture("sunset", BUILT_IN, builtin_picture(max_side or 256), lambda width, _: builtin_picture(width))
     else:
         source = Path(path)
         original = load_picture(source)

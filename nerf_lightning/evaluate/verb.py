@@ -9,12 +9,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from nerf_lightning.build import build_data
 from nerf_lightning.callbacks.panels import result_panel, write_png
 from nerf_lightning.evaluate.perceptual import perceptual_distance
 from nerf_lightning.files import write_json
 from nerf_lightning.open_run import beside, open_run
 from nerf_lightning.progress import tracked
+from nerf_lightning.run_data import data_again
 from nerf_lightning.system import ViewResult
 
 
@@ -45,7 +45,7 @@ def evaluate(run: str, output: str | None, worst: int, photos: str | None) -> No
     """
     source = Path(run).expanduser()
     found = open_run(source)
-    data = build_data(found.cfg, photos)
+    data = data_again(found.cfg, found.scene, photos)
     folder = beside(source) / "evaluation" if output is None else Path(output).expanduser()
     first = data.held_out(0)
     distance, why = perceptual_distance(first.width, first.height)

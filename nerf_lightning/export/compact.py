@@ -111,7 +111,8 @@ def decode(content: bytes, path: Path | str) -> RunFolder:
         if (header["format"], header["version"]) != (FORMAT, VERSION):
             found = f"{header['format']}, version {header['version']}"
             raise InputError(path, "header", found, f"{FORMAT}, version {VERSION}", "export the run again")
-        config, (frame, orbit, to_source) = header["config"], frame_from(header["scene"])
+        config, scene = header["config"], header["scene"]
+        frame, orbit, to_source = frame_from(scene)
         tensors = {key: _decoded(key, arrays, one["code"], one["shape"]) for key, one in header["arrays"].items()}
     except InputError:
         raise
@@ -125,7 +126,7 @@ def decode(content: bytes, path: Path | str) -> RunFolder:
             system.sampler.unpack(_of("sampler", tensors))
     except (KeyError, RuntimeError) as error:
         raise InputError(path, "", str(error), "the weights of the model it names") from error
-    return RunFolder(cfg, system.eval(), orbit, to_source)
+    return RunFolder(cfg, system.eval(), orbit, to_source, scene)
 
 
 def _of(part: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

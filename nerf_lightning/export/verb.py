@@ -6,7 +6,6 @@ from pathlib import Path
 
 import torch
 
-from nerf_lightning.build import build_data
 from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.errors import InputError
@@ -17,6 +16,7 @@ from nerf_lightning.export.smallest import MOST_VIEWS, PRECISIONS, smallest, som
 from nerf_lightning.export.volume import cells_across, cropped, sample_volume
 from nerf_lightning.files import atomic
 from nerf_lightning.open_run import SceneRun, beside, open_run, open_scene_run
+from nerf_lightning.run_data import data_again
 from nerf_lightning.run_folder import plain_config
 
 NAMES = {
@@ -60,7 +60,7 @@ def export(order: Order) -> None:
 def compacted(order: Order, source: Path) -> tuple[bytes, str]:
     """A run as one small file."""
     found = open_run(source)
-    data = build_data(found.cfg, order.photos)
+    data = data_again(found.cfg, found.scene, order.photos)
     before = sum(tensor.numel() * tensor.element_size() for tensor in found.system.state_dict().values())
     compact = smallest(found.system, data, plain_config(found.cfg), order.loss, order.precision)
     size = f"{len(compact.content) / 1000:,.1f} kB of {before / 1000:,.1f} kB (precision={compact.precision})"
@@ -86,7 +86,7 @@ def shaped(order: Order, source: Path) -> tuple[bytes, str]:
 def views_of(run: SceneRun, photos: str | None) -> Cameras:
     """From where a run's field is known: its photos' cameras, or where these are gone its orbit and what lies above that."""
     try:
-        data = build_data(run.cfg, photos)
+        data = data_again(run.cfg, run.scene, photos)
     except InputError as error:
         if photos is not None:
             raise

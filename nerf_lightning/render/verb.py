@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerf_lightning.build import build_data
 from nerf_lightning.callbacks.panels import panel
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.errors import InputError
@@ -19,6 +18,7 @@ from nerf_lightning.render.frame import CHANNELS, ERROR_TIMES, Style, depth_rang
 from nerf_lightning.render.order import Order
 from nerf_lightning.render.route import WITH_PHOTOS, Route, find_route
 from nerf_lightning.renderer.renderer import NAMED
+from nerf_lightning.run_data import data_again
 from nerf_lightning.system import NeRF3D
 
 BLACK = (0.0, 0.0, 0.0)
@@ -82,7 +82,7 @@ def the_route(order: Order, found: SceneRun) -> Route:
             key = "scale" if order.scale != 1 else "background"
             value = order.scale if order.scale != 1 else order.background
             raise InputError("config", key, str(value), f"scale=1 and a colour beside photos (path={order.path})")
-        data = build_data(found.cfg, order.photos)
+        data = data_again(found.cfg, found.scene, order.photos)
         assert isinstance(data, RayDataModule)  # of a scene's run
         scene = data.scene
     route = find_route(order.path, order.frames, found.orbit, scene)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from nerf_lightning.dataset.pixels import Picture
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.scene import BUILT_IN, Scene, Views
 from nerf_lightning.stability import damage
 from nerf_lightning.stability.toys import MARBLE, PILE, ROD, around, photograph, toy
 
@@ -61,12 +61,12 @@ def picture(width: int = 48, height: int = 48) -> Picture:
     phase = np.pi * across**2 * width / 6
     waves = [np.sin(phase[None, :] + tilt * down[:, None]) for tilt in (0.0, 3.0, 9.0)]
     return Picture(
-        "waves", "built-in", torch.from_numpy((127.5 + 110 * np.stack(waves, axis=-1)).round().astype(np.uint8))
+        "waves", BUILT_IN, torch.from_numpy((127.5 + 110 * np.stack(waves, axis=-1)).round().astype(np.uint8))
     )
 
 
 def _one_colour(seed: int) -> Picture:
-    return Picture("plain", "built-in", torch.tensor([200, 120, 40], dtype=torch.uint8).expand(96, 96, 3).contiguous())
+    return Picture("plain", BUILT_IN, torch.tensor([200, 120, 40], dtype=torch.uint8).expand(96, 96, 3).contiguous())
 
 
 def _damaged(change: Callable[..., Scene], *how: object) -> MakeScene:

@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.scene import BUILT_IN, Scene, Views
 
 DISTANCE, FIELD_OF_VIEW = 4.0, 0.7
 """Of the cameras from the origin, and across a picture, radians."""
@@ -148,7 +148,7 @@ def toy(
     train, val = around(views, size), around(held_out, size, phase=0.7)
     return Scene(
         name="toy",
-        source="built-in",
+        source=BUILT_IN,
         train=Views(photograph(bodies, train, background, grain), train),
         val=Views(photograph(bodies, val, background, grain), val),
         orbit=around(8, size, phase=0.3),

@@ -44,4 +44,4 @@ def ball_run(to_source: torch.Tensor) -> SceneRun:
     up = torch.tensor([0.0, 0.0, 1.0])
     poses = torch.cat([orbit_around(CENTRE, up, 3.0, elevation, 8) for elevation in (-0.6, 0.6)])
     orbit = Cameras(K.repeat(16, 1, 1), poses, 32, 24)
-    return SceneRun(OmegaConf.create(), ball_system(), orbit, to_source)
+    return SceneRun(OmegaConf.create(), ball_system(), orbit, to_source, {})
