@@ -116,7 +116,8 @@ def chart(found: Found) -> Figure:
     sizes = [one.size / 1000 for one in grown]
     axes.plot(sizes, [one.psnr for one in grown], "o-", color=BLUE, mfc="white", label="while growing")
     for index, one in enumerate(grown):
-        axes.annotate(str(index), (sizes[index], one.psnr), (0, -13), textcoords="offset points", ha="center")
+        above = (0, 6) if index % 2 else (0, -14)  # neighbours may be as large as each other
+        axes.annotate(str(index), (sizes[index], one.psnr), above, textcoords="offset points", ha="center")
     bend = knee(grown)
     axes.plot(sizes[bend], grown[bend].psnr, "D", color=BLUE, ms=9, label=f"knee: rung {bend}")
     whole = found.full.values()
