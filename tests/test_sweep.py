@@ -8,6 +8,7 @@ import pytest
 from test_cli import command
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3"]
+BARE = ["callbacks.baselines=null", "callbacks.charts=null", "callbacks.training_gif=null", "callbacks.enlarge=null"]
 
 
 def table(root: Path) -> dict[str, dict[str, str]]:
@@ -53,7 +54,7 @@ def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(
 
     from nerf_lightning.callbacks import Checkpoints
 
-    small = ["-m", "+experiment=smoke_2d", "dataset.max_side=16", "model.width=8", "seed=0,1"]
+    small = ["-m", "+experiment=smoke_2d", "dataset.max_side=16", "model.width=8", "seed=0,1", *BARE]
     assert inside(*small, "budget.steps=20", "name=whole")[0] == 0
     save = Checkpoints.save
 
@@ -81,7 +82,7 @@ def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(
 
 
 def test_a_study_is_one_command(inside, tmp_path: Path):
-    code, out, err = inside("+experiment=study_rate", "dataset.max_side=16", "budget.steps=2", "model.width=8")
+    code, out, err = inside("+experiment=study_rate", "dataset.max_side=16", "budget.steps=2", "model.width=8", *BARE)
     assert code == 0, err
     (root,) = (tmp_path / "outputs" / "study_rate").iterdir()
     assert len(table(root)) == 7 and (root / "gallery.png").is_file()
@@ -89,7 +90,7 @@ def test_a_study_is_one_command(inside, tmp_path: Path):
 
 
 def test_optuna_proposes_the_same_trials_again_and_failing_ones_are_recorded(tmp_path: Path):
-    line = ["+experiment=tune_picture", "dataset.max_side=16", "budget.steps=2", "hydra.sweeper.n_trials=2"]
+    line = ["+experiment=tune_picture", "dataset.max_side=16", "budget.steps=2", "hydra.sweeper.n_trials=2", *BARE]
     first, second = (command(*line, cwd=tmp_path) for _ in range(2))
     assert first.returncode == second.returncode == 0, first.stderr + second.stderr
     assert first.stdout.count(": starts") == 2 and second.stdout.count("done before") == 2
@@ -102,7 +103,7 @@ def test_optuna_proposes_the_same_trials_again_and_failing_ones_are_recorded(tmp
 def test_other_launchers(launcher: str, tmp_path: Path):
     """In processes of their own, whose way back to this package must work."""
     settings = {"joblib": ["hydra.launcher.n_jobs=2"], "submitit_local": ["threads=1"]}[launcher]
-    done = command("-m", *SMALL, "model.width=8,-1", f"hydra/launcher={launcher}", *settings, cwd=tmp_path)
+    done = command("-m", *SMALL, *BARE, "model.width=8,-1", f"hydra/launcher={launcher}", *settings, cwd=tmp_path)
     assert done.returncode == 1, done.stderr
     assert "1 of 2 jobs failed: model.width=-1" in done.stderr
     (root,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
@@ -111,7 +112,13 @@ def test_other_launchers(launcher: str, tmp_path: Path):
 
 
 def test_two_processes_share_a_run_and_leave_one_folder(inside, tmp_path: Path):
-    options = ["+experiment=picture", "dataset.max_side=32", "budget.steps=150", "trainer.accelerator=cpu", "threads=1"]
+    options = [
+        "+experiment=picture",
+        "dataset.max_side=32",
+        "budget.steps=150",
+        "trainer.accelerator=cpu",
+        "threads=1",
+    ] + BARE
     code, out, err = inside(*options, "name=one")
     assert code == 0, err
     done = command(*options, "trainer=ddp", "name=two", cwd=tmp_path)
