@@ -7,7 +7,6 @@ results.json           see callbacks/results.py
 snapshots/ orbit.gif   pictures
 """
 
-import importlib
 import json
 import os
 import pickle
@@ -27,32 +26,10 @@ from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Sce
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic, write_json
 from nerf_lightning.system import System
+from nerf_lightning.trusted import check_config
 
 FORMAT = 1
 """Of run folders. Goes up when an older version of this package could no longer make sense of a newer one's runs."""
-
-TRUST = "NERF_LIGHTNING_TRUST"
-"""Environment variable: further packages, comma-separated, whose classes a run folder may name."""
-
-TARGETS = {
-    "lightning": ("Trainer",),
-    "lightning.pytorch.loggers": ("TensorBoardLogger",),
-    "nerf_lightning.callbacks": (
-        *("Baselines", "Checkpoints", "Enlarge", "Guard", "HeldOut", "Live", "Orbit", "PictureCharts", "Progress"),
-        *("Snapshots", "Throughput", "TrainingGif"),
-    ),
-    "nerf_lightning.dataset": ("from_bricks", "from_download", "from_photos", "from_picture"),
-    "nerf_lightning.model": (
-        *("FourierField", "HashGrid2DField", "HashGridField", "MLPField", "PictureMLP", "SirenField", "TensoRFField"),
-        "VoxelField",
-    ),
-    "nerf_lightning.renderer": ("VolumeRenderer",),
-    "nerf_lightning.sampler": ("ImportanceSampler", "OccupancySampler", "UniformSampler"),
-    "nerf_lightning.system": ("constant", "cosine", "exponential"),
-    "torch.optim": ("Adam", "AdamW"),
-}
-"""What a run folder may name: a module's names that configurations are made of. Anything else could be called with a
-stranger's arguments."""
 
 
 def plain_config(cfg: DictConfig) -> dict[str, Any]:
@@ -84,58 +61,6 @@ def load_config(folder: Path) -> DictConfig:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(path, "", str(error), "a run's configuration in YAML") from error
     return OmegaConf.create(check_config(plain, path))
-
-
-def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
-    """Refuses a configuration from outside that is not plain, or names a target that is not trusted.
-
-    Args:
-        plain: as it was read.
-        path: where from, for the message.
-
-    Raises:
-        InputError: as said.
-    """
-    if not isinstance(plain, dict):
-        raise InputError(path, "", type(plain).__name__, "a mapping")
-    _check(path, "", plain)
-    return plain
-
-
-def _check(path: Path | str, key: str, node: Any) -> None:
-    if isinstance(node, dict):
-        for name, value in node.items():
-            _check(path, f"{key}.{name}" if key else str(name), value)
-            if name == "_target_" and not _trusted(value):
-                raise InputError(
-                    path,
-                    f"{key}._target_",
-                    repr(value),
-                    "a class of this package that configurations name",
-                    f"set {TRUST} to allow its package",
-                )
-    elif isinstance(node, list):
-        for index, value in enumerate(node):
-            _check(path, f"{key}[{index}]", value)
-    elif isinstance(node, str) and "${" in node:
-        raise InputError(path, key, repr(node), "a resolved value")
-
-
-def _trusted(target: Any) -> bool:
-    """Whether a target is on the list, or defined (not merely imported) in a package that the user trusts."""
-    if not isinstance(target, str):
-        return False
-    module, _, name = target.rpartition(".")
-    if name in TARGETS.get(module, ()):
-        return True
-    package = target.split(".")[0]
-    if package not in filter(None, os.environ.get(TRUST, "").split(",")):
-        return False
-    try:
-        found = getattr(importlib.import_module(module), name, None)
-    except ImportError:
-        return False
-    return getattr(found, "__module__", "").split(".")[0] == package
 
 
 def save_scene(data: RayDataModule | PixelDataModule, folder: Path) -> None:

@@ -10,7 +10,8 @@ import torch
 import yaml
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.run_folder import TARGETS, TRUST, load_config, load_run, read_checkpoint
+from nerf_lightning.run_folder import load_config, load_run, read_checkpoint
+from nerf_lightning.trusted import TARGETS, TRUST
 
 
 @pytest.fixture

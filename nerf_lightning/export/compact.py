@@ -18,8 +18,9 @@ from torch import Tensor
 
 from nerf_lightning.build import build_system
 from nerf_lightning.errors import InputError
-from nerf_lightning.run_folder import RunFolder, check_config, frame_from
+from nerf_lightning.run_folder import RunFolder, frame_from
 from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.trusted import check_config
 
 FORMAT, VERSION = "nerf_lightning compact", 1
 WORTH_BYTES = 2048

@@ -1,0 +1,83 @@
+"""What a configuration from outside may name: a run folder or compact file of a stranger's must not execute code."""
+
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.errors import InputError
+
+TRUST = "NERF_LIGHTNING_TRUST"
+"""Environment variable: further packages, comma-separated, whose classes a run folder may name."""
+
+TARGETS = {
+    "lightning": ("Trainer",),
+    "lightning.pytorch.loggers": ("TensorBoardLogger",),
+    "nerf_lightning.callbacks": (
+        *("Baselines", "Checkpoints", "Enlarge", "Guard", "HeldOut", "Live", "Orbit", "PictureCharts", "Progress"),
+        *("Snapshots", "Throughput", "TrainingGif"),
+    ),
+    "nerf_lightning.dataset": ("from_bricks", "from_download", "from_photos", "from_picture"),
+    "nerf_lightning.model": (
+        *("FourierField", "HashGrid2DField", "HashGridField", "MLPField", "PictureMLP", "SirenField", "TensoRFField"),
+        "VoxelField",
+    ),
+    "nerf_lightning.renderer": ("VolumeRenderer",),
+    "nerf_lightning.sampler": ("ImportanceSampler", "OccupancySampler", "UniformSampler"),
+    "nerf_lightning.system": ("constant", "cosine", "exponential"),
+    "torch.optim": ("Adam", "AdamW"),
+}
+"""What a run folder may name: a module's names that configurations are made of. Anything else could be called with a
+stranger's arguments."""
+
+
+def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
+    """Refuses a configuration from outside that is not plain, or names a target that is not trusted.
+
+    Args:
+        plain: as it was read.
+        path: where from, for the message.
+
+    Raises:
+        InputError: as said.
+    """
+    if not isinstance(plain, dict):
+        raise InputError(path, "", type(plain).__name__, "a mapping")
+    _check(path, "", plain)
+    return plain
+
+
+def _check(path: Path | str, key: str, node: Any) -> None:
+    if isinstance(node, dict):
+        for name, value in node.items():
+            _check(path, f"{key}.{name}" if key else str(name), value)
+            if name == "_target_" and not _trusted(value):
+                raise InputError(
+                    path,
+                    f"{key}._target_",
+                    repr(value),
+                    "a class of this package that configurations name",
+                    f"set {TRUST} to allow its package",
+                )
+    elif isinstance(node, list):
+        for index, value in enumerate(node):
+            _check(path, f"{key}[{index}]", value)
+    elif isinstance(node, str) and "${" in node:
+        raise InputError(path, key, repr(node), "a resolved value")
+
+
+def _trusted(target: Any) -> bool:
+    """Whether a target is on the list, or defined (not merely imported) in a package that the user trusts."""
+    if not isinstance(target, str):
+        return False
+    module, _, name = target.rpartition(".")
+    if name in TARGETS.get(module, ()):
+        return True
+    package = target.split(".")[0]
+    if package not in filter(None, os.environ.get(TRUST, "").split(",")):
+        return False
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return False
+    return getattr(found, "__module__", "").split(".")[0] == package
