@@ -5,15 +5,13 @@ from functools import partial
 import numba
 import torch
 
-# Sums may be reordered and contracted, which vector units need; not-a-numbers must stay visible.
-FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
-
-inner = partial(numba.njit, cache=True, fastmath=FASTMATH, error_model="numpy")
+# No fast maths. Numba optimises a function again for every other one it is linked into, and a process that compiles a kernel
+# runs another copy than one that loads it from the cache: where the optimiser may reorder or fuse, their last bits differ.
+# What vector units need is written out instead: see `lanes`.
+inner = partial(numba.njit, cache=True, error_model="numpy")
 """Decorates what is called within a kernel."""
-kernel = partial(numba.njit, cache=True, fastmath=FASTMATH, error_model="numpy", parallel=True)
+kernel = partial(inner, parallel=True)
 """Decorates an entry point; `workers` says into how many pieces it cuts its work."""
-exact = partial(numba.njit, cache=True, error_model="numpy", parallel=True)
-"""Like `kernel`, but rounding step by step as torch does: for decisions that must not differ from the reference's."""
 
 
 def workers() -> int:

@@ -5,7 +5,7 @@ Numba leaves short loops to scalar instructions and cannot know that rows do not
 
 import operator
 
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, models, overload, register_model
 
@@ -55,15 +55,57 @@ def store(typing, array, row, first, values):
 
 
 @intrinsic
-def total(typing, a):
-    """The sum of all lanes."""
+def zeros(typing, lanes):
+    """As many zeros as the tuple `lanes` is long."""
+    width = len(lanes)
 
     def code(context, builder, signature, values):
-        kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), values[0].type])
-        add = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.fadd.v{a.width}f32")
-        return builder.call(add, [ir.Constant(ir.FloatType(), 0.0), values[0]], fastmath=("reassoc",))
+        return ir.Constant(ir.VectorType(ir.FloatType(), width), [0.0] * width)
+
+    return Lanes(width)(lanes), code
+
+
+@intrinsic
+def total(typing, a):
+    """The sum of all lanes: that of the first half plus that of the second, and so on in each."""
+
+    def code(context, builder, signature, values):
+        found, width = values[0], 1 << (a.width - 1).bit_length()
+        nothing = ir.Constant(found.type, [0.0] * a.width)
+        found = _pick(builder, found, nothing, [min(i, a.width) for i in range(width)])  # filled up to a power of two
+        while width > 1:
+            width //= 2
+            first, second = (_pick(builder, found, found, range(start, start + width)) for start in (0, width))
+            found = builder.fadd(first, second)
+        return builder.extract_element(found, ir.IntType(32)(0))
 
     return types.float32(a), code
+
+
+def _pick(builder, first, second, places):
+    """A vector of the numbers at these places of two vectors of one length."""
+    mask = ir.Constant(ir.VectorType(ir.IntType(32), len(places)), list(places))
+    return builder.shuffle_vector(first, second, mask)
+
+
+FUSES = binding.get_host_cpu_features().get("fma", True)
+"""Whether the processor multiplies and adds in one go; only x86 knows such that do not."""
+
+
+@intrinsic
+def fused(typing, a, b, c):
+    """a * b + c of three numbers or three values of one width, rounded once where the processor can."""
+
+    def code(context, builder, signature, values):
+        if not FUSES:
+            return builder.fadd(builder.fmul(values[0], values[1]), values[2])
+        kind = values[0].type
+        name = f"llvm.fma.v{a.width}f32" if isinstance(a, Lanes) else "llvm.fma.f32"
+        return builder.call(
+            cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name), values
+        )
+
+    return a(a, a, a), code
 
 
 @intrinsic

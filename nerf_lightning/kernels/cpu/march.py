@@ -5,19 +5,17 @@ Distances, positions and cells are rounded exactly as the torch reference rounds
 
 from numba import float32, int32, prange
 
-from nerf_lightning.kernels.cpu.compile import exact
-
-exact_inner = exact(parallel=False)
+from nerf_lightning.kernels.cpu.compile import inner, kernel
 
 
-@exact_inner
+@inner
 def contraction(t, unit):
     """The map that unbounded distances are uniform in; see `Bounds.distances`."""
     x = t / unit
     return x / float32(2) if x < float32(1) else float32(1) - float32(1) / (float32(2) * x)
 
 
-@exact_inner
+@inner
 def edge(k, shift, near, far, step, samples, unbounded, low, span, unit):
     """Distance at which interval k begins."""
     steps = float32(k) + shift - float32(0.5)
@@ -27,7 +25,7 @@ def edge(k, shift, near, far, step, samples, unbounded, low, span, unit):
     return unit * (float32(2) * y if y < float32(0.5) else float32(1) / max(float32(2) - float32(2) * y, float32(1e-6)))
 
 
-@exact_inner
+@inner
 def to_unit(x, y, z, centre, half, unbounded):
     """`Bounds.to_unit` of one position."""
     a, b, c = (x - centre[0]) / half[0], (y - centre[1]) / half[1], (z - centre[2]) / half[2]
@@ -43,12 +41,12 @@ def to_unit(x, y, z, centre, half, unbounded):
     )
 
 
-@exact_inner
+@inner
 def cell(u, resolution):
     return min(max(int32(u * float32(resolution)), int32(0)), int32(resolution - 1))
 
 
-@exact_inner
+@inner
 def steps_to_leave(origin, direction, centre, half, cells, u, v, w, t, step):
     """How many steps surely stay within the present cell of a cells^3 grid over the box (0 if unsure)."""
     nearest = float32(1e30)
@@ -64,7 +62,7 @@ def steps_to_leave(origin, direction, centre, half, cells, u, v, w, t, step):
     return max(int((nearest - t) / step) - 1, 0)
 
 
-@exact
+@kernel
 def walk(origins, directions, near, far, shift, occupied, resolution, blocks, cells, centre, half, unbounded, samples,
          step, found, counts, workers):  # fmt: skip
     """Notes which intervals of each ray to keep in found [R, samples + 1] and how many in counts [R].
@@ -115,7 +113,7 @@ def walk(origins, directions, near, far, shift, occupied, resolution, blocks, ce
             counts[ray] = kept
 
 
-@exact
+@kernel
 def pack(near, far, shift, half, unbounded, samples, step, found, offsets, t, dt, ray_of, workers):
     """Distances and lengths of the intervals that `walk` noted, one ray after the other."""
     rays, unit = len(near), max(half[0], max(half[1], half[2]))
@@ -133,7 +131,7 @@ def pack(near, far, shift, half, unbounded, samples, step, found, offsets, t, dt
                 t[n], dt[n], ray_of[n] = (start + end) / float32(2), end - start, ray
 
 
-@exact
+@kernel
 def coarsen(occupied, resolution, blocks, cells, workers):
     """blocks [cells^3]: whether any of a block's cells is occupied; cells divides resolution."""
     size = resolution // cells
@@ -150,7 +148,7 @@ def coarsen(occupied, resolution, blocks, cells, workers):
                     blocks[(i * cells + j) * cells + k] = some
 
 
-@exact
+@kernel
 def points(origins, directions, ray, t, out, workers):
     """out [3, N] = origins[ray] + t * directions[ray]."""
     samples = len(t)
@@ -161,7 +159,7 @@ def points(origins, directions, ray, t, out, workers):
                 out[axis, n] = origins[r, axis] + t[n] * directions[r, axis]
 
 
-@exact
+@kernel
 def mark(origins, directions, ray, t, centre, half, unbounded, marks, resolution, value, workers):
     """Writes a value into the cells that hold the samples. Workers may meet in a cell: they write the same there."""
     samples = len(t)

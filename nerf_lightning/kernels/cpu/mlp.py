@@ -8,9 +8,18 @@ import numpy as np
 from numba import float32, prange
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
+from nerf_lightning.kernels.cpu.lanes import fused, load, total, zeros
 
 TILE = 128
 """Samples worked on together; a constant, so that the inner loops need no remainder."""
+RUN = (0,) * 8
+"""Samples of a tile summed up side by side."""
+
+
+@inner(inline="always")
+def sum4(a0, b0, a1, b1, a2, b2, a3, b3, start):
+    """start + a0 b0 + a1 b1 + a2 b2 + a3 b3, from the last to the first."""
+    return fused(a0, b0, fused(a1, b1, fused(a2, b2, fused(a3, b3, start))))
 
 
 @inner
@@ -28,10 +37,10 @@ def affine(W, b, x, y, rectify):
             w30, w31, w32, w33 = W[o + 3, i], W[o + 3, i + 1], W[o + 3, i + 2], W[o + 3, i + 3]
             for n in range(TILE):
                 x0, x1, x2, x3 = x[i, n], x[i + 1, n], x[i + 2, n], x[i + 3, n]
-                y[o, n] += w00 * x0 + w01 * x1 + w02 * x2 + w03 * x3
-                y[o + 1, n] += w10 * x0 + w11 * x1 + w12 * x2 + w13 * x3
-                y[o + 2, n] += w20 * x0 + w21 * x1 + w22 * x2 + w23 * x3
-                y[o + 3, n] += w30 * x0 + w31 * x1 + w32 * x2 + w33 * x3
+                y[o, n] = sum4(w00, x0, w01, x1, w02, x2, w03, x3, y[o, n])
+                y[o + 1, n] = sum4(w10, x0, w11, x1, w12, x2, w13, x3, y[o + 1, n])
+                y[o + 2, n] = sum4(w20, x0, w21, x1, w22, x2, w23, x3, y[o + 2, n])
+                y[o + 3, n] = sum4(w30, x0, w31, x1, w32, x2, w33, x3, y[o + 3, n])
         if rectify:
             for k in range(o, o + 4):
                 for n in range(TILE):
@@ -51,44 +60,48 @@ def back_input(W, dy, dx):
             w30, w31, w32, w33 = W[o + 3, i], W[o + 3, i + 1], W[o + 3, i + 2], W[o + 3, i + 3]
             for n in range(TILE):
                 y0, y1, y2, y3 = dy[o, n], dy[o + 1, n], dy[o + 2, n], dy[o + 3, n]
-                dx[i, n] += w00 * y0 + w10 * y1 + w20 * y2 + w30 * y3
-                dx[i + 1, n] += w01 * y0 + w11 * y1 + w21 * y2 + w31 * y3
-                dx[i + 2, n] += w02 * y0 + w12 * y1 + w22 * y2 + w32 * y3
-                dx[i + 3, n] += w03 * y0 + w13 * y1 + w23 * y2 + w33 * y3
+                dx[i, n] = sum4(w00, y0, w10, y1, w20, y2, w30, y3, dx[i, n])
+                dx[i + 1, n] = sum4(w01, y0, w11, y1, w21, y2, w31, y3, dx[i + 1, n])
+                dx[i + 2, n] = sum4(w02, y0, w12, y1, w22, y2, w32, y3, dx[i + 2, n])
+                dx[i + 3, n] = sum4(w03, y0, w13, y1, w23, y2, w33, y3, dx[i + 3, n])
 
 
 @inner
 def back_weight(dW, db, dy, x):
     """dW += dy x^T, db += the sum of dy."""
     outputs, inputs = dW.shape
-    zero = float32(0)
+    zero = zeros(RUN)
     for o in range(0, outputs, 4):
         for k in range(o, o + 4):
-            total = zero
-            for n in range(TILE):
-                total += dy[k, n]
-            db[k] += total
+            s = zero
+            for n in range(0, TILE, len(RUN)):
+                s = s + load(dy, k, n, RUN)
+            db[k] += total(s)
         for i in range(0, inputs, 4):
             s00, s01, s02, s03 = zero, zero, zero, zero
             s10, s11, s12, s13 = zero, zero, zero, zero
             s20, s21, s22, s23 = zero, zero, zero, zero
             s30, s31, s32, s33 = zero, zero, zero, zero
-            for n in range(TILE):
-                x0, x1, x2, x3 = x[i, n], x[i + 1, n], x[i + 2, n], x[i + 3, n]
-                y0, y1, y2, y3 = dy[o, n], dy[o + 1, n], dy[o + 2, n], dy[o + 3, n]
-                s00, s01, s02, s03 = s00 + y0 * x0, s01 + y0 * x1, s02 + y0 * x2, s03 + y0 * x3
-                s10, s11, s12, s13 = s10 + y1 * x0, s11 + y1 * x1, s12 + y1 * x2, s13 + y1 * x3
-                s20, s21, s22, s23 = s20 + y2 * x0, s21 + y2 * x1, s22 + y2 * x2, s23 + y2 * x3
-                s30, s31, s32, s33 = s30 + y3 * x0, s31 + y3 * x1, s32 + y3 * x2, s33 + y3 * x3
+            for n in range(0, TILE, len(RUN)):
+                x0, x1 = load(x, i, n, RUN), load(x, i + 1, n, RUN)
+                x2, x3 = load(x, i + 2, n, RUN), load(x, i + 3, n, RUN)
+                y = load(dy, o, n, RUN)
+                s00, s01, s02, s03 = fused(y, x0, s00), fused(y, x1, s01), fused(y, x2, s02), fused(y, x3, s03)
+                y = load(dy, o + 1, n, RUN)
+                s10, s11, s12, s13 = fused(y, x0, s10), fused(y, x1, s11), fused(y, x2, s12), fused(y, x3, s13)
+                y = load(dy, o + 2, n, RUN)
+                s20, s21, s22, s23 = fused(y, x0, s20), fused(y, x1, s21), fused(y, x2, s22), fused(y, x3, s23)
+                y = load(dy, o + 3, n, RUN)
+                s30, s31, s32, s33 = fused(y, x0, s30), fused(y, x1, s31), fused(y, x2, s32), fused(y, x3, s33)
             for k, sums in enumerate(
                 ((s00, s01, s02, s03), (s10, s11, s12, s13), (s20, s21, s22, s23), (s30, s31, s32, s33))
             ):
                 for m in range(4):
-                    dW[o + k, i + m] += sums[m]
+                    dW[o + k, i + m] += total(sums[m])
 
 
 @inner
-def load(x, extra, first, count, tile):
+def fill(x, extra, first, count, tile):
     """Copies columns first : first + count of x, then of extra, into a tile; zeros fill the rest of it."""
     rows = len(x)
     tile[rows + len(extra) :] = float32(0)
@@ -134,7 +147,7 @@ def forward(weights, widths, x, extra, out, workers):
         for tile in range(tiles * worker // workers, tiles * (worker + 1) // workers):
             first = tile * TILE
             count = min(TILE, samples - first)
-            load(x, extra, first, count, activations[: widths[0]])
+            fill(x, extra, first, count, activations[: widths[0]])
             row, _ = run_tile(weights, widths, activations)
             for o in range(len(out)):
                 out[o, first : first + count] = activations[row + o, :count]
@@ -155,9 +168,9 @@ def backward(weights, widths, x, extra, above, grad_x, grad_weights, workers):
         for tile in range(tiles * worker // workers, tiles * (worker + 1) // workers):
             first = tile * TILE
             count = min(TILE, samples - first)
-            load(x, extra, first, count, activations[: widths[0]])
+            fill(x, extra, first, count, activations[: widths[0]])
             row, start = run_tile(weights, widths, activations)
-            load(above, nothing, first, count, grad_out[: widths[layers]])
+            fill(above, nothing, first, count, grad_out[: widths[layers]])
             for index in range(layers - 1, -1, -1):
                 inputs, outputs = widths[index], widths[index + 1]
                 start -= outputs * inputs + outputs
