@@ -20,7 +20,7 @@ from nerf_lightning.capture.tabletop import Tabletop
 from nerf_lightning.dataset.brickmodel import bulldozer
 from nerf_lightning.export.mesh import mesh_file
 from nerf_lightning.export.verb import views_of
-from nerf_lightning.export.volume import cells_across, cropped, sample_volume
+from nerf_lightning.export.volume import volume_of
 from nerf_lightning.open_run import SceneRun, open_scene_run
 
 Rows = list[dict[str, Any]]
@@ -50,9 +50,7 @@ def distance_to_bricks(points: np.ndarray) -> np.ndarray:
 
 def mesh_of(run: SceneRun, box: torch.Tensor | None = None) -> tuple[trimesh.Trimesh, float]:
     """A run's mesh, read back from its file, and the side of a voxel in the same unit."""
-    volume = sample_volume(run.system, cells_across(run.system))
-    if box is not None:
-        volume = cropped(volume, box, run.to_source)
+    volume = volume_of(run, box=box)
     content = mesh_file(run, views_of(run, None), volume, None, "ply").content
     mesh: Any = trimesh.load(io.BytesIO(content), file_type="ply")
     return mesh, volume.cell * run.scale

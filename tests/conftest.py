@@ -26,9 +26,11 @@ install_import_hook(checked_modules(), "typechecker.check")
 # ruff: noqa: E402
 import pytest
 import torch
+from once import once
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.capture.synthetic import Flaws, Truth, write_capture
 from nerf_lightning.kernels import use_kernels
 
 
@@ -96,6 +98,17 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path
     folder = tmp_path_factory.mktemp("run")
     train(composed(["+experiment=smoke_3d", "dataset.size=16", "budget.steps=10", "callbacks.orbit.frames=0"], folder))
     return folder
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Truth]:
+    """A synthetic capture with a sheet of six tags: folders `calibration` and `photos`, eight photos each. To be looked at."""
+    from capture.views import SIX, SMALL
+
+    def make(folder: Path) -> tuple[Path, Truth]:
+        return folder, write_capture(folder, SIX, SMALL, 8, 8, Flaws(blur=0.5, noise=2.0), seed=3)
+
+    return once(tmp_path_factory, "capture", make)
 
 
 LOW, HIGH = torch.tensor([-1.0, -1.5, -0.5]), torch.tensor([1.0, 0.5, 1.5])

@@ -4,6 +4,7 @@ import logging
 import re
 import runpy
 import shlex
+import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -13,9 +14,7 @@ from typing import Any
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from capture.views import SIX, SIZE, SMALL
-
-from nerf_lightning.capture.synthetic import Flaws, write_capture
+from capture.views import SIZE
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
@@ -110,7 +109,11 @@ def smaller(line: str) -> str:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_command_of_a_page_works(
-    page: Path, shell: Callable[[str], int], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    page: Path,
+    shell: Callable[[str], int],
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    request: pytest.FixtureRequest,
 ):
     (tmp_path / "ladder.yaml").write_text("rungs: [{finest: 8, coarsest: 8}, {finest: 12, coarsest: 8}]\n")
     for block in [*blocks(page, "python"), *blocks(page, "yaml")]:
@@ -118,9 +121,9 @@ def test_every_command_of_a_page_works(
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(block)
     if "calibration=" in page.read_text():
-        write_capture(tmp_path, SIX, SMALL, 6, 6, Flaws(blur=0.5, noise=2.0), seed=3)
-        (tmp_path / "calibration").rename(tmp_path / "sheet_photos")
-        (tmp_path / "photos").rename(tmp_path / "object_photos")
+        folder, _ = request.getfixturevalue("made")
+        shutil.copytree(folder / "calibration", tmp_path / "sheet_photos")
+        shutil.copytree(folder / "photos", tmp_path / "object_photos")
     imageio.imwrite(tmp_path / "cat.jpg", np.tile(np.arange(0, 240, 10, np.uint8)[:, None, None], (1, 20, 3)))
     assert commands(page)
     for line in commands(page):

@@ -70,18 +70,10 @@ def capture(
     log.info("%s: looking for tags of %s in %d photos", calibration, family, len(sheets))
     seen = sight(sheets, detector)
     wrong = of_one_size(calibration, {s.name: (s.width, s.height) for s in seen})
-    lens_found = calibrate(calibration, [s for s in seen if s.name not in wrong], known)
-    lens_found.dropped.update(wrong)
-    for text in lens_found.warnings:
-        log.warning("calibration: %s", text)
-    for left_out, reason in lens_found.dropped.items():
-        log.warning("%s left out of the calibration: %s", left_out, reason)
-    lens = lens_found.lens
-    log.info("focal length %.1f pixels, reprojection error %.2f pixels", lens.fx, lens_found.rms)
-
+    kept = [s for s in seen if s.name not in wrong]
     log.info("%s: looking for tags in %d photos", photos, len(views))
     sightings = sight(views, detector)
-    turned = of_one_size(photos, {s.name: (s.width, s.height) for s in sightings}, (lens.width, lens.height))
+    turned = of_one_size(photos, {s.name: (s.width, s.height) for s in sightings}, (kept[0].width, kept[0].height))
     usable = [s for s in sightings if s.name not in turned]
     if not any(s.marks for s in usable):
         raise InputError(
@@ -91,6 +83,14 @@ def capture(
             "photos with at least one whole tag in view",
             "are the folders swapped, or is tags.dictionary another one?",
         )
+    lens_found = calibrate(calibration, kept, known)
+    lens_found.dropped.update(wrong)
+    for text in lens_found.warnings:
+        log.warning("calibration: %s", text)
+    for left_out, reason in lens_found.dropped.items():
+        log.warning("%s left out of the calibration: %s", left_out, reason)
+    lens = lens_found.lens
+    log.info("focal length %.1f pixels, reprojection error %.2f pixels", lens.fx, lens_found.rms)
     solved, reasons = _place(usable, lens_found, known)
     _plausible(photos, solved, size)
     results = [_result(s, i, solved, reasons, turned) for i, s in _numbered(sightings, usable)]

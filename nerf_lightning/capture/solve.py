@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from nerf_lightning.capture.bundle import Bundle, Refined, refine, simplified
+from nerf_lightning.capture.bundle import Bundle, simplified
 from nerf_lightning.capture.detect import Mark
 from nerf_lightning.capture.geometry import folds, inverse, move
 from nerf_lightning.capture.pose import Hypothesis, mark_poses, photo_poses
+from nerf_lightning.capture.refine import Refined, refine
 from nerf_lightning.capture.walk import choose
 from nerf_lightning.dataset.lens import Lens
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.volume import Volume
+from nerf_lightning.export.volume import PIXELS, Volume
 from nerf_lightning.progress import tracked
 from nerf_lightning.system import NeRF3D
 
@@ -68,9 +68,11 @@ def lit_cells(system: NeRF3D, volume: Volume, cameras: Cameras) -> Bool[ndarray,
     )
     places = places.view(-1, 3)
     dark = torch.arange(len(places))
+    # Within a pixel a slanted surface has many depths: where cells are finer, the pixel's width says how far to go on.
+    beyond = max(volume.cell, PIXELS * (system.field.bounds.pixel or 0.0))
     for view in tracked(range(len(cameras)), len(cameras), "views"):
         rendered = system.render(cameras.view_rays(view).to(system.device))
-        ends = torch.where(rendered.opacity > 0.5, rendered.depth, FAR).cpu() + volume.cell
+        ends = torch.where(rendered.opacity > 0.5, rendered.depth, FAR).cpu() + beyond
         # At an outline a pixel's depth is a mean of near and far: the nearest of its neighbours' counts.
         ends = -torch.nn.functional.max_pool2d(-ends.view(1, cameras.height, cameras.width), 3, 1, 1).flatten()
         offset = places[dark] - cameras.centres[view]

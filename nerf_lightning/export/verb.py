@@ -13,7 +13,7 @@ from nerf_lightning.evenly import evenly
 from nerf_lightning.export.mesh import mesh_file, points_file, require_mesh, voxels_file
 from nerf_lightning.export.order import Order
 from nerf_lightning.export.smallest import MOST_VIEWS, PRECISIONS, smallest, some_cameras
-from nerf_lightning.export.volume import cells_across, cropped, sample_volume
+from nerf_lightning.export.volume import volume_of
 from nerf_lightning.files import atomic
 from nerf_lightning.open_run import SceneRun, beside, open_run, open_scene_run
 from nerf_lightning.run_data import data_again
@@ -71,9 +71,8 @@ def compacted(order: Order, source: Path) -> tuple[bytes, str]:
 def shaped(order: Order, source: Path) -> tuple[bytes, str]:
     """A run as a mesh, points or voxels."""
     found = open_scene_run(source)
-    volume = sample_volume(found.system, order.resolution or cells_across(found.system))
-    if order.box is not None:
-        volume = cropped(volume, torch.tensor(order.box).view(2, 3), found.to_source)
+    box = None if order.box is None else torch.tensor(order.box).view(2, 3)
+    volume = volume_of(found, order.resolution, box)
     if order.format == "npz":
         shape = voxels_file(found, volume)
     elif order.content == "points":

@@ -7,13 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.cameras import transform
+from nerf_lightning.cameras import Bounds, transform
+from nerf_lightning.errors import InputError
 from nerf_lightning.export.reach import occupied_cells
+from nerf_lightning.open_run import SceneRun
 from nerf_lightning.progress import tracked
 from nerf_lightning.system import NeRF3D
 
 COARSEST, FINEST = 64, 256
-"""Cells along the box's longest side, where nobody says how many."""
+"""Cells along the longest side, where nobody says how many."""
 PIXELS = 1.25
 """Width of a cell in pixels: at one pixel what a surface has too much is noise."""
 ASKED = 1 << 17
@@ -40,25 +42,51 @@ class Volume:
         return self.low + (index + 0.5) * self.cell
 
 
-def cells_across(system: NeRF3D) -> int:
-    """Cells along the box's longest side, somewhat larger than what a pixel of the photos shows, within bounds."""
+def region_of(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tensor, "4 4"]) -> Float[Tensor, "2 3"]:
+    """Lower and upper corner of the part of some bounds, world frame, that holds a box of another frame.
+
+    Args:
+        box: lower and upper corner in the frame of the photos' own file.
+        to_source: similarity from the world frame to that one.
+
+    Raises:
+        InputError: where the box lies outside the bounds.
+    """
+    corners = transform(torch.linalg.inv(to_source), torch.cartesian_prod(*box.T))
+    aabb = bounds.aabb.cpu()
+    region = torch.stack([torch.maximum(corners.amin(0), aabb[0]), torch.minimum(corners.amax(0), aabb[1])])
+    if not (region[0] < region[1]).all():
+        where = transform(to_source, torch.cartesian_prod(*aabb.T))
+        low, high = ([round(x, 4) for x in corner.tolist()] for corner in (where.amin(0), where.amax(0)))
+        raise InputError(
+            "config", "box", str(box.flatten().tolist()), f"something within {low} to {high}, the scene's box"
+        )
+    return region
+
+
+def cells_across(system: NeRF3D, region: Float[Tensor, "2 3"] | None = None) -> int:
+    """Cells along a region's longest side, somewhat larger than what a pixel of the photos shows, within bounds."""
     bounds = system.field.bounds
-    across = 2 * float(bounds.half_size.max()) / (PIXELS * bounds.pixel) if bounds.pixel else math.inf
+    low, high = bounds.aabb if region is None else region
+    across = float((high - low).max()) / (PIXELS * bounds.pixel) if bounds.pixel else math.inf
     return round(min(max(across, COARSEST), FINEST))
 
 
 @torch.no_grad()
-def sample_volume(system: NeRF3D, resolution: int) -> Volume:
-    """Asks a field's density all over its box, where its sampler would look; elsewhere there is nothing.
+def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] | None = None) -> Volume:
+    """Asks a field's density all over a region, where its sampler would look; elsewhere there is nothing.
 
     Args:
-        resolution: cells along the box's longest side.
+        resolution: cells along the region's longest side.
+        region: lower and upper corner, world frame; None takes the field's box.
     """
     bounds = system.field.bounds
-    cell = 2 * float(bounds.half_size.max()) / resolution
-    shape = [max(1, math.ceil(float(side) / cell - 1e-6)) for side in 2 * bounds.half_size]
-    # Cubic cells may stand over the box: evenly on both sides.
-    low = bounds.centre - torch.tensor(shape, device=system.device) * (cell / 2)
+    corners = bounds.aabb if region is None else region.to(system.device)
+    sides = corners[1] - corners[0]
+    cell = float(sides.max()) / resolution
+    shape = [max(1, math.ceil(float(side) / cell - 1e-6)) for side in sides]
+    # Cubic cells may stand over the region: evenly on both sides.
+    low = corners.mean(0) - torch.tensor(shape, device=system.device) * (cell / 2)
     volume = Volume(torch.zeros(shape), low.cpu(), cell)
     occupied = occupied_cells(system)
     slab = max(1, ASKED // (shape[1] * shape[2]))
@@ -90,3 +118,18 @@ def cropped(volume: Volume, box: Float[Tensor, "2 3"], to_source: Float[Tensor, 
     places = transform(to_source, volume.places(index.float()))
     inside = ((places >= box[0]) & (places <= box[1])).all(-1)
     return replace(volume, density=volume.density * inside)
+
+
+def volume_of(run: SceneRun, resolution: int | None = None, box: Float[Tensor, "2 3"] | None = None) -> Volume:
+    """A run's field, or what of it lies in a box, as cells.
+
+    Args:
+        resolution: cells along the longest side of what is asked; None takes `cells_across`.
+        box: lower and upper corner in the frame of the photos' own file.
+
+    Raises:
+        InputError: where the box lies outside the scene's.
+    """
+    region = None if box is None else region_of(run.system.field.bounds, box, run.to_source)
+    volume = sample_volume(run.system, resolution or cells_across(run.system, region), region)
+    return volume if box is None else cropped(volume, box, run.to_source)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from capture.views import LENS, SIX, SIZE, cameras, sightings
 
-from nerf_lightning.capture.bundle import LENS_PARAMETERS, Bundle, _Problem, lens_vector, refine, simplified
+from nerf_lightning.capture.bundle import LENS_PARAMETERS, Bundle, Problem, lens_vector, simplified
 from nerf_lightning.capture.detect import Mark
 from nerf_lightning.capture.geometry import angle_between, inverse, move, project, to_matrix
 from nerf_lightning.capture.layout import SQUARE
+from nerf_lightning.capture.refine import refine
 
 
 def bundle(photos: int = 8, noise: float = 0.0, off: float = 0.0, seed: int = 0) -> Bundle:
@@ -24,7 +25,7 @@ def bundle(photos: int = 8, noise: float = 0.0, off: float = 0.0, seed: int = 0)
 def test_derivatives_are_those_of_differences():
     made = replace(bundle(3, noise=0.5, off=0.05), twists=1e-3 * np.arange(6.0))
     made = replace(made, lens=replace(LENS, distortion=(-0.2, 0.05, 0.001, -0.002, 0.01), fy=910.0))
-    problem = _Problem(made, np.ones(9, bool), {0}, True)
+    problem = Problem(made, np.ones(9, bool), {0}, True)
     x = (
         problem.start()
         + 1e-2
@@ -35,7 +36,7 @@ def test_derivatives_are_those_of_differences():
     for i in range(problem.unknowns):
         step = np.zeros_like(x)
         step[i] = 1e-6 * max(1.0, abs(x[i]))
-        ahead, behind = (np.concatenate(problem.evaluate(x + s)[0]) for s in (step, -step))
+        ahead, behind = (problem.evaluate(x + s)[0] for s in (step, -step))
         slope = (ahead - behind) / (2 * step[i])
         np.testing.assert_allclose(jacobian[:, i], slope, rtol=1e-4, atol=1e-4 * max(1.0, np.abs(slope).max()))
 

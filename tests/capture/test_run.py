@@ -9,6 +9,7 @@ import pytest
 import torch
 import yaml
 from capture.views import LENS, SIX, SIZE, SMALL
+from once import once
 
 from nerf_lightning.capture.calibrate import calibrate
 from nerf_lightning.capture.detect import guess_family, sight, tag_detector
@@ -16,45 +17,49 @@ from nerf_lightning.capture.geometry import angle_between, inverse, project
 from nerf_lightning.capture.layout import TagLayout, flat_pose, read_layout
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.photos import find_photos
-from nerf_lightning.capture.run import capture
+from nerf_lightning.capture.run import Capture, capture
 from nerf_lightning.capture.synthetic import Truth
 from nerf_lightning.dataset import open_scene
 from nerf_lightning.dataset.lens import rectify
 from nerf_lightning.errors import InputError
 
 
-@pytest.fixture(scope="module")
-def packed(made: tuple[Path, Truth]):
-    folder, _ = made
-    packing = Packing(folder / "out" / "scene.npz", longest=200, holdout=4)
-    return capture(folder / "calibration", folder / "photos", SIZE, packing)
+@pytest.fixture(scope="session")
+def packed(made: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Capture]:
+    """The folder of what was found out about it, and the same."""
+
+    def make(folder: Path) -> tuple[Path, Capture]:
+        packing = Packing(folder / "scene.npz", longest=200, holdout=4)
+        return folder, capture(made[0] / "calibration", made[0] / "photos", SIZE, packing)
+
+    return once(tmp_path_factory, "packed", make)
 
 
-def test_a_synthetic_capture_gives_back_its_cameras(made: tuple[Path, Truth], packed):
-    folder, truth = made
-    entries = json.loads((folder / "out" / "cameras.json").read_text())["photos"]
+def test_a_synthetic_capture_gives_back_its_cameras(made: tuple[Path, Truth], packed: tuple[Path, Capture]):
+    (_, truth), (folder, found) = made, packed
+    entries = json.loads((folder / "cameras.json").read_text())["photos"]
     assert [entry["name"] for entry in entries] == sorted(truth.photos)
     assert all(set(entry) == {"name", "status", "reason", "K", "c2w", "reprojection_px"} for entry in entries)
     placed = [entry for entry in entries if entry["status"] == "placed"]
     assert len(placed) >= 7
-    (reference,) = (tag for n, tag in enumerate(packed.solved.tags) if n in packed.solved.fixed)
+    (reference,) = (tag for n, tag in enumerate(found.solved.tags) if n in found.solved.fixed)
     home = SIX.poses[reference]
     off, turned = [], []
     for entry in placed:
-        pose, found = truth.photos[entry["name"]], home @ np.array(entry["c2w"])
-        off.append(np.linalg.norm(found[:3, 3] - pose[:3, 3]) / np.linalg.norm(pose[:3, 3]))
-        turned.append(angle_between(found, pose))
+        pose, told = truth.photos[entry["name"]], home @ np.array(entry["c2w"])
+        off.append(np.linalg.norm(told[:3, 3] - pose[:3, 3]) / np.linalg.norm(pose[:3, 3]))
+        turned.append(angle_between(told, pose))
     assert np.median(off) < 0.02 and np.median(turned) < np.radians(0.6)
-    assert abs(packed.calibration.lens.fx / SMALL.fx - 1) < 0.02
+    assert abs(found.calibration.lens.fx / SMALL.fx - 1) < 0.02
 
 
-def test_the_scene_trains_like_any_other(made: tuple[Path, Truth], packed):
-    folder, _ = made
-    scene = open_scene(str(folder / "out" / "scene.npz"))
+def test_the_scene_trains_like_any_other(packed: tuple[Path, Capture]):
+    folder, found = packed
+    scene = open_scene(str(folder / "scene.npz"))
     assert scene.resolution == (200, 150) and scene.bounds.unbounded
-    assert len(scene.train) + len(scene.val) == len([p for p in packed.photos if p.status == "placed"])
+    assert len(scene.train) + len(scene.val) == len([p for p in found.photos if p.status == "placed"])
     assert len(scene.val) == 2
-    assert torch.equal(scene.train.images, packed.scene.train.images)
+    assert torch.equal(scene.train.images, found.scene.train.images)
     # The subject stands in the box, and the orbit looks at it from as far as the cameras.
     assert (scene.bounds.aabb[0] < 0).all() and (scene.bounds.aabb[1] > 0).all()
     heights = scene.orbit.centres[:, 2]
@@ -62,10 +67,10 @@ def test_the_scene_trains_like_any_other(made: tuple[Path, Truth], packed):
     assert 0 < scene.bounds.near < float((scene.train.cameras.centres - scene.bounds.centre).norm(dim=1).min())
 
 
-def test_calibration_is_written_for_people_and_programs(made: tuple[Path, Truth], packed):
-    folder, _ = made
-    content = yaml.safe_load((folder / "out" / "calibration.yaml").read_text())
-    assert content["fx"] == pytest.approx(packed.calibration.lens.fx)
+def test_calibration_is_written_for_people_and_programs(packed: tuple[Path, Capture]):
+    folder, found = packed
+    content = yaml.safe_load((folder / "calibration.yaml").read_text())
+    assert content["fx"] == pytest.approx(found.calibration.lens.fx)
     assert content["tags"]["dictionary"] == "DICT_4X4_50"
     assert len(content["tags"]["to_world"]) >= 3 and set(content["tags"]["to_world"]) <= set(range(6))
     assert content["photos_used"] and content["standard_deviations"]["focal"] > 0
@@ -85,9 +90,9 @@ def test_undistorted_points_lie_where_a_pinhole_camera_puts_them():
     assert inside.sum() > 200 and np.abs(back - seen).max() < 0.05
 
 
-def test_no_pixel_of_the_scene_lacks_a_source(tmp_path: Path, made: tuple[Path, Truth], packed):
+def test_no_pixel_of_the_scene_lacks_a_source(packed: tuple[Path, Capture]):
     """White photos stay white to the last pixel: undistortion brings no black border."""
-    rectification = rectify(packed.calibration.lens)
+    rectification = rectify(packed[1].calibration.lens)
     white = np.full((SMALL.height, SMALL.width, 3), 255, np.uint8)
     assert rectification.apply(white).min() == 255
     assert rectification.col.min() > -0.5 and rectification.col.max() < SMALL.width - 0.5
@@ -127,7 +132,7 @@ def run(made: tuple[Path, Truth], tmp_path: Path, **changes):
     [
         ({"size": 60.0}, "tags.size: found 60, expected the side .* in metres"),
         ({"size": 6.0}, "m away from the tags, expected 0.03 to 30 m; give the side"),
-        ({"dictionary": "DICT_7X7_50"}, "0 photos with tags of 8"),
+        ({"dictionary": "DICT_7X7_50"}, "no tag of DICT_7X7_50 in 8 photos"),
         ({"output": Path("scene.txt")}, "ends in .npz"),
         ({"orbit": "999.png"}, "orbit: found 999.png, expected a placed photo"),
         ({"calibration": Path("nowhere")}, "calibration: found nowhere, which is no folder"),

@@ -12,7 +12,7 @@ from export.balls import CENTRE, DENSE, RADIUS, ball_run, ball_system
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.mesh import mesh_file, points_file, require_mesh, voxels_file
-from nerf_lightning.export.volume import cells_across, cropped, sample_volume
+from nerf_lightning.export.volume import cells_across, region_of, sample_volume, volume_of
 
 SCALE, SHIFT = 0.02, torch.tensor([5.0, -1.0, 2.0])
 TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -73,17 +73,28 @@ def test_voxels_hold_density_and_colour_and_their_place():
     assert density.max() * SCALE == pytest.approx(DENSE, rel=0.01), "per unit of the photos' frame"
 
 
-def test_what_lies_outside_a_box_is_cut_off():
+def test_what_lies_outside_a_box_is_cut_off_and_cells_are_as_fine_as_it_is_small():
     run = ball_run(to_source())
     middle = there(CENTRE)
-    half = torch.tensor(np.stack([middle - SCALE, middle + [SCALE, SCALE, 0]]), dtype=torch.float32)
-    volume = cropped(sample_volume(run.system, RESOLUTION), half, run.to_source)
-    shape = mesh_file(run, run.orbit, volume, 0.5, "ply")
-    mesh = trimesh.load(io.BytesIO(shape.content), file_type="ply")
+    reach = 0.7 * SCALE
+    box = torch.tensor(np.stack([middle - reach, middle + [reach, reach, 0]]), dtype=torch.float32)
+    volume = volume_of(run, RESOLUTION, box)
+    assert volume.cell == pytest.approx(1.4 / RESOLUTION, rel=1e-4)
+    mesh = trimesh.load(io.BytesIO(mesh_file(run, run.orbit, volume, 0.5, "ply").content), file_type="ply")
     low, high = mesh.bounds
-    cell = SCALE * 2 / RESOLUTION
+    cell = SCALE * volume.cell
     assert abs(high[2] - middle[2]) < cell and abs(low[2] - (middle[2] - SCALE * RADIUS)) < 1.5 * cell
     assert mesh.is_watertight, "closed where it was cut"
+
+
+def test_a_box_reaches_no_farther_than_the_scene_and_one_beside_it_is_refused():
+    run = ball_run(to_source())
+    everything = torch.tensor([[-100.0] * 3, [100.0] * 3])
+    assert torch.equal(region_of(run.system.field.bounds, everything, run.to_source), run.system.field.bounds.aabb)
+    with pytest.raises(
+        InputError, match=r"config: box: found \[-2.0.*expected something within \[4.98.* the scene's box"
+    ):
+        volume_of(run, RESOLUTION, torch.tensor([[-2.0] * 3, [-1.0] * 3]))
 
 
 def test_boxes_of_any_shape_have_cubic_cells():
