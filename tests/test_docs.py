@@ -20,12 +20,13 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
 
 SCENE = "dataset.download=false dataset.resize=16 dataset.rays=64 callbacks.orbit.frames=2 budget.seconds=null budget.steps=2"
+PLAIN = "callbacks.baselines=null callbacks.charts=null callbacks.training_gif=null callbacks.enlarge=null"
 PICTURE = "dataset.max_side=16 dataset.pixels=64 budget.seconds=null budget.steps=2"
 SMALLER: list[tuple[str, str]] = [
     ("experiment=pareto", f"{SCENE} recipe=tensorf_small seed=0"),
-    ("experiment=study_grid", f"{PICTURE} model.frequencies=1 model.width=16"),
-    ("experiment=study_frequencies", f"{PICTURE} model.frequencies=2"),
-    ("experiment=study_rate", f"{PICTURE} optimizer.lr=1e-1"),
+    ("experiment=study_grid", f"{PICTURE} {PLAIN} model.frequencies=1 model.width=16"),
+    ("experiment=study_frequencies", f"{PICTURE} {PLAIN} model.frequencies=2"),
+    ("experiment=study_rate", f"{PICTURE} {PLAIN} optimizer.lr=1e-1"),
     ("render.scale=2", "dataset.max_side=16 dataset.pixels=64 budget.steps=2"),
     ("experiment=capture", "dataset.rays=64 callbacks.orbit.frames=2 budget.steps=2 budget.seconds=null"),
     ("nerf_lightning.rightsize", f"{SCENE} ladder=ladder.yaml"),

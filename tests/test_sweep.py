@@ -17,9 +17,10 @@ def table(root: Path) -> dict[str, dict[str, str]]:
 
 
 def test_a_sweep_leaves_table_and_figure_and_is_done_once(inside, tmp_path: Path):
-    command = ["-m", *SMALL, "model.width=8,16", "seed=0,1"]
+    command = ["-m", *SMALL, "callbacks.charts=null", "model.width=8,16", "seed=0,1"]
     code, out, err = inside(*command)
-    root = tmp_path / "outputs" / "smoke_2d" / "sweep_budget.steps=3_dataset.max_side=16_model.width=8,16_seed=0,1"
+    name = "sweep_budget.steps=3_callbacks.charts=null_dataset.max_side=16_model.width=8,16_seed=0,1"
+    root = tmp_path / "outputs" / "smoke_2d" / name
     assert code == 0, err
     names = {f"model.width={width},seed={seed}" for width in (8, 16) for seed in (0, 1)}
     assert {path.name for path in root.iterdir() if path.is_dir()} == names
@@ -35,7 +36,7 @@ def test_a_sweep_leaves_table_and_figure_and_is_done_once(inside, tmp_path: Path
 
 
 def test_a_job_that_raises_is_named_and_the_others_go_on(inside, tmp_path: Path):
-    code, out, err = inside("-m", *SMALL, "model.width=8,-1,16,9")
+    code, out, err = inside("-m", *SMALL, *BARE, "model.width=8,-1,16,9")
     (root,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
     assert code == 1
     assert err.strip().splitlines()[-1] == "nerf_lightning: 1 of 4 jobs failed: model.width=-1"
@@ -44,7 +45,7 @@ def test_a_job_that_raises_is_named_and_the_others_go_on(inside, tmp_path: Path)
     assert sum(row["status"] != "failed" for row in table(root).values()) == 3
     assert "Traceback" in (root / "model.width=-1" / "error.txt").read_text()
     assert json.loads((root / "model.width=-1" / "results.json").read_text())["seed"] == 0
-    code, out, err = inside("-m", *SMALL, "model.width=8,-1,16,9")
+    code, out, err = inside("-m", *SMALL, *BARE, "model.width=8,-1,16,9")
     assert code == 1 and out.count("done before") == 3, "what failed is tried again"
     assert (root / "model.width=-1" / "error.txt").is_file()
 

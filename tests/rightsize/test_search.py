@@ -63,13 +63,13 @@ def test_a_search_leaves_the_smallest_that_is_enough(
 
 
 def test_the_choice_is_an_experiment_by_its_path(given: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    found = search([*given, "target.within_db=100"], tmp_path)
+    found = search([*given, "target.within_db=100", "budget.steps=20"], tmp_path)
     assert found["chosen"]["rung"] == 0, "a hundred dB below the best is anything"
     monkeypatch.chdir(tmp_path)
     (argument,) = cli.by_path(["+experiment=found/best.yaml"], cli.conf_dir())
     cfg = composed([argument], tmp_path)
     assert {key: cfg.model[key] for key in RUNGS[0]} == RUNGS[0]
-    assert cfg.sampler.samples == 32 and cfg.dataset.path == f"{tmp_path}/scene.npz" and cfg.budget.steps == 120
+    assert cfg.sampler.samples == 32 and cfg.dataset.path == f"{tmp_path}/scene.npz" and cfg.budget.steps == 20
 
 
 def test_other_arguments_stay_as_they_are(tmp_path: Path):

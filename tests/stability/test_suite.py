@@ -7,6 +7,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 import pytest
 
+from nerf_lightning.compose import composed
 from nerf_lightning.errors import InputError
 from nerf_lightning.stability.__main__ import stability
 from nerf_lightning.stability.cell import Cell, Outcome, folder_of, run
@@ -28,18 +29,25 @@ def test_there_are_enough_conditions_and_each_says_what_must_be():
 
 @pytest.mark.parametrize("condition", CONDITIONS, ids=lambda condition: condition.name)
 def test_every_condition_has_a_scene_and_options_that_compose(condition, tmp_path: Path):
-    from nerf_lightning.compose import composed
     from nerf_lightning.dataset import Picture
 
     made = condition.scene(0)
     assert isinstance(made, Picture) == condition.flat
+    base = [] if condition.flat else ["dataset=photos", "dataset.path=x"]
+    tried = []
     for method in METHODS.values():
         options = condition.options_for(method.kind)
-        if options is None or method.flat != condition.flat:
-            continue
-        base = [] if condition.flat else ["dataset=photos", "dataset.path=x"]
-        cfg = composed([*base, *method.options, *options], tmp_path)
-        assert cfg.callbacks.guard.attempts == (3 if method.guard else 0)
+        if options is not None and method.flat == condition.flat and options not in tried:
+            composed([*base, *method.options, *options], tmp_path)
+            tried.append(options)
+    assert tried
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_guard_is_off_where_a_method_says_so(name: str, tmp_path: Path):
+    method = METHODS[name]
+    cfg = composed([*([] if method.flat else ["dataset=photos", "dataset.path=x"]), *method.options], tmp_path)
+    assert cfg.callbacks.guard.attempts == (3 if method.guard else 0)
 
 
 def test_cells():
