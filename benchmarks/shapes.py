@@ -28,6 +28,8 @@ PHOTOS, VIEWS = 20, 40
 """Of the sheet, and of the object."""
 ABOVE = 0.005
 """Metres above the table from which on the object alone is looked at: a few voxels above the paper."""
+LONGEST = 800
+"""Pixels of the photos' longer side, of 1024: a mesh is as fine as they are."""
 LONGER = 3
 """Times the seconds that a capture is trained for, where every ray hits something."""
 
@@ -113,8 +115,8 @@ def of_capture(seconds: float, output: Path) -> Rows:
     folder = output / "shapes" / "capture"
     layout = SHEETS["six tags"]
     write_capture(folder, layout, LENS, PHOTOS, VIEWS, FLAWS, 0)
-    found = capture(folder / "calibration", folder / "photos", SIZE, Packing(folder / "scene.npz"))
-    given = [f"dataset.path='{folder}/scene.npz'", "dataset.resize=400", f"budget.seconds={LONGER * seconds}"]
+    found = capture(folder / "calibration", folder / "photos", SIZE, Packing(folder / "scene.npz", LONGEST))
+    given = [f"dataset.path='{folder}/scene.npz'", f"budget.seconds={LONGER * seconds}"]
     trained = train("capture", given, 0, folder / "run")
     rows = size_of_capture(open_scene_run(folder / "run"), found.solved, layout)
     return [{**row, "psnr": trained["psnr"]} for row in rows]

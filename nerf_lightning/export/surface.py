@@ -19,6 +19,8 @@ EMPTY = 0.02
 """Opacity of a cell below which it is nothing at all, and says nothing about where to draw the line."""
 FAR = 1e9
 """Distance at which a ray ends that meets nothing."""
+LOOKED = 300
+"""Pixels of a view's longer side, at most, when it is rendered to see what lies in the light."""
 FLOATER = 0.01
 """A piece with fewer cells than this share of the largest one's floats, and is left out."""
 
@@ -68,8 +70,10 @@ def lit_cells(system: NeRF3D, volume: Volume, cameras: Cameras) -> Bool[ndarray,
     )
     places = places.view(-1, 3)
     dark = torch.arange(len(places))
+    share = min(1.0, LOOKED / max(cameras.width, cameras.height))
+    cameras = cameras.resized(max(1, round(share * cameras.width)), max(1, round(share * cameras.height)))
     # Within a pixel a slanted surface has many depths: where cells are finer, the pixel's width says how far to go on.
-    beyond = max(volume.cell, PIXELS * (system.field.bounds.pixel or 0.0))
+    beyond = max(volume.cell, PIXELS * cameras.pixel_width(system.field.bounds.centre.cpu()))
     for view in tracked(range(len(cameras)), len(cameras), "views"):
         rendered = system.render(cameras.view_rays(view).to(system.device))
         ends = torch.where(rendered.opacity > 0.5, rendered.depth, FAR).cpu() + beyond
