@@ -40,20 +40,23 @@ class Surface:
     """Pieces left out."""
 
 
-def otsu(values: Float[ndarray, "N"]) -> float:
-    """The threshold in [0, 1] that parts values into two groups of the least variance within (Otsu 1979); 0.5 for too few."""
-    counts, edges = np.histogram(values, BINS, (0.0, 1.0))
-    centres = (edges[:-1] + edges[1:]) / 2
-    below, total = np.cumsum(counts), counts.sum()
-    above = total - below
-    sums = np.cumsum(counts * centres)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        apart = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
-    if not np.isfinite(apart).any():
+def solid_from(values: Float[ndarray, "N"]) -> float:
+    """The value from which on something is solid: the upper threshold that parts values into three groups, haze, blurred
+    sides and solids, of the least variance within (Otsu 1979, section IV); 0.5 for no values at all.
+
+    Two groups would do for a clean field. Where there is much haze, the line between them lies within it.
+    """
+    from skimage.filters import threshold_multiotsu
+
+    if not len(values):
         return 0.5
-    best = np.nan_to_num(apart, nan=-1.0)
+    low, high = float(values.min()), float(values.max())
+    if len(np.flatnonzero(np.histogram(values, BINS)[0])) < 3:
+        return (low + high) / 2 if low < high else high / 2
+    found = threshold_multiotsu(values, 3, BINS)[1]
     # Between two clear groups many thresholds are as good: the middle one.
-    return float(edges[1:][np.flatnonzero(best >= best.max() * (1 - 1e-9))].mean())
+    above = values > found
+    return float(values[~above].max() + values[above].min()) / 2
 
 
 @torch.no_grad()
@@ -118,7 +121,7 @@ def find_surface(volume: Volume, lit: Bool[ndarray, "X Y Z"], threshold: float |
         raise InputError("config", "threshold", str(threshold), "between 0 and 1")
     level = volume.opacity.numpy()
     if threshold is None:
-        threshold = otsu(level[lit & (level > EMPTY)])
+        threshold = solid_from(level[lit & (level > EMPTY)])
     most = level.max()
     level = np.where(lit | ~box_around(lit & (level > threshold)), level, 1.0)
     pieces, _ = ndimage.label(level > threshold, structure=np.ones((3, 3, 3)))

@@ -7,7 +7,7 @@ import trimesh
 from export.balls import CENTRE, RADIUS, ball_run
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.surface import box_around, find_surface, lit_cells, otsu
+from nerf_lightning.export.surface import box_around, find_surface, lit_cells, solid_from
 from nerf_lightning.export.volume import Volume, sample_volume
 
 N, CELL, SOFT, DENSE = 40, 0.05, 0.02, 60.0
@@ -58,8 +58,12 @@ def test_what_the_box_cuts_is_closed_there():
 def test_the_threshold_stands_between_the_thin_and_the_dense():
     generator = np.random.default_rng(0)
     thin, dense = generator.normal(0.15, 0.03, 4000), generator.normal(0.9, 0.02, 1000)
-    assert 0.3 < otsu(np.concatenate([thin, dense]).clip(0, 1)) < 0.8
-    assert otsu(np.zeros(0)) == 0.5
+    assert 0.24 < solid_from(np.concatenate([thin, dense]).clip(0, 1)) < 0.8
+    blurred = generator.uniform(0.1, 0.9, 1500)
+    haze = generator.uniform(0.02, 0.08, 40000)
+    assert 0.3 < solid_from(np.concatenate([haze, blurred, dense]).clip(0, 1)) < 0.8, "not within the haze"
+    assert solid_from(np.zeros(0)) == 0.5 and solid_from(np.full(3, 0.6)) == 0.3
+    assert solid_from(np.array([0.2, 0.2, 0.8])) == pytest.approx(0.5)
     fog = volume(((0, 0, 0), 0.5))
     fog.density[fog.density < 0.3] = (
         0.3  # a haze all over the box, which stops a quarter of the light on its way to the middle
