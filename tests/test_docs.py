@@ -15,12 +15,13 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 from capture.views import SIZE
+from test_sweep import BARE
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
 
 SCENE = "dataset.download=false dataset.resize=16 dataset.rays=64 callbacks.orbit.frames=2 budget.seconds=null budget.steps=2"
-PLAIN = "callbacks.baselines=null callbacks.charts=null callbacks.training_gif=null callbacks.enlarge=null"
+PLAIN = " ".join(BARE)
 PICTURE = "dataset.max_side=16 dataset.pixels=64 budget.seconds=null budget.steps=2"
 SMALLER: list[tuple[str, str]] = [
     ("experiment=pareto", f"{SCENE} recipe=tensorf_small seed=0"),

@@ -128,7 +128,10 @@ class Problem:
         self.unknowns = self.first_twist + self._twisting
         self.seen = _Seen.of(bundle.marks)
         self._last: tuple[np.ndarray, tuple[np.ndarray, csr_matrix]] | None = None
-        self._columns = self._column_of_each_entry()
+        columns = self._column_of_each_entry()
+        self._there = columns >= 0
+        self._columns = columns[self._there]
+        self._ends = np.concatenate([[0], np.cumsum(self._there.sum(2).reshape(-1))])
 
     def _column_of_each_entry(self) -> Int[np.ndarray, "N 2 E"]:
         """Columns of a point's entries in the Jacobian, ascending, as `_evaluate` lines them up; -1 for those of fixed tags."""
@@ -210,8 +213,6 @@ class Problem:
         if self.free_twists:
             lifted = seen.warp[:, None] * (tag_turn @ tag_start)[:, :, 2]
             entries.append(by_point @ lifted[:, :, None])
-        there_are = self._columns >= 0
-        ends = np.concatenate([[0], np.cumsum(there_are.sum(2).reshape(-1))])
-        values = np.concatenate(entries, axis=2)[there_are], self._columns[there_are], ends
+        values = np.concatenate(entries, axis=2)[self._there], self._columns, self._ends
         residuals = (pixels.reshape(-1, 2) - seen.pixels).reshape(-1)
         return residuals, csr_matrix(values, shape=(len(residuals), self.unknowns))

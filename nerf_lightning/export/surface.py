@@ -53,7 +53,8 @@ def solid_from(values: Float[ndarray, "N"]) -> float:
     low, high = float(values.min()), float(values.max())
     if len(np.flatnonzero(np.histogram(values, BINS)[0])) < 3:
         return (low + high) / 2 if low < high else high / 2
-    found = threshold_multiotsu(values, 3, BINS)[1]
+    # It names the middle of a bin, all of which belongs below.
+    found = threshold_multiotsu(values, 3, BINS)[1] + (high - low) / BINS / 2
     # Between two clear groups many thresholds are as good: the middle one.
     above = values > found
     return float(values[~above].max() + values[above].min()) / 2

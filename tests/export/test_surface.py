@@ -58,7 +58,7 @@ def test_what_the_box_cuts_is_closed_there():
 def test_the_threshold_stands_between_the_thin_and_the_dense():
     generator = np.random.default_rng(0)
     thin, dense = generator.normal(0.15, 0.03, 4000), generator.normal(0.9, 0.02, 1000)
-    assert 0.24 < solid_from(np.concatenate([thin, dense]).clip(0, 1)) < 0.8
+    assert 0.3 < solid_from(np.concatenate([thin, dense]).clip(0, 1)) < 0.8
     blurred = generator.uniform(0.1, 0.9, 1500)
     haze = generator.uniform(0.02, 0.08, 40000)
     assert 0.3 < solid_from(np.concatenate([haze, blurred, dense]).clip(0, 1)) < 0.8, "not within the haze"

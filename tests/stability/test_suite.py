@@ -38,7 +38,8 @@ def test_every_condition_has_a_scene_and_options_that_compose(condition, tmp_pat
     for method in METHODS.values():
         options = condition.options_for(method.kind)
         if options is not None and method.flat == condition.flat and options not in tried:
-            composed([*base, *method.options, *options], tmp_path)
+            cfg = composed([*base, *method.options, *options], tmp_path)
+            assert cfg.callbacks.guard.attempts == (3 if method.guard else 0)
             tried.append(options)
     assert tried
 
