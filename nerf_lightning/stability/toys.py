@@ -14,8 +14,9 @@ DISTANCE, FIELD_OF_VIEW = 4.0, 0.7
 """Of the cameras from the origin, and across a picture, radians."""
 FINER = 3
 """Rays along each side of a pixel, whose mean is its colour."""
-TOGETHER = 1 << 13
-"""Rays traced at a time: what all bodies say of them stays in the processor's cache."""
+TILE = 90
+"""Rays along each side of what is traced at a time: what bodies say of them stays in the processor's cache, and most bodies
+of a heap are not there."""
 LIGHT = (0.5, -0.4, 0.77)
 """Direction towards the light, nearly unit."""
 
@@ -87,16 +88,35 @@ def trace(bodies: list[Body], rays: Rays, grain: float = 1.0) -> tuple[Float[Ten
     return torch.where(hit[:, None], pattern(points, normals, grain), 0.0), hit.to(torch.float32)
 
 
+def in_sight(bodies: list[Body], rays: Rays) -> list[Body]:
+    """Those that rays from one place may meet: their enclosing balls reach into the cone around all of the rays."""
+    boxes = torch.stack([body.box for body in bodies])
+    offset = boxes.mean(1) - rays.origins[0]
+    distance, radius = offset.norm(dim=1), (boxes[:, 1] - boxes[:, 0]).norm(dim=1) / 2
+    axis = torch.nn.functional.normalize(rays.directions.mean(0), dim=0)
+    cone = (rays.directions @ axis).min().clamp(-1, 1).acos()
+    ball = (radius / distance).clamp(max=1).asin()
+    away = (offset @ axis / distance).clamp(-1, 1).acos()
+    seen = (away <= cone + ball + 1e-3) | (distance <= radius)
+    return [body for body, it in zip(bodies, seen.tolist(), strict=True) if it]
+
+
 def photograph(
     bodies: list[Body], cameras: Cameras, background: tuple[float, float, float] | None, grain: float = 1.0
 ) -> UInt8[Tensor, "V H W C"]:
     """Pictures on a background, or with alpha where that is None."""
     fine = cameras.resized(FINER * cameras.width, FINER * cameras.height)
+    pixels = torch.arange(fine.height * fine.width).view(fine.height, fine.width)
+    tiles = [tile.flatten() for row in pixels.split(TILE) for tile in row.split(TILE, dim=1)]
     pictures = []
     for view in range(len(cameras)):
-        rays = fine.view_rays(view)
-        parts = [trace(bodies, rays[start : start + TOGETHER], grain) for start in range(0, len(rays), TOGETHER)]
-        layers = torch.cat([torch.cat([colour * cover[:, None], cover[:, None]], dim=1) for colour, cover in parts])
+        rays, layers = fine.view_rays(view), torch.zeros(fine.height * fine.width, 4)
+        for tile in tiles:
+            some = rays[tile]
+            near = in_sight(bodies, some)
+            if near:
+                colour, cover = trace(near, some, grain)
+                layers[tile] = torch.cat([colour * cover[:, None], cover[:, None]], dim=1)
         layers = layers.view(fine.height, fine.width, 4)
         mean = layers.view(cameras.height, FINER, cameras.width, FINER, 4).mean((1, 3))
         premultiplied, alpha = mean[..., :3], mean[..., 3:]

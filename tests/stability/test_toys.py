@@ -8,7 +8,7 @@ import torch
 from nerf_lightning.cameras import Rays
 from nerf_lightning.stability import damage
 from nerf_lightning.stability.conditions import picture
-from nerf_lightning.stability.toys import DISTANCE, MARBLE, PILE, Ball, Block, around, enclosing, toy, trace
+from nerf_lightning.stability.toys import DISTANCE, MARBLE, PILE, Ball, Block, around, enclosing, in_sight, toy, trace
 
 
 def ray(origin: list[float], direction: list[float]) -> Rays:
@@ -40,6 +40,22 @@ def test_the_nearer_body_is_seen():
     colour, cover = trace([behind, red], ray([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]))
     alone, _ = trace([red], ray([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]))
     assert torch.equal(colour, alone) and cover.tolist() == [1.0]
+
+
+def test_what_is_out_of_sight_changes_nothing():
+    bodies: list = [Ball((x, y, 0.0), 0.1) for x in (-0.8, 0.0, 0.8) for y in (-0.8, 0.0, 0.8)] + PILE
+    rays = around(3, 24).view_rays(1)
+    few = 0
+    for start in range(0, len(rays), 24):
+        some = rays[start : start + 12]
+        near = in_sight(bodies, some)
+        few += len(near) < len(bodies)
+        whole, cover = trace(bodies, some)
+        assert bool(cover.any()) <= bool(near)
+        if near:
+            colour, alone = trace(near, some)
+            assert torch.equal(colour, whole) and torch.equal(alone, cover)
+    assert few > 20
 
 
 def test_cameras_stand_apart_and_look_at_the_middle():
