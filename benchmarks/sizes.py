@@ -4,8 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as imageio
 import torch
 from omegaconf import DictConfig
+from torch import Tensor
 
 from nerf_lightning import cli
 from nerf_lightning.build import build_data
@@ -84,10 +86,16 @@ def measure(overrides: list[str], seconds: float, output: Path) -> dict[str, Row
             index: found.full.get(index) or train_in_full(cfg, options, found.sampler, data, folder / f"rung_{index}")
             for index, options in enumerate(found.ladder.rungs)
         }
-        rows.append({"scene": name, **_row(found, full)})
+        assert isinstance(data, RayDataModule)  # scenes alone are measured
+        rows.append({"scene": name, "picture_kB": png_size(data.scene.val.images) / 1000, **_row(found, full)})
         last = cfg, found
     assert last is not None  # there are scenes
     return {"sizes": rows, "few": few(*last, overrides, seconds, output)}
+
+
+def png_size(images: Tensor) -> float:
+    """Mean bytes of pictures [V, H, W, C] as PNG: how complex a scene is, told without a field."""
+    return sum(len(imageio.imwrite("<bytes>", image.numpy(), extension=".png")) for image in images) / len(images)
 
 
 def few(whole: DictConfig, found: Found, overrides: list[str], seconds: float, output: Path) -> Rows:
