@@ -75,32 +75,57 @@ class Bounds:
             size = float(self.half_size.max())
             near = torch.full_like(rays.origins[:, 0], 0.02 * size if self.near is None else self.near)
             return near, torch.full_like(near, UNBOUNDED_REACH * size if self.far is None else self.far)
+        enter, leave = self._crossing(rays)
+        near, far = enter.clamp_min(0.0 if self.near is None else max(self.near, 0.0)), leave
+        return near, far if self.far is None else far.clamp_max(self.far)
+
+    def _crossing(self, rays: Rays) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
+        """Where each ray's line enters and leaves the box, by the slab test: leave < enter where it misses."""
         # A zero component never crosses its slab: nudge it, so that the division gives +-huge instead of nan.
         safe = torch.where(rays.directions.abs() < 1e-9, torch.full_like(rays.directions, 1e-9), rays.directions)
         crossings = (self.aabb[:, None] - rays.origins) / safe
-        near = crossings.amin(0).amax(-1).clamp_min(0.0 if self.near is None else max(self.near, 0.0))
-        far = crossings.amax(0).amin(-1)
-        return near, far if self.far is None else far.clamp_max(self.far)
+        return crossings.amin(0).amax(-1), crossings.amax(0).amin(-1)
+
+    def inside(self, rays: Rays) -> Float[Tensor, "R 2"]:
+        """Distances between which each ray is at its closest to the content: those in the box, or twice where it passes the
+        box's centre. They may be negative."""
+        enter, leave = self._crossing(rays)
+        closest = ((self.centre - rays.origins) * rays.directions).sum(-1)
+        ends = torch.stack([torch.where(enter < leave, end, closest) for end in (enter, leave)], dim=-1)
+        return ends.contiguous()
 
     def distances(
-        self, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "*#R S"]
+        self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "*#R S"]
     ) -> Float[Tensor, "R S"]:
-        """Maps s in [0, 1] to distances: linear when bounded, linear then linear in disparity when not.
+        """Maps s in [0, 1] to distances: linear when bounded; when not, linear inside the box, thinning out from it.
 
-        The unbounded map is uniform in g(t) = t/2 below the unit length u, 1 - u/(2t) above it, so samples thin out with
-        distance as pixels do (nerfacto's piecewise spacing); u is the box's half-size.
+        The unbounded map is even in `warp`, as samples are in the contracted space of mip-NeRF 360 (section 3): before the
+        box and behind it a step grows with the square of 1 + the distance to the box in half-sizes.
         """
         near, far = near[:, None], torch.maximum(far, near)[:, None]
         if not self.unbounded:
             return near + (far - near) * s
-        unit = self.half_size.max()
+        inside, unit = self.inside(rays), self.half_size.max()
+        start = warp(near, inside, unit)
+        return unwarp(start + (warp(far, inside, unit) - start) * s, inside, unit)
 
-        def g(t: Tensor) -> Tensor:
-            x = t / unit
-            return torch.where(x < 1, x / 2, 1 - 1 / (2 * x.clamp_min(1.0)))
 
-        y = g(near) + (g(far) - g(near)) * s
-        return unit * torch.where(y < 0.5, 2 * y, 1 / (2 - 2 * y).clamp_min(1e-6))
+def warp(t: Float[Tensor, "R S"], inside: Float[Tensor, "R 2"], unit: Float[Tensor, ""]) -> Float[Tensor, "R S"]:
+    """Distances along rays as numbers that are even where samples shall be: 0 at the nearer end of `inside`, growing by 1 a
+    `unit` up to its other end, and by x / (1 + x) in all over x units beyond either end."""
+    enter, leave = inside[:, :1], inside[:, 1:]
+    before, behind = ((enter - t) / unit).clamp_min(0), ((t - leave) / unit).clamp_min(0)
+    within = (torch.minimum(torch.maximum(t, enter), leave) - enter) / unit
+    return 1 / (1 + before) - 1 / (1 + behind) + within
+
+
+def unwarp(y: Float[Tensor, "R S"], inside: Float[Tensor, "R 2"], unit: Float[Tensor, ""]) -> Float[Tensor, "R S"]:
+    """The inverse of `warp`."""
+    enter, leave = inside[:, :1], inside[:, 1:]
+    length = (leave - enter) / unit
+    before = 1 / (1 + y.clamp(-1 + 1e-6, 0)) - 1
+    behind = 1 / (1 - (y - length).clamp(0, 1 - 1e-6)) - 1
+    return torch.where(y < 0, enter - unit * before, torch.where(y > length, leave + unit * behind, enter + unit * y))
 
 
 class InBounds(torch.nn.Module):

@@ -47,7 +47,7 @@ def march_reference(
     # One more than the steps: the first one may be cut short by the shift, and the last must reach the far end.
     steps = torch.arange(samples + 2, device=near.device) + shift[:, None] - 0.5
     if bounds.unbounded:
-        edges = bounds.distances(near, far, (steps / samples).clamp(0, 1))
+        edges = bounds.distances(rays, near, far, (steps / samples).clamp(0, 1))
     else:
         edges = torch.minimum(near[:, None] + steps.clamp_min(0) * step, far[:, None])
     keep = edges[:, 1:] > edges[:, :-1]
@@ -95,7 +95,8 @@ def march(
     cpu.coarsen(occupied.numpy(), resolution, blocks, cells, threads)
     found, counts = np.empty((count, samples + 1), np.int32), np.empty(count, np.int64)
     origins, directions = rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy()
-    ends = near.contiguous().numpy(), far.contiguous().numpy(), shift.contiguous().numpy()
+    inside = bounds.inside(rays) if bounds.unbounded else torch.empty(0, 2)
+    ends = tuple(x.contiguous().numpy() for x in (near, far, inside, shift))
     half, length = bounds.half_size.numpy(), np.float32(step)
     box = bounds.centre.numpy(), half, bounds.unbounded
     cpu.walk(

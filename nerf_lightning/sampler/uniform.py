@@ -36,7 +36,7 @@ class UniformSampler(Sampler):
         s = torch.linspace(0, 1, self.samples + 1, device=near.device).expand(len(rays), -1)
         if self.stratified and generator is not None:
             s = stratified_edges(s, generator)
-        return self.bounds.distances(near, far, s)
+        return self.bounds.distances(rays, near, far, s)
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         edges = self.edges(rays, generator)

@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from nerf_lightning.cameras import Bounds, InBounds, Rays
+from nerf_lightning.cameras.bounds import unwarp, warp
 
 BOX = torch.tensor([[-1.0, -0.5, 0.2], [1.5, 2.0, 1.0]])
 
@@ -112,22 +113,51 @@ def test_without_bounds_near_and_far_override(near, far):
 def test_distances_rise_from_near_to_far(unbounded):
     near, far = torch.tensor([0.0, 0.02, 0.5, 3.0]), torch.tensor([1.0, 50.0, 0.9, 80.0])
     s = torch.linspace(0, 1, 65).expand(1, -1)
-    t = Bounds(BOX, unbounded).distances(near, far, s)
+    t = Bounds(BOX, unbounded).distances(some_rays(4), near, far, s)
     torch.testing.assert_close(t[:, 0], near, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(t[:, -1], far, rtol=1e-4, atol=1e-5)
     assert (t.diff(dim=1) > 0).all()
-    if unbounded:  # even in g: t/2 up to the longest half-size, then 1 - 1/(2t)
-        g = np.vectorize(lambda x: x / 2 if x < 1 else 1 - 0.5 / x)(t.double().numpy() / 1.25)
-        np.testing.assert_allclose(
-            np.diff(g, axis=1), (np.diff(g, axis=1).mean(1, keepdims=True)).repeat(64, 1), atol=1e-5
-        )
-    else:
+    if not unbounded:
         torch.testing.assert_close(t, near[:, None] + (far - near)[:, None] * s)
+
+
+def along_x(*starts: list[float]) -> Rays:
+    return Rays(torch.tensor(starts), torch.tensor([[1.0, 0.0, 0.0]]).expand(len(starts), -1))
+
+
+def test_without_bounds_steps_are_even_in_the_box_and_grow_out_from_it():
+    """A cube of half-size 2, met, begun inside of, missed, and far behind: by hand."""
+    cube = Bounds(torch.tensor([[-2.0, -2, -2], [2, 2, 2]]), unbounded=True)
+    rays = along_x([-8.0, 0, 0], [1.0, 0, 0], [-8.0, 5, 0], [30.0, 0, 0])
+    torch.testing.assert_close(cube.inside(rays), torch.tensor([[6.0, 10.0], [-3.0, 1.0], [8.0, 8.0], [-32.0, -28.0]]))
+    # Six before the box are three half-sizes, 3 / 4 of all there is before; then two in it; ten behind it are 5 / 6.
+    even = torch.tensor([[-3 / 4, 0.0, 1.0, 2.0, 2 + 1 / 2, 2 + 5 / 6]])
+    t = torch.tensor([[0.0, 6.0, 8.0, 10.0, 12.0, 20.0]])
+    inside, unit = cube.inside(rays), torch.tensor(2.0)
+    torch.testing.assert_close(warp(t, inside[:1], unit), even)
+    torch.testing.assert_close(unwarp(even, inside[:1], unit), t)
+    near, far = torch.zeros(4), torch.full((4,), 40.0)
+    steps = cube.distances(rays, near, far, torch.linspace(0, 1, 401).expand(4, -1)).diff(dim=1)
+    t = cube.distances(rays, near, far, torch.linspace(0, 1, 401).expand(4, -1))[:, :-1] + steps / 2
+    beyond = torch.stack([inside[:, :1] - t, t - inside[:, 1:]]).amax(0).clamp_min(0) / 2
+    growth = steps / (1 + beyond) ** 2
+    torch.testing.assert_close(growth, growth.median(dim=1, keepdim=True).values.expand_as(growth), rtol=1e-2, atol=0)
+
+
+def test_a_ray_along_a_wall_that_it_misses_has_places_too():
+    """Its line never meets that axis's slab: the crossings are as good as infinite."""
+    cube = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True)
+    t = cube.distances(
+        along_x([-4.0, 1.5, 0]), torch.tensor([0.1]), torch.tensor([50.0]), torch.linspace(0, 1, 33)[None]
+    )
+    assert t.isfinite().all() and (t.diff(dim=1) > 0).all() and t.diff(dim=1).argmin() in range(10, 22)
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
 def test_a_ray_that_misses_has_no_length(unbounded):
-    t = Bounds(BOX, unbounded).distances(torch.tensor([2.0]), torch.tensor([1.0]), torch.linspace(0, 1, 5)[None])
+    t = Bounds(BOX, unbounded).distances(
+        some_rays(1), torch.tensor([2.0]), torch.tensor([1.0]), torch.linspace(0, 1, 5)[None]
+    )
     torch.testing.assert_close(t, torch.full((1, 5), 2.0))
 
 

@@ -45,7 +45,7 @@ def test_jitter_keeps_each_edge_in_its_stratum(count: int, unbounded: bool, box:
     near, far = bounds.near_far(rays)
     rays, near, far = (x[near < far] for x in (rays, near, far))
     even = torch.linspace(0, 1, count + 1).expand(len(rays), -1)
-    strata = bounds.distances(near, far, (even[:, 1:] + even[:, :-1]) / 2)
+    strata = bounds.distances(rays, near, far, (even[:, 1:] + even[:, :-1]) / 2)
     jittered = torch.stack([sampler.edges(rays, seeded(i)) for i in range(50)])
     torch.testing.assert_close(jittered[0][:, [0, -1]], sampler.edges(rays, None)[:, [0, -1]])
     inner = jittered[:, :, 1:-1]

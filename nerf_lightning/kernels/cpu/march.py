@@ -9,20 +9,33 @@ from nerf_lightning.kernels.cpu.compile import inner, kernel
 
 
 @inner
-def contraction(t, unit):
-    """The map that unbounded distances are uniform in; see `Bounds.distances`."""
-    x = t / unit
-    return x / float32(2) if x < float32(1) else float32(1) - float32(1) / (float32(2) * x)
+def warp(t, enter, leave, unit):
+    """Numbers that an unbounded ray's steps are even in; see `nerf_lightning.cameras.bounds.warp`."""
+    one, zero = float32(1), float32(0)
+    before, behind = max((enter - t) / unit, zero), max((t - leave) / unit, zero)
+    within = (min(max(t, enter), leave) - enter) / unit
+    return one / (one + before) - one / (one + behind) + within
 
 
 @inner
-def edge(k, shift, near, far, step, samples, unbounded, low, span, unit):
+def unwarp(y, enter, leave, unit):
+    """The inverse of `warp`."""
+    one, zero, most = float32(1), float32(0), float32(1 - 1e-6)
+    length = (leave - enter) / unit
+    if y < zero:
+        return enter - unit * (one / (one + max(y, -most)) - one)
+    if y > length:
+        return leave + unit * (one / (one - min(y - length, most)) - one)
+    return enter + unit * y
+
+
+@inner
+def edge(k, shift, near, far, step, samples, unbounded, low, span, enter, leave, unit):
     """Distance at which interval k begins."""
     steps = float32(k) + shift - float32(0.5)
     if not unbounded:
         return min(near + max(steps, float32(0)) * step, far)
-    y = low + span * min(max(steps / float32(samples), float32(0)), float32(1))
-    return unit * (float32(2) * y if y < float32(0.5) else float32(1) / max(float32(2) - float32(2) * y, float32(1e-6)))
+    return unwarp(low + span * min(max(steps / float32(samples), float32(0)), float32(1)), enter, leave, unit)
 
 
 @inner
@@ -63,7 +76,7 @@ def steps_to_leave(origin, direction, centre, half, cells, u, v, w, t, step):
 
 
 @kernel
-def walk(origins, directions, near, far, shift, occupied, resolution, blocks, cells, centre, half, unbounded, samples,
+def walk(origins, directions, near, far, inside, shift, occupied, resolution, blocks, cells, centre, half, unbounded, samples,
          step, found, counts, workers):  # fmt: skip
     """Notes which intervals of each ray to keep in found [R, samples + 1] and how many in counts [R].
 
@@ -75,14 +88,15 @@ def walk(origins, directions, near, far, shift, occupied, resolution, blocks, ce
     for worker in prange(workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
             first, last, kept = near[ray], max(far[ray], near[ray]), 0
-            low, span = float32(0), float32(0)
+            enter, leave, low, span = float32(0), float32(0), float32(0), float32(0)
             if unbounded:
-                low = contraction(first, unit)
-                span = contraction(last, unit) - low
+                enter, leave = inside[ray, 0], inside[ray, 1]
+                low = warp(first, enter, leave, unit)
+                span = warp(last, enter, leave, unit) - low
             k = 0
-            start = edge(0, shift[ray], first, last, step, samples, unbounded, low, span, unit)
+            start = edge(0, shift[ray], first, last, step, samples, unbounded, low, span, enter, leave, unit)
             while k <= samples:
-                end = edge(k + 1, shift[ray], first, last, step, samples, unbounded, low, span, unit)
+                end = edge(k + 1, shift[ray], first, last, step, samples, unbounded, low, span, enter, leave, unit)
                 if not end > start:
                     if start >= last:
                         break
@@ -103,7 +117,9 @@ def walk(origins, directions, near, far, shift, occupied, resolution, blocks, ce
                         leap = steps_to_leave(origins[ray], directions[ray], centre, half, cells, u, v, w, t, step)
                     if leap > 0:
                         k += leap
-                        end = edge(k + 1, shift[ray], first, last, step, samples, unbounded, low, span, unit)
+                        end = edge(
+                            k + 1, shift[ray], first, last, step, samples, unbounded, low, span, enter, leave, unit
+                        )
                 elif occupied[
                     (cell(u, resolution) * resolution + cell(v, resolution)) * resolution + cell(w, resolution)
                 ]:
@@ -114,20 +130,21 @@ def walk(origins, directions, near, far, shift, occupied, resolution, blocks, ce
 
 
 @kernel
-def pack(near, far, shift, half, unbounded, samples, step, found, offsets, t, dt, ray_of, workers):
+def pack(near, far, inside, shift, half, unbounded, samples, step, found, offsets, t, dt, ray_of, workers):
     """Distances and lengths of the intervals that `walk` noted, one ray after the other."""
     rays, unit = len(near), max(half[0], max(half[1], half[2]))
     for worker in prange(workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
             first, last = near[ray], max(far[ray], near[ray])
-            low, span = float32(0), float32(0)
+            enter, leave, low, span = float32(0), float32(0), float32(0), float32(0)
             if unbounded:
-                low = contraction(first, unit)
-                span = contraction(last, unit) - low
+                enter, leave = inside[ray, 0], inside[ray, 1]
+                low = warp(first, enter, leave, unit)
+                span = warp(last, enter, leave, unit) - low
             for n in range(offsets[ray], offsets[ray + 1]):
                 k = found[ray, n - offsets[ray]]
-                start = edge(k, shift[ray], first, last, step, samples, unbounded, low, span, unit)
-                end = edge(k + 1, shift[ray], first, last, step, samples, unbounded, low, span, unit)
+                start = edge(k, shift[ray], first, last, step, samples, unbounded, low, span, enter, leave, unit)
+                end = edge(k + 1, shift[ray], first, last, step, samples, unbounded, low, span, enter, leave, unit)
                 t[n], dt[n], ray_of[n] = (start + end) / float32(2), end - start, ray
 
 
