@@ -18,6 +18,9 @@ from nerf_lightning.errors import InputError
 
 NEAR = 0.25
 """Sampling starts at this share of the nearest camera's distance to the subject: nobody holds a lens closer."""
+SUBJECT = 0.5
+"""The box's share of what the photos show across at the subject. Around an object there are tags, which are in the photos too;
+they may lie outside the box, where a field has less and less detail."""
 FRAMES = 60
 
 
@@ -40,7 +43,8 @@ def pack(
     """Makes a scene of photos that have been placed.
 
     Undistortion zooms in until no pixel lacks a source, so that no black border is ever trained on. The scene's frame is the
-    tags': metres, z out of the paper. Content lies in a cube around what the cameras look at; what is beyond is kept too.
+    tags': metres, z out of the paper. The box is a cube around what the cameras look at, half as wide as the photos show there;
+    what is beyond is kept too, the coarser the farther.
 
     Args:
         paths: the photos, all of the lens's size.
@@ -77,7 +81,8 @@ def pack(
     if orbit is not None:
         through = poses[[path.name for path in paths].index(orbit), :3, 3]
     near = NEAR * min(viewing_distance(train.cameras.c2w, centre), float(distances.min()))
-    aabb = torch.from_numpy(visible_cube(train.cameras)).float()
+    cube = torch.from_numpy(visible_cube(train.cameras)).float()
+    aabb = cube.mean(0) + SUBJECT * (cube - cube.mean(0))
     return Scene(
         name=name,
         source=source,

@@ -11,6 +11,7 @@ import yaml
 from capture.views import LENS, SIX, SIZE, SMALL
 from once import once
 
+from nerf_lightning.cameras import transform
 from nerf_lightning.capture.calibrate import calibrate
 from nerf_lightning.capture.detect import guess_family, sight, tag_detector
 from nerf_lightning.capture.geometry import angle_between, inverse, project
@@ -19,6 +20,7 @@ from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.photos import find_photos
 from nerf_lightning.capture.run import Capture, capture
 from nerf_lightning.capture.synthetic import Truth
+from nerf_lightning.capture.tabletop import Tabletop
 from nerf_lightning.dataset import open_scene
 from nerf_lightning.dataset.lens import rectify
 from nerf_lightning.errors import InputError
@@ -60,8 +62,14 @@ def test_the_scene_trains_like_any_other(packed: tuple[Path, Capture]):
     assert len(scene.train) + len(scene.val) == len([p for p in found.photos if p.status == "placed"])
     assert len(scene.val) == 2
     assert torch.equal(scene.train.images, found.scene.train.images)
-    # The subject stands in the box, and the orbit looks at it from as far as the cameras.
-    assert (scene.bounds.aabb[0] < 0).all() and (scene.bounds.aabb[1] > 0).all()
+    # The subject stands in the box, which is no more than four times as wide; the orbit looks at it from the cameras' height.
+    (reference,) = (tag for n, tag in enumerate(found.solved.tags) if n in found.solved.fixed)
+    corners = torch.from_numpy(Tabletop(SIX).box).float()
+    from_truth = torch.from_numpy(inverse(SIX.poses[reference])).float()
+    subject = transform(from_truth, torch.cartesian_prod(*corners.T))
+    low, high = scene.bounds.aabb
+    assert (low < subject.amin(0)).all() and (subject.amax(0) < high).all()
+    assert (high - low).max() < 4 * (corners[1] - corners[0]).max()
     heights = scene.orbit.centres[:, 2]
     assert heights.std() < 1e-4 and heights.min() > 0
     assert 0 < scene.bounds.near < float((scene.train.cameras.centres - scene.bounds.centre).norm(dim=1).min())
