@@ -91,8 +91,7 @@ class Bounds:
         box's centre. They may be negative."""
         enter, leave = self._crossing(rays)
         closest = ((self.centre - rays.origins) * rays.directions).sum(-1)
-        ends = torch.stack([torch.where(enter < leave, end, closest) for end in (enter, leave)], dim=-1)
-        return ends.contiguous()
+        return torch.stack([torch.where(enter < leave, end, closest) for end in (enter, leave)], dim=-1)
 
     def distances(
         self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "*#R S"]
