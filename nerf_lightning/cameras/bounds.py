@@ -76,8 +76,8 @@ class Bounds:
             near = torch.full_like(rays.origins[:, 0], 0.02 * size if self.near is None else self.near)
             return near, torch.full_like(near, UNBOUNDED_REACH * size if self.far is None else self.far)
         enter, leave = self._crossing(rays)
-        near, far = enter.clamp_min(0.0 if self.near is None else max(self.near, 0.0)), leave
-        return near, far if self.far is None else far.clamp_max(self.far)
+        near = enter.clamp_min(0.0 if self.near is None else max(self.near, 0.0))
+        return near, leave if self.far is None else leave.clamp_max(self.far)
 
     def _crossing(self, rays: Rays) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
         """Where each ray's line enters and leaves the box, by the slab test: leave < enter where it misses."""

@@ -82,7 +82,7 @@ def pack(
         through = poses[[path.name for path in paths].index(orbit), :3, 3]
     near = NEAR * min(viewing_distance(train.cameras.c2w, centre), float(distances.min()))
     cube = torch.from_numpy(visible_cube(train.cameras)).float()
-    aabb = cube.mean(0) + SUBJECT * (cube - cube.mean(0))
+    aabb = centre + SUBJECT * (cube - centre)
     return Scene(
         name=name,
         source=source,

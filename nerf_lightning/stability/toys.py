@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, UInt8
@@ -38,7 +39,7 @@ class Ball:
         points = rays.origins + rays.directions * t.nan_to_num(posinf=0)[:, None]
         return t, (points - torch.tensor(self.centre)) / self.radius
 
-    @property
+    @cached_property
     def box(self) -> Float[Tensor, "2 3"]:
         centre = torch.tensor(self.centre)
         return torch.stack([centre - self.radius, centre + self.radius])
@@ -62,7 +63,7 @@ class Block:
         normals = torch.nn.functional.one_hot(axis, 3).to(t.dtype) * -rays.directions.sign()
         return t, normals
 
-    @property
+    @cached_property
     def box(self) -> Float[Tensor, "2 3"]:
         return torch.tensor([self.low, self.high])
 

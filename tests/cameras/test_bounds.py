@@ -137,8 +137,9 @@ def test_without_bounds_steps_are_even_in_the_box_and_grow_out_from_it():
     torch.testing.assert_close(warp(t, inside[:1], unit), even)
     torch.testing.assert_close(unwarp(even, inside[:1], unit), t)
     near, far = torch.zeros(4), torch.full((4,), 40.0)
-    steps = cube.distances(rays, near, far, torch.linspace(0, 1, 401).expand(4, -1)).diff(dim=1)
-    t = cube.distances(rays, near, far, torch.linspace(0, 1, 401).expand(4, -1))[:, :-1] + steps / 2
+    edges = cube.distances(rays, near, far, torch.linspace(0, 1, 401).expand(4, -1))
+    steps = edges.diff(dim=1)
+    t = edges[:, :-1] + steps / 2
     beyond = torch.stack([inside[:, :1] - t, t - inside[:, 1:]]).amax(0).clamp_min(0) / 2
     growth = steps / (1 + beyond) ** 2
     torch.testing.assert_close(growth, growth.median(dim=1, keepdim=True).values.expand_as(growth), rtol=1e-2, atol=0)
