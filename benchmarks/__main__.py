@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--budgets", default="60", help="seconds of training, separated by commas")
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--output", type=Path, default=Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S"))
-    arguments = parser.parse_args()
+    arguments = parser.parse_intermixed_args()  # overrides may stand behind options
     overrides = [part for part in arguments.parts if "=" in part]
     parts = [part for part in arguments.parts if "=" not in part] or list(PARTS)
     unknown = sorted(set(parts) - set(PARTS))

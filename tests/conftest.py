@@ -3,9 +3,18 @@
 import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
+# While the hook below loads a module it looks for all compiled files under a name of its own, those of libraries too, and so
+# would compile thousands again: what takes long to import comes first.
+import cv2  # noqa: F401
+import lightning.pytorch  # noqa: F401
+import matplotlib.figure  # noqa: F401
+import numba  # noqa: F401
+import scipy.signal  # noqa: F401
+import torch.utils.tensorboard
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,7 +34,6 @@ install_import_hook(checked_modules(), "typechecker.check")
 
 # ruff: noqa: E402
 import pytest
-import torch
 from once import once
 from torch.nn.functional import normalize
 
@@ -69,14 +77,12 @@ def kernels(request: pytest.FixtureRequest, fast_kernels: None) -> str:
 
 
 @pytest.fixture
-def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
-    """Runs a command line in this process, in an empty folder; returns exit code, output and errors."""
-    from nerf_lightning.__main__ import main
-
+def verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+    """Runs a verb's `main` with arguments in this process, in an empty folder; returns exit code, output and errors."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("NERF_LIGHTNING_TRACEBACK", raising=False)
 
-    def run(*arguments: str) -> tuple[int, str, str]:
+    def run(main: Callable[[], None], *arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["nerf_lightning", *arguments])
         code = 0
         try:
@@ -87,6 +93,14 @@ def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.Captur
 
     yield run
     logging.getLogger().handlers.clear()  # they write to what was captured
+
+
+@pytest.fixture
+def inside(verb):
+    """Likewise, of `python -m nerf_lightning`."""
+    from nerf_lightning.__main__ import main
+
+    return partial(verb, main)
 
 
 @pytest.fixture(scope="session")

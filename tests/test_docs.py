@@ -20,7 +20,10 @@ from test_sweep import BARE
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
 
-SCENE = "dataset.download=false dataset.resize=16 dataset.rays=64 callbacks.orbit.frames=2 budget.seconds=null budget.steps=2"
+SCENE = (
+    "dataset.download=false dataset.resize=16 dataset.rays=64 callbacks.orbit.frames=2 budget.seconds=null budget.steps=2"
+    " sampler.samples=32 sampler.resolution=16"
+)
 PLAIN = " ".join(BARE)
 PICTURE = "dataset.max_side=16 dataset.pixels=64 budget.seconds=null budget.steps=2"
 SMALLER: list[tuple[str, str]] = [
@@ -33,6 +36,7 @@ SMALLER: list[tuple[str, str]] = [
     ("nerf_lightning.rightsize", f"{SCENE} ladder=ladder.yaml"),
     ("best.yaml", "dataset.rays=64 callbacks.orbit.frames=2 budget.seconds=null budget.steps=2"),
     ("experiment=lego", SCENE),
+    ("-m +experiment=picture", f"{PICTURE} {PLAIN}"),
     ("experiment=picture", PICTURE),
     (
         "model=ball",

@@ -2,10 +2,13 @@
 
 import csv
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from test_cli import command
+from test_cli import ROOT, command
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3"]
 BARE = ["callbacks.baselines=null", "callbacks.charts=null", "callbacks.training_gif=null", "callbacks.enlarge=null"]
@@ -90,14 +93,26 @@ def test_a_study_is_one_command(inside, tmp_path: Path):
     assert {float(row["optimizer.lr"]) for row in table(root).values()} == {1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1}
 
 
+IN_TURN = """
+import json, sys
+from nerf_lightning.__main__ import main
+for line in json.loads(sys.argv.pop()):
+    sys.argv[1:] = line
+    main()
+"""
+"""Command lines one after the other, in a process of their own: Optuna warns, and here warnings are errors."""
+
+
 def test_optuna_proposes_the_same_trials_again_and_failing_ones_are_recorded(tmp_path: Path):
     line = ["+experiment=tune_picture", "dataset.max_side=16", "budget.steps=2", "hydra.sweeper.n_trials=2", *BARE]
-    first, second = (command(*line, cwd=tmp_path) for _ in range(2))
-    assert first.returncode == second.returncode == 0, first.stderr + second.stderr
-    assert first.stdout.count(": starts") == 2 and second.stdout.count("done before") == 2
-    assert len(table(next((tmp_path / "outputs" / "tune_picture").iterdir()))) == 2
-    failing = command(*line, "model.coarsest=0", cwd=tmp_path)
-    assert failing.returncode != 0 and failing.stderr.count("failed: config: model.coarsest") == 2
+    lines = json.dumps([line, line, [*line, "model.coarsest=0"]])
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    called = [sys.executable, "-c", IN_TURN, lines]
+    done = subprocess.run(called, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode != 0, "no trial of the last one succeeds"
+    assert done.stdout.count(": starts") == 4 and done.stdout.count("done before") == 2, done.stdout + done.stderr
+    assert {len(table(path)) for path in (tmp_path / "outputs" / "tune_picture").iterdir()} == {2}
+    assert done.stderr.count("failed: config: model.coarsest") == 2
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])

@@ -20,7 +20,7 @@ from nerf_lightning.cameras import Bounds, Cameras, Rays, pixel_to_camera, trans
 from nerf_lightning.dataset import Scene, Views, save_npz
 from nerf_lightning.dataset.bricks import bricks
 from nerf_lightning.errors import InputError
-from nerf_lightning.view import view_scene
+from nerf_lightning.view import main, view_scene
 from nerf_lightning.viewer.drawing import (
     box_edges,
     frusta,
@@ -245,21 +245,15 @@ def test_the_line_says_who_can_see_the_page():
     assert "http://127.0.0.1:9000; shared with the network (host=0.0.0.0)" in shared
 
 
-def command(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    environment.pop("NERF_LIGHTNING_TRACEBACK", None)
-    line = [sys.executable, "-m", "nerf_lightning.view", *arguments]
-    listen = functools.partial(
-        signal.signal, signal.SIGINT, signal.SIG_DFL
-    )  # what runs in the background may ignore it
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(line, cwd=cwd, env=environment, preexec_fn=listen, **pipes)
-
-
 def test_ctrl_c_ends_it_cleanly_and_nothing_is_written(scene: Scene, tmp_path: Path):
     pytest.importorskip("viser", reason="viser is not installed")
     save_npz(scene, tmp_path / "small.npz")
-    process = command("scene=small.npz", "port=0", cwd=tmp_path)
+    line = [sys.executable, "-m", "nerf_lightning.view", "scene=small.npz", "port=0"]
+    # What runs in the background may ignore it.
+    listen = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(line, cwd=tmp_path, env=environment, preexec_fn=listen, **pipes)
     try:
         line = process.stdout.readline()
         assert line.startswith("small: http://127.0.0.1:"), line
@@ -281,11 +275,10 @@ def test_ctrl_c_ends_it_cleanly_and_nothing_is_written(scene: Scene, tmp_path: P
         (["scene=missing.npz", "port=0"], ["missing.npz", "nothing there"]),
     ],
 )
-def test_bad_input_gets_one_line_and_exit_code_2(arguments: list[str], words: list[str], tmp_path: Path):
+def test_bad_input_gets_one_line_and_exit_code_2(verb, arguments: list[str], words: list[str], tmp_path: Path):
     pytest.importorskip("viser", reason="viser is not installed")
-    process = command(*arguments, cwd=tmp_path)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 2
+    code, _, err = verb(main, *arguments)
+    assert code == 2
     assert err.count("\n") == 1, err
     for word in words:
         assert word in err

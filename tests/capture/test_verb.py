@@ -1,24 +1,22 @@
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 from capture.views import SIZE
 
+from nerf_lightning import cli
+from nerf_lightning.capture.__main__ import task
 from nerf_lightning.capture.synthetic import Truth
 
-
-def capture(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "nerf_lightning.capture", *arguments]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120)
+main = partial(cli.run, "capture", task)
 
 
-def test_one_command_makes_a_scene_with_its_report(made: tuple[Path, Truth], tmp_path: Path):
+def test_one_command_makes_a_scene_with_its_report(verb, made: tuple[Path, Truth], tmp_path: Path):
     folder, _ = made
     given = [f"calibration={folder}/calibration", f"photos={folder}/photos", f"tags.size={SIZE}", "resize=120"]
-    done = capture(*given, "output=mine/scene.npz", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "of 8 photos placed" in done.stdout and "+experiment=capture dataset.path=mine/scene.npz" in done.stdout
+    code, out, err = verb(main, *given, "output=mine/scene.npz")
+    assert code == 0, err
+    assert "of 8 photos placed" in out and "+experiment=capture dataset.path=mine/scene.npz" in out
     written = sorted(str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file())
     report = [f"mine/scene_report/{name}.png" for name in ("cameras", "coverage", "errors", "tags")]
     assert written == ["mine/calibration.yaml", "mine/cameras.json", "mine/scene.npz", *report]
@@ -38,8 +36,8 @@ def test_one_command_makes_a_scene_with_its_report(made: tuple[Path, Truth], tmp
         (["holdout=1"], "holdout: found 1"),
     ],
 )
-def test_bad_input_is_one_line(arguments: list[str], words: str, tmp_path: Path):
-    done = capture(*arguments, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1 and words in done.stderr, done.stderr
+def test_bad_input_is_one_line(verb, arguments: list[str], words: str, tmp_path: Path):
+    code, _, err = verb(main, *arguments)
+    assert code == 2
+    assert err.count("\n") == 1 and words in err, err
     assert tmp_path.is_dir() and not list(tmp_path.iterdir())
