@@ -1,5 +1,6 @@
 """What a capture writes: the scene, and `cameras.json` beside it."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,15 @@ class Packing:
     def __post_init__(self) -> None:
         if self.output.suffix != ".npz":
             raise InputError("config", "output", str(self.output), "a file name that ends in .npz")
+
+    def check(self, photos: Sequence[Path]) -> None:
+        """Before long work: whether the photo that the orbit goes through is among those to be placed.
+
+        Raises:
+            InputError: where it is not.
+        """
+        if self.orbit is not None and self.orbit not in [path.name for path in photos]:
+            raise InputError("config", "orbit", self.orbit, f"a photo's name, such as {photos[0].name}")
 
 
 def write_scene(folder: Path, photos: list[Placed], lens: Lens, packing: Packing) -> Scene:

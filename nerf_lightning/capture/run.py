@@ -64,6 +64,7 @@ def capture(
     if not 0 < size < 10:
         raise InputError("config", "tags.size", f"{size:g}", "the side of a tag's black square in metres, such as 0.06")
     sheets, views = find_photos(calibration, "calibration"), find_photos(photos, "photos")
+    packing.check(views)
     family = guess_family(sheets) if dictionary == "auto" else dictionary
     known = None if layout == "auto" or board else read_layout(Path(layout), family, size).poses
     detector = board_detector(family, size, board) if board else tag_detector(family, size)

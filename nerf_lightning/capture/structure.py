@@ -56,6 +56,7 @@ def capture_without_tags(folder: Path, packing: Packing) -> tuple[list[Placed], 
         todo = "pip install 'nerf_lightning[colmap]'"
         raise InputError("pycolmap", "", "no such package", "the optional extra for photos without tags", todo)
     paths = find_photos(folder, "photos")
+    packing.check(paths)
     with tempfile.TemporaryDirectory() as workspace:
         sizes = _copies(paths, Path(workspace) / "photos")
         turned = of_one_size(folder, sizes)

@@ -17,6 +17,7 @@ from nerf_lightning.capture.detect import guess_family, sight, tag_detector
 from nerf_lightning.capture.geometry import angle_between, inverse, project
 from nerf_lightning.capture.layout import TagLayout, flat_pose, read_layout
 from nerf_lightning.capture.outputs import Packing
+from nerf_lightning.capture.pack import pack
 from nerf_lightning.capture.photos import find_photos
 from nerf_lightning.capture.run import Capture, capture
 from nerf_lightning.capture.synthetic import Truth
@@ -142,7 +143,7 @@ def run(made: tuple[Path, Truth], tmp_path: Path, **changes):
         ({"size": 6.0}, "m away from the tags, expected 0.03 to 30 m; give the side"),
         ({"dictionary": "DICT_7X7_50"}, "no tag of DICT_7X7_50 in 8 photos"),
         ({"output": Path("scene.txt")}, "ends in .npz"),
-        ({"orbit": "999.png"}, "orbit: found 999.png, expected a placed photo"),
+        ({"orbit": "999.png"}, "orbit: found 999.png, expected a photo's name, such as "),
         ({"calibration": Path("nowhere")}, "calibration: found nowhere, which is no folder"),
     ],
 )
@@ -150,6 +151,13 @@ def test_bad_input_says_what_to_do(made: tuple[Path, Truth], tmp_path: Path, cha
     with pytest.raises(InputError, match=words):
         run(made, tmp_path, **changes)
     assert not list(tmp_path.glob("**/*.npz")) and not list(tmp_path.glob("*.json"))
+
+
+def test_an_orbit_through_a_photo_left_out_is_refused(made: tuple[Path, Truth]):
+    paths = find_photos(made[0] / "photos", "photos")
+    c2w = np.stack([made[1].photos[path.name] for path in paths])
+    with pytest.raises(InputError, match=f"orbit: found {paths[0].name}, expected a placed photo"):
+        pack(paths[1:], c2w[1:], SMALL, "small", "tests", orbit=paths[0].name)
 
 
 def test_folders_of_the_wrong_kind(made: tuple[Path, Truth], tmp_path: Path):
