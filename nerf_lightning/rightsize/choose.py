@@ -126,9 +126,12 @@ def next_to_train(
     met = [rung for rung, psnr in tried.items() if psnr >= target.psnr]
     if not met:
         return max(tried) + 1 if max(tried) < last else None
-    smaller = min(met) - 1
-    hopeless = smaller < 0 or smaller in tried or expected(smaller, tried, rungs) < target.psnr - CLOSE
-    return None if hopeless else smaller
+    failed = max((rung for rung in tried if rung < min(met)), default=-1)
+    smaller = range(failed + 1, min(min(met), len(rungs)))
+    # A whole training may bring more than the last steps of the climb told apart: some rungs can be skipped.
+    likely = [rung for rung in smaller if expected(rung, tried, rungs) >= target.psnr]
+    close = [rung for rung in smaller[-1:] if expected(rung, tried, rungs) >= target.psnr - CLOSE]
+    return next(iter(likely + close), None)
 
 
 def chosen(tried: dict[int, float], best: int, target: Target) -> int | None:

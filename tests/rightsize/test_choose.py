@@ -109,6 +109,21 @@ def test_a_figure_is_met_by_a_rung_and_not_by_the_next_smaller():
     assert chosen({2: 27.0, 3: 27.5}, 2, target) is None
 
 
+def test_rungs_that_a_whole_training_makes_needless_are_skipped():
+    """Bricks, 1500 steps: none of the rungs climbed to has 31 dB, trained in full the fourth has."""
+    target, climbed = Target(psnr=31), rungs(21.2, 23.4, 25.4, 27.4, 28.9, 29.7, 30.2, 30.5)
+
+    def following(tried: dict[int, float], most: int = 4) -> int | None:
+        return next_to_train(tried, climbed, target, 7, most)
+
+    assert following({}) == 7
+    assert following({7: 34.0}) == 4, "32.4 are expected, of the next smaller one 30.9"
+    assert following({7: 34.0, 4: 32.2}) == 3, "30.7 are expected"
+    assert following({7: 34.0, 4: 30.9}) == 5, "what fails is not tried again, nor what is smaller"
+    assert following({7: 34.0, 4: 32.2}, most=2) is None
+    assert chosen({7: 34.0, 4: 32.2}, 7, target) == 4
+
+
 def test_what_is_expected_of_a_rung_is_the_gain_of_the_nearest():
     assert expected(0, {2: 30.0, 1: 28.5}, rungs(26, 27, 28)) == pytest.approx(27.5)
     assert expected(1, {2: 30.0}, rungs(26, 27, 28)) == pytest.approx(29.0)
