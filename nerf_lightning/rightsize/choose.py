@@ -128,7 +128,7 @@ def next_to_train(
         return max(tried) + 1 if max(tried) < last else None
     failed = max((rung for rung in tried if rung < min(met)), default=-1)
     smaller = range(failed + 1, min(min(met), len(rungs)))
-    # A whole training may bring more than the last steps of the climb told apart: some rungs can be skipped.
+    # The first whole training tells how much more it brings than the climb: several rungs may turn out to be needless.
     likely = [rung for rung in smaller if expected(rung, tried, rungs) >= target.psnr]
     close = [rung for rung in smaller[-1:] if expected(rung, tried, rungs) >= target.psnr - CLOSE]
     return next(iter(likely + close), None)

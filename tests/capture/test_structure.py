@@ -69,6 +69,8 @@ def test_photos_that_show_nothing(tmp_path: Path):
         imageio.imwrite(tmp_path / f"{i}.png", np.full((120, 160, 3), 100 + i, np.uint8))
     with pytest.raises(InputError, match="0 of 3 photos that hang together, expected at least 3; take more photos"):
         capture_without_tags(tmp_path, Packing(tmp_path / "scene.npz"))
+    with pytest.raises(InputError, match=r"orbit: found 9.png, expected a photo's name, such as 0.png"):
+        capture_without_tags(tmp_path, Packing(tmp_path / "scene.npz", orbit="9.png"))
     assert not (tmp_path / "scene.npz").exists()
 
 
