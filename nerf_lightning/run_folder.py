@@ -30,6 +30,8 @@ from nerf_lightning.trusted import check_config
 
 FORMAT = 1
 """Of run folders. Goes up when an older version of this package could no longer make sense of a newer one's runs."""
+GROUPS = ("dataset", "model", "optimizer", "schedule", "trainer")
+"""Of a configuration, in the order written: the last one is missing where a file was cut short."""
 
 
 def plain_config(cfg: DictConfig) -> dict[str, Any]:
@@ -51,7 +53,7 @@ def load_config(folder: Path) -> DictConfig:
     """Reads a run's configuration, refusing anything that would run code from outside the package.
 
     Raises:
-        InputError: where the file is missing or broken, holds interpolations, or names a target that is not trusted.
+        InputError: where the file is missing, broken or cut short, holds interpolations, or names a target that is not trusted.
     """
     path = folder / "config.yaml"
     try:
@@ -60,7 +62,11 @@ def load_config(folder: Path) -> DictConfig:
         raise InputError(path, "", "no such file", "the folder of a run", "look below outputs/") from error
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(path, "", str(error), "a run's configuration in YAML") from error
-    return OmegaConf.create(check_config(plain, path))
+    checked = check_config(plain, path)
+    missing = [group for group in GROUPS if group not in checked]
+    if missing:
+        raise InputError(path, missing[0], "nothing", "a run's whole configuration", "was the file cut short?")
+    return OmegaConf.create(checked)
 
 
 def save_scene(data: RayDataModule | PixelDataModule, folder: Path) -> None:

@@ -18,7 +18,10 @@ from nerf_lightning.trusted import TARGETS, TRUST
 def config() -> dict:
     return {
         "dataset": {"_target_": "nerf_lightning.dataset.from_bricks", "size": 16},
+        "model": {"_target_": "nerf_lightning.model.HashGridField"},
         "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
+        "schedule": {"_target_": "nerf_lightning.system.constant"},
+        "trainer": {"_target_": "lightning.Trainer"},
         "callbacks": {"orbit": {"_target_": "nerf_lightning.callbacks.Orbit"}},
     }
 
