@@ -54,8 +54,8 @@ def test_climbing_goes_on_while_it_pays():
 
 
 def test_climbing_stops_at_a_figure():
-    assert not climbed_enough(rungs(20, 20, 20, 27.9), Target(psnr=28), 1)
-    assert "reached" in climbed_enough(rungs(20, 28), Target(psnr=28), 1)
+    assert not climbed_enough(rungs(20, 20, 20, 26.9), Target(psnr=28), 1)
+    assert "near" in climbed_enough(rungs(20, 27), Target(psnr=28), 1), "a whole training brings 1 dB at the least"
 
 
 def test_the_knee_is_where_more_bytes_begin_to_bring_less():
@@ -91,7 +91,7 @@ def test_a_candidate_is_held_against_the_best():
 
 
 def test_a_figure_is_met_by_a_rung_and_not_by_the_next_smaller():
-    target, climbed = Target(psnr=28), rungs(26, 27, 28)
+    target, climbed = Target(psnr=28), rungs(25, 26, 27)
 
     def following(tried: dict[int, float], most: int = 3) -> int | None:
         return next_to_train(tried, climbed, target, 3, most)
@@ -110,18 +110,18 @@ def test_a_figure_is_met_by_a_rung_and_not_by_the_next_smaller():
 
 
 def test_rungs_that_a_whole_training_makes_needless_are_skipped():
-    """Bricks, 1500 steps: none of the rungs climbed to has 31 dB, trained in full the fourth has."""
-    target, climbed = Target(psnr=31), rungs(21.2, 23.4, 25.4, 27.4, 28.9, 29.7, 30.2, 30.5)
+    """Bricks, 1500 steps: none of the rungs climbed to has 31 dB, trained in full even the fourth has."""
+    target, climbed = Target(psnr=31), rungs(21.2, 23.4, 25.4, 27.4, 28.9, 29.7, 30.2)
 
     def following(tried: dict[int, float], most: int = 4) -> int | None:
         return next_to_train(tried, climbed, target, 7, most)
 
-    assert following({}) == 7
-    assert following({7: 34.0}) == 4, "32.4 are expected, of the next smaller one 30.9"
-    assert following({7: 34.0, 4: 32.2}) == 3, "30.7 are expected"
-    assert following({7: 34.0, 4: 30.9}) == 5, "what fails is not tried again, nor what is smaller"
-    assert following({7: 34.0, 4: 32.2}, most=2) is None
-    assert chosen({7: 34.0, 4: 32.2}, 7, target) == 4
+    assert following({}) == 6
+    assert following({6: 33.5}) == 4, "32.2 are expected, of the next smaller one 30.7"
+    assert following({6: 33.5, 4: 32.2}) == 3, "30.7 are expected"
+    assert following({6: 33.5, 4: 30.9}) == 5, "what fails is not tried again, nor what is smaller"
+    assert following({6: 33.5, 4: 32.2}, most=2) is None
+    assert chosen({6: 33.5, 4: 32.2}, 6, target) == 4
 
 
 def test_what_is_expected_of_a_rung_is_the_gain_of_the_nearest():
