@@ -31,7 +31,7 @@ from nerf_lightning.trusted import check_config
 FORMAT = 1
 """Of run folders. Goes up when an older version of this package could no longer make sense of a newer one's runs."""
 GROUPS = ("dataset", "model", "optimizer", "schedule", "trainer")
-"""Of a configuration, in the order written: the last one is missing where a file was cut short."""
+"""Of a configuration, in the order written: the last one at least is missing where a file was cut short."""
 
 
 def plain_config(cfg: DictConfig) -> dict[str, Any]:

@@ -248,12 +248,12 @@ def test_the_line_says_who_can_see_the_page():
 def test_ctrl_c_ends_it_cleanly_and_nothing_is_written(scene: Scene, tmp_path: Path):
     pytest.importorskip("viser", reason="viser is not installed")
     save_npz(scene, tmp_path / "small.npz")
-    line = [sys.executable, "-m", "nerf_lightning.view", "scene=small.npz", "port=0"]
+    called = [sys.executable, "-m", "nerf_lightning.view", "scene=small.npz", "port=0"]
     # What runs in the background may ignore it.
     listen = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen(line, cwd=tmp_path, env=environment, preexec_fn=listen, **pipes)
+    process = subprocess.Popen(called, cwd=tmp_path, env=environment, preexec_fn=listen, **pipes)
     try:
         line = process.stdout.readline()
         assert line.startswith("small: http://127.0.0.1:"), line
