@@ -13,7 +13,7 @@ from nerf_lightning.kernels.composite import (
 )
 from nerf_lightning.kernels.harmonics import spherical_harmonics, spherical_harmonics_reference
 from nerf_lightning.kernels.hashgrid import hash_interpolate, hash_interpolate_reference
-from nerf_lightning.kernels.hashgrid2d import hash_interpolate_2d, hash_interpolate_2d_reference
+from nerf_lightning.kernels.hashgrid2d import hash_interpolate_2d
 from nerf_lightning.kernels.march import (
     cell_index,
     march,
@@ -25,7 +25,12 @@ from nerf_lightning.kernels.march import (
     points_reference,
 )
 from nerf_lightning.kernels.mlp import mlp, mlp_heads, mlp_reference
-from nerf_lightning.kernels.planes import plane_line_products, plane_line_products_reference, plane_line_sum
+from nerf_lightning.kernels.planes import (
+    plane_line_products,
+    plane_line_products_reference,
+    plane_line_sum,
+    plane_line_sum_and_products,
+)
 from nerf_lightning.kernels.switch import fast, use_kernels
 from nerf_lightning.kernels.voxels import (
     interpolate_rows,
@@ -47,7 +52,6 @@ __all__ = [
     "fast",
     "hash_interpolate",
     "hash_interpolate_2d",
-    "hash_interpolate_2d_reference",
     "hash_interpolate_reference",
     "interpolate_rows",
     "keep_visible",
@@ -66,6 +70,7 @@ __all__ = [
     "plane_line_products",
     "plane_line_products_reference",
     "plane_line_sum",
+    "plane_line_sum_and_products",
     "points",
     "points_reference",
     "read_voxels",

@@ -1,5 +1,7 @@
 """Real spherical harmonics: the directions a colour network sees."""
 
+import functools
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -7,31 +9,57 @@ from torch import Tensor
 from nerf_lightning.kernels.switch import fast
 
 
+# Powers of (x, y, z) that the harmonics are made of: squares and products of two coordinates, then of three.
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+TRIPLES = tuple((pair, axis) for pair in (0, 1, 2) for axis in (0, 1, 2)) + ((3, 2),)
+_XX, _YY, _ZZ, _XY, _YZ, _XZ = range(3, 9)
+
+
+def _cubic(pair: int, axis: int) -> int:
+    return 9 + TRIPLES.index((pair - 3, axis))
+
+
+# Each function as factors of those powers; the first one is a constant.
+TERMS: tuple[dict[int, float], ...] = (
+    {},
+    {1: -0.48860251190291987},
+    {2: 0.48860251190291987},
+    {0: -0.48860251190291987},
+    {_XY: 1.0925484305920792},
+    {_YZ: -1.0925484305920792},
+    {_ZZ: 3 * 0.31539156525252005},
+    {_XZ: -1.0925484305920792},
+    {_XX: 0.5462742152960396, _YY: -0.5462742152960396},
+    {_cubic(_XX, 1): -3 * 0.5900435899266435, _cubic(_YY, 1): 0.5900435899266435},
+    {_cubic(_XY, 2): 2.890611442640554},
+    {_cubic(_ZZ, 1): -5 * 0.4570457994644657, 1: 0.4570457994644657},
+    {_cubic(_ZZ, 2): 5 * 0.3731763325901154, 2: -3 * 0.3731763325901154},
+    {_cubic(_ZZ, 0): -5 * 0.4570457994644657, 0: 0.4570457994644657},
+    {_cubic(_XX, 2): 1.445305721320277, _cubic(_YY, 2): -1.445305721320277},
+    {_cubic(_XX, 0): -0.5900435899266435, _cubic(_YY, 0): 3 * 0.5900435899266435},
+)
+CONSTANTS = {0: 0.28209479177387814, 6: -0.31539156525252005}
+
+
+@functools.lru_cache(maxsize=64)
+def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """Factors of all powers, constants, and which coordinates and pairs are multiplied. Made once: each costs a copy."""
+    factors, constants = (torch.zeros(*shape, len(TERMS), dtype=torch.float64) for shape in ((9 + len(TRIPLES),), ()))
+    for function, powers in enumerate(TERMS):
+        for power, factor in powers.items():
+            factors[power, function] = factor
+    for function, constant in CONSTANTS.items():
+        constants[function] = constant
+    columns = [torch.tensor(column, device=device) for pairs in (PAIRS, TRIPLES) for column in zip(*pairs, strict=True)]
+    return factors.to(dtype).to(device), constants.to(dtype).to(device), columns
+
+
 def spherical_harmonics_reference(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:
-    """`spherical_harmonics` in plain torch, for every device and precision."""
-    x, y, z = d.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    return torch.stack(
-        [
-            torch.full_like(x, 0.28209479177387814),
-            -0.48860251190291987 * y,
-            0.48860251190291987 * z,
-            -0.48860251190291987 * x,
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (3 * zz - 1),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644657 * y * (5 * zz - 1),
-            0.3731763325901154 * z * (5 * zz - 3),
-            -0.4570457994644657 * x * (5 * zz - 1),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ],
-        dim=-1,
-    )
+    """`spherical_harmonics` in plain torch, for every device and precision: one product with the powers of the coordinates."""
+    factors, constants, (first, second, pair, axis) = _tables(d.dtype, d.device)
+    pairs = d.index_select(1, first) * d.index_select(1, second)
+    triples = pairs.index_select(1, pair) * d.index_select(1, axis)
+    return torch.addmm(constants, torch.cat([d, pairs, triples], dim=1), factors)
 
 
 def spherical_harmonics(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:

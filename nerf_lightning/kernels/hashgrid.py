@@ -1,5 +1,11 @@
 """Trilinear interpolation on nested grids with hashed entries (Instant-NGP, Müller et al. 2022, section 3)."""
 
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -10,56 +16,115 @@ from nerf_lightning.kernels.switch import fast
 # Instant-NGP, eq. 4: pi_1 = 1, pi_2 = 2654435761, pi_3 = 805459861; the second as the int32 it wraps to.
 PRIMES = (1, 2654435761 - 2**32, 805459861)
 
+Cells = tuple[int, ...]
+"""Cells of a grid along each of D axes."""
 
-def corners(
-    cell: Int[Tensor, "3 N"], fraction: Float[Tensor, "3 N"], resolution: int, entries: int
-) -> tuple[Int[Tensor, "8 N"], Float[Tensor, "8 N"]]:
-    """Table entry and trilinear weight of the eight corners of each position's cell.
 
-    Entries are row-major where all corners of the grid fit in `entries` (a power of two if they do not), else hashed.
+def is_dense(cells: Cells, entries: int) -> bool:
+    """Whether all corners of a grid fit in a table, which then holds them row by row; else they are hashed."""
+    return math.prod(side + 1 for side in cells) <= entries
+
+
+def factors(cells: Cells, entries: int) -> Cells:
+    """What each axis' place is multiplied by in the number of a corner's entry."""
+    return tuple(
+        math.prod(side + 1 for side in cells[:axis]) if is_dense(cells, entries) else PRIMES[axis]
+        for axis in range(len(cells))
+    )
+
+
+def joined(parts: Sequence[Tensor], dense: bool, last: int | Tensor) -> Tensor:
+    """Numbers of entries: the sum of what the axes contribute, or the bits of their hash that fit in a table.
 
     Args:
-        cell: lower corner, in [0, resolution).
-        fraction: position within the cell, in [0, 1].
-        resolution: cells along each side of the grid.
-        entries: size of the table.
+        parts: places along each axis times its factor, 32-bit; they broadcast.
+        dense: see `is_dense`.
+        last: of the table's entries, one less than a power of two where they are hashed.
     """
-    side = resolution + 1
-    dense = side**3 <= entries
-    factors = (1, side, side * side) if dense else PRIMES
-    # A product an axis and side, which the corners then combine. Positions run last: long, contiguous vector operations.
-    low = [cell[axis] * factor for axis, factor in enumerate(factors)]
-    ends = [(a, a + factor) for a, factor in zip(low, factors, strict=True)]
-    shares = [(1 - f, f) for f in fraction]
-    index, weight = [], []
-    for i in (0, 1):
-        for j in (0, 1):
-            x, y = ends[0][i], ends[1][j]
-            both, share = (x + y if dense else x ^ y), shares[0][i] * shares[1][j]
-            for k in (0, 1):
-                index.append(both + ends[2][k] if dense else (both ^ ends[2][k]) & (entries - 1))
-                weight.append(share * shares[2][k])
-    return torch.stack(index), torch.stack(weight)
+    if dense:
+        return functools.reduce(torch.add, parts)
+    return functools.reduce(torch.bitwise_xor, parts) & last
+
+
+def entry_of(vertices: Int[Tensor, "D N"], cells: Cells, entries: int) -> Int[Tensor, "N"]:
+    """Entry of a table that each vertex of a grid is kept in."""
+    parts = [place * factor for place, factor in zip(vertices, factors(cells, entries), strict=True)]
+    return joined(parts, is_dense(cells, entries), entries - 1)
+
+
+class _Levels(NamedTuple):
+    """All levels' constants on a device."""
+
+    cells: Float[Tensor, "L D 1"]
+    lower: Int[Tensor, "L D 1"]
+    """The last cell of each axis."""
+    factors: Int[Tensor, "L D 1"]
+    steps: Int[Tensor, "L D 2 1"]
+    """What either end of a cell adds."""
+    first: Int[Tensor, "L 1 1"]
+    """Where each level's table begins."""
+    runs: list[tuple[slice, bool, Int[Tensor, "l *ones"]]]
+    """Levels in a row that are all dense, or all hashed, and the last entries of their tables."""
+
+
+@functools.lru_cache(maxsize=64)
+def _levels(
+    resolutions: tuple[Cells, ...], sizes: tuple[int, ...], dtype: torch.dtype, device: torch.device
+) -> _Levels:
+    """Made once: each would cost a copy to the device, and a wait."""
+
+    def whole(values: object) -> Tensor:
+        return torch.tensor(values, dtype=torch.int32, device=device)
+
+    table = [factors(*level) for level in zip(resolutions, sizes, strict=True)]
+    kinds = [is_dense(*level) for level in zip(resolutions, sizes, strict=True)]
+    runs, begin = [], 0
+    for dense, group in itertools.groupby(kinds):
+        part = slice(begin, begin + len(list(group)))
+        last = whole([size - 1 for size in sizes[part]]).view(-1, *[1] * (len(resolutions[0]) + 1))
+        runs.append((part, dense, last))
+        begin = part.stop
+    each = whole(table)[..., None]
+    return _Levels(
+        torch.tensor(resolutions, dtype=dtype, device=device)[..., None],
+        whole(resolutions)[..., None] - 1,
+        each,
+        torch.stack([torch.zeros_like(each), each], dim=2),
+        whole([0, *itertools.accumulate(sizes)][:-1])[:, None, None],
+        runs,
+    )
+
+
+def _across(x: Tensor, axis: int, dimensions: int) -> Tensor:
+    """[L, D, 2, N] -> one axis, so that what is true of its two ends broadcasts over the corners: [L, 1 or 2 an axis, N]."""
+    one = x[:, axis]
+    return one.view(len(one), *(2 if axis == other else 1 for other in range(dimensions)), one.shape[-1])
 
 
 def hash_interpolate_reference(
-    tables: Float[Tensor, "T F"], unit: Float[Tensor, "N 3"], resolutions: list[int], sizes: list[int]
+    tables: Float[Tensor, "T F"], unit: Float[Tensor, "N D"], resolutions: Sequence[Cells], sizes: Sequence[int]
 ) -> Float[Tensor, "N LF"]:
-    """`hash_interpolate` in plain torch, for every device and differentiable in the positions too."""
-    places = unit.clamp(0, 1).T.contiguous()
-    indices, weights, start = [], [], 0
-    for resolution, size in zip(resolutions, sizes, strict=True):
-        scaled = places * resolution
-        cell = scaled.to(torch.int32).clamp_(0, resolution - 1)  # what is not a number stays so, in some cell
-        index, weight = corners(cell, scaled - cell, resolution, size)
-        # int64, for which alone the CPU's index_add (the gather's gradient) is fast: 7 against 105 ms for two million.
-        indices.append(index.long() + start)
-        weights.append(weight)
-        start += size
+    """`hash_interpolate` in plain torch, for every device and differentiable in the positions too; in D dimensions.
+
+    All levels and corners together: on a GPU the number of operations is what counts.
+    """
+    count, dimensions = unit.shape
+    levels = _levels(tuple(resolutions), tuple(sizes), unit.dtype, unit.device)
+    scaled = unit.clamp(0, 1).T * levels.cells  # positions run last: long, contiguous vector operations
+    # What is not a number stays so, in some cell.
+    cell = scaled.to(torch.int32).clamp_(min=0).minimum(levels.lower)
+    fraction = scaled - cell
+    ends = (cell * levels.factors)[:, :, None] + levels.steps
+    shares = torch.stack([1 - fraction, fraction], dim=2)
+    parts = [_across(ends, axis, dimensions) for axis in range(dimensions)]
+    index = torch.cat([joined([part[run] for part in parts], dense, last) for run, dense, last in levels.runs])
+    weight = functools.reduce(torch.mul, [_across(shares, axis, dimensions) for axis in range(dimensions)])
+    corners = 2**dimensions
+    # int64, for which alone the CPU's index_add (the gather's gradient) is fast: 7 against 105 ms for two million.
+    rows = (index.view(len(sizes), corners, count) + levels.first).long()
     # One gather for all levels: each gather's gradient is as large as the whole of `tables`.
-    index = torch.stack(indices)
-    entries = tables.index_select(0, index.flatten()).view(*index.shape, tables.shape[1])
-    return (entries * torch.stack(weights)[..., None]).sum(1).transpose(0, 1).flatten(1)
+    entries = tables.index_select(0, rows.flatten()).view(*rows.shape, tables.shape[1])
+    return (entries * weight.view(*rows.shape, 1)).sum(1).transpose(0, 1).flatten(1)
 
 
 class HashInterpolate(torch.autograd.Function):
@@ -103,4 +168,4 @@ def hash_interpolate(
     """
     if fast(tables, unit) and not unit.requires_grad:
         return HashInterpolate.apply(tables, unit, resolutions, sizes)
-    return hash_interpolate_reference(tables, unit, resolutions, sizes)
+    return hash_interpolate_reference(tables, unit, [(side,) * 3 for side in resolutions], sizes)

@@ -1,7 +1,10 @@
 """Planes times lines: a volume as a sum of products (vector-matrix decomposition; TensoRF, Chen et al. 2022, eq. 3)."""
 
+import functools
+from typing import NamedTuple
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.kernels.switch import fast
@@ -10,24 +13,54 @@ PLANE_AXES = ((1, 2), (0, 2), (0, 1))
 """Axes of each mode's plane; its line runs along the axis that is left: 0, 1, 2."""
 
 
+class Footprint(NamedTuple):
+    """What positions read: rows of all planes and of all lines, one mode after the other, and their shares."""
+
+    plane_rows: Int[Tensor, "twelveN"]
+    plane_shares: Float[Tensor, "N 3 4 1"]
+    line_rows: Int[Tensor, "sixN"]
+    line_shares: Float[Tensor, "N 3 2 1"]
+
+
+@functools.lru_cache(maxsize=64)
+def _axes_and_steps(side: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The axes of the planes, and what modes, corners and ends add to a row. Made once: each costs a copy to the device."""
+    first, second = torch.tensor(PLANE_AXES, device=device).unbind(1)
+    mode, end = torch.arange(3, device=device)[:, None], torch.arange(2, device=device)
+    corner = (end[:, None] * side + end).flatten()
+    return first, second, mode * side * side + corner, mode * side + end
+
+
+def footprint(unit: Float[Tensor, "N 3"], side: int) -> Footprint:
+    """Where positions in [0, 1]^3 read in planes and lines of so many vertices along a side; outside they are clamped."""
+    first, second, plane_steps, line_steps = _axes_and_steps(side, unit.device)
+    scaled = unit.clamp(0, 1) * (side - 1)
+    low = scaled.long().clamp_(0, side - 2)
+    fraction = scaled - low
+    share = torch.stack([1 - fraction, fraction], dim=2)
+    across, down = share.index_select(1, first), share.index_select(1, second)
+    corner = torch.add(low.index_select(1, second), low.index_select(1, first), alpha=side)
+    return Footprint(
+        (corner[..., None] + plane_steps).flatten(),
+        (across[..., None] * down[:, :, None]).view(len(unit), 3, 4, 1),
+        (low[..., None] + line_steps).flatten(),
+        share[..., None],
+    )
+
+
+def _products(planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], at: Footprint) -> Float[Tensor, "N 3 C"]:
+    """One gather for all planes and one for all lines: on a GPU the number of operations is what counts."""
+    shape, channels = at.plane_shares.shape[:3], lines.shape[2]
+    corners = planes.flatten(0, 2).index_select(0, at.plane_rows).view(*shape, channels)
+    ends = lines.flatten(0, 1).index_select(0, at.line_rows).view(*shape[:2], 2, channels)
+    return (corners * at.plane_shares).sum(2) * (ends * at.line_shares).sum(2)
+
+
 def plane_line_products_reference(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N threeC"]:
     """`plane_line_products` in plain torch, for every device and differentiable in the positions too."""
-    side = lines.shape[1]
-    scaled = unit.clamp(0, 1).T * (side - 1)
-    low = scaled.long().clamp(0, side - 2)
-    fraction = scaled - low
-    share = torch.stack([1 - fraction, fraction])[..., None]
-    products = []
-    for mode, (a, b) in enumerate(PLANE_AXES):
-        plane, line, corner = planes[mode].flatten(0, 1), lines[mode], low[a] * side + low[b]
-        ends = [share[i, mode] * line.index_select(0, low[mode] + i) for i in (0, 1)]
-        corners = [
-            share[i, a] * share[j, b] * plane.index_select(0, corner + i * side + j) for i in (0, 1) for j in (0, 1)
-        ]
-        products.append(torch.stack(corners).sum(0) * torch.stack(ends).sum(0))
-    return torch.cat(products, dim=1)
+    return _products(planes, lines, footprint(unit, lines.shape[1])).flatten(1)
 
 
 def _block(channels: int) -> int:
@@ -87,4 +120,16 @@ def plane_line_sum(
     """The sum of what `plane_line_products` gives at each position."""
     if _fast(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, True)[:, 0]
-    return plane_line_products_reference(planes, lines, unit).sum(1)
+    return _products(planes, lines, footprint(unit, lines.shape[1])).sum((1, 2))
+
+
+def plane_line_sum_and_products(
+    summed: tuple[Float[Tensor, "3 S S A"], Float[Tensor, "3 S A"]],
+    apart: tuple[Float[Tensor, "3 S S B"], Float[Tensor, "3 S B"]],
+    unit: Float[Tensor, "N 3"],
+) -> tuple[Float[Tensor, "N"], Float[Tensor, "N threeB"]]:
+    """`plane_line_sum` of some planes and lines, and `plane_line_products` of others of the same size."""
+    if _fast(*summed, unit) and _fast(*apart, unit):
+        return plane_line_sum(*summed, unit), plane_line_products(*apart, unit)
+    at = footprint(unit, summed[1].shape[1])
+    return _products(*summed, at).sum((1, 2)), _products(*apart, at).flatten(1)

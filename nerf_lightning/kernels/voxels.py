@@ -3,6 +3,8 @@
 Row 0 stands for all vertices that hold none: its values are constants and get no gradient.
 """
 
+import functools
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -16,23 +18,27 @@ def side_of(index: Int[Tensor, "cells"]) -> int:
     return round(len(index) ** (1 / 3))
 
 
+@functools.lru_cache(maxsize=64)
+def _steps(side: int, device: torch.device) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:
+    """What a step along each axis adds to a vertex's number, and each corner of a cell. Made once: each costs a copy."""
+    ends = torch.arange(2, device=device)
+    corners = (ends[:, None, None] * side + ends[:, None]) * side + ends
+    return torch.tensor([side * side, side, 1], device=device), corners.flatten()
+
+
 def locate_reference(
     index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
     """`locate` in plain torch, for every device and differentiable in the positions."""
     side = side_of(index)
+    strides, corners = _steps(side, unit.device)
     scaled = unit.clamp(0, 1) * (side - 1)
-    cell = scaled.long().clamp(0, side - 2)  # what is not a number becomes the smallest of all
+    cell = scaled.long().clamp_(0, side - 2)  # what is not a number becomes the smallest of all
     fraction = scaled - cell
-    rows, weights = [], []
-    for i in (0, 1):
-        for j in (0, 1):
-            for k in (0, 1):
-                at = ((cell[:, 0] + i) * side + cell[:, 1] + j) * side + cell[:, 2] + k
-                rows.append(index[at])
-                shares = [f if bit else 1 - f for f, bit in zip(fraction.unbind(1), (i, j, k), strict=True)]
-                weights.append(shares[0] * shares[1] * shares[2])
-    return torch.stack(rows, 1), torch.stack(weights, 1)
+    x, y, z = torch.stack([1 - fraction, fraction], dim=2).unbind(1)
+    weights = (x[:, :, None] * y[:, None])[..., None] * z[:, None, None]
+    vertices = (cell * strides).sum(1, keepdim=True) + corners
+    return index.index_select(0, vertices.flatten()).view(-1, 8), weights.flatten(1)
 
 
 def locate(index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
@@ -67,7 +73,8 @@ def interpolate_rows(
 ) -> Float[Tensor, "N *F"]:
     """Any number of values a vertex, interpolated, in plain torch."""
     values = torch.cat([values[:1].detach(), values[1:]])
-    return torch.einsum("nc,nc...->n...", weights, values[rows.long()])
+    found = values.index_select(0, rows.flatten()).view(*rows.shape, *values.shape[1:])
+    return (found * weights.view(*weights.shape, *[1] * (values.dim() - 1))).sum(1)
 
 
 def voxel_value(
@@ -124,9 +131,10 @@ def read_voxels_reference(
     basis: Float[Tensor, "N B"],
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
     """`read_voxels` in plain torch, for every device and differentiable in weights and basis too."""
-    mixed = interpolate_rows(views, rows, weights).view(len(rows), 3, basis.shape[1])
-    rgb = interpolate_rows(colour, rows, weights) + torch.einsum("ncb,nb->nc", mixed, basis)
-    return interpolate_rows(density, rows, weights), rgb
+    # One table, so that all is gathered at once.
+    found = interpolate_rows(torch.cat([density[:, None], colour, views], dim=1), rows, weights)
+    raw, rgb, mixed = found.split([1, 3, views.shape[1]], dim=1)
+    return raw[:, 0], rgb + (mixed.unflatten(1, (3, -1)) * basis[:, None]).sum(2)
 
 
 def read_voxels(
@@ -168,19 +176,25 @@ class _Roughness(torch.autograd.Function):
         return grad, None, None, None, None
 
 
+@functools.lru_cache(maxsize=64)
+def _neighbours(side: int, device: torch.device) -> tuple[Int[Tensor, "6 1"], ...]:
+    """Of the six directions: the stride of the axis, the way to the neighbour, and the place on the axis that has none."""
+    strides = torch.tensor([side * side, side, 1], device=device).repeat(2)[:, None]
+    signs = torch.tensor([-1, 1], device=device).repeat_interleave(3)[:, None]
+    return strides, strides * signs, (signs > 0) * (side - 1)
+
+
 def roughness_reference(
     values: Float[Tensor, "V"], vertex: Int[Tensor, "V"], index: Int[Tensor, "cells"], first: int, last: int
 ) -> Float[Tensor, ""]:
     """`roughness` in plain torch, for every device."""
     side, at = side_of(index), vertex[first:last].long()
-    squares = torch.zeros_like(values[first:last])
-    for stride in (side * side, side, 1):
-        place = at // stride % side
-        for sign in (-1, 1):
-            inside = (place + sign >= 0) & (place + sign < side)
-            other = torch.where(inside, index[torch.where(inside, at + sign * stride, 0)].long(), 0)
-            squares = squares + torch.where(other > 0, (values[first:last] - values.detach()[other]) ** 2, 0)
-    return squares.mean()
+    strides, ways, ends = _neighbours(side, index.device)
+    inside = at // strides % side != ends
+    # Row 0 stands for all that are not kept; where there is no neighbour, any vertex will do.
+    other = index.index_select(0, (at + ways * inside).flatten()).view(inside.shape) * inside
+    apart = values[first:last] - values.detach().index_select(0, other.flatten()).view(inside.shape)
+    return (apart.square() * (other > 0)).sum() / (last - first)
 
 
 def roughness(

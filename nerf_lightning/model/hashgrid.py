@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import hash_interpolate, mlp, mlp_heads
-from nerf_lightning.kernels.hashgrid import corners
+from nerf_lightning.kernels.hashgrid import entry_of
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field
 from nerf_lightning.model.pruning import vertices_in
@@ -57,8 +57,7 @@ class HashGrid(torch.nn.Module):
 
     def rows(self, vertices: Int[Tensor, "3 N"], level: int) -> Int[Tensor, "N"]:
         """Rows of `tables` that a level keeps its vertices in."""
-        entry, _ = corners(vertices, torch.zeros(vertices.shape), self.resolutions[level], self.sizes[level])
-        return sum(self.sizes[:level]) + entry[0]
+        return sum(self.sizes[:level]) + entry_of(vertices, (self.resolutions[level],) * 3, self.sizes[level])
 
     @torch.no_grad()
     def take(self, smaller: "HashGrid") -> Int[Tensor, "I"]:

@@ -9,7 +9,7 @@ from torch.nn.functional import interpolate
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import mlp, plane_line_products, plane_line_sum
+from nerf_lightning.kernels import mlp, plane_line_sum, plane_line_sum_and_products
 from nerf_lightning.kernels.planes import PLANE_AXES
 from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field, replace_data
@@ -41,12 +41,8 @@ class VectorMatrix(torch.nn.Module):
         """Cells along each side at present."""
         return self.lines.shape[1] - 1
 
-    def products(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N threeC"]:
-        """All components at positions in the unit cube, side by side."""
-        return plane_line_products(self.planes, self.lines, unit)
-
     def total(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-        """Their sum."""
+        """The sum of all components at positions in the unit cube."""
         return plane_line_sum(self.planes, self.lines, unit)
 
     @torch.no_grad()
@@ -146,8 +142,10 @@ class TensoRFField(Field):
         self.colour_net = layers(3 * colour_components + self.terms, width, 3)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
-        unit = self.bounds.to_unit(positions)
-        return self.activation(self.density_volume.total(unit)), self.colour_volume.products(unit)
+        density, colour = self.density_volume, self.colour_volume
+        factors = (density.planes, density.lines), (colour.planes, colour.lines)
+        total, products = plane_line_sum_and_products(*factors, self.bounds.to_unit(positions))
+        return self.activation(total), products
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """As `forward` gives it, without the work for the colour."""
