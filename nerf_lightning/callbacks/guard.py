@@ -1,5 +1,6 @@
 """Guard: notices that training has broken down, says why, and sets it going again."""
 
+import copy
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -42,9 +43,9 @@ def plain_error(data: RayDataModule | PixelDataModule, system: System) -> float:
     """The squared error of the best single colour on training pixels: what a field that shows nothing reaches."""
     if isinstance(data, RayDataModule):
         drawn = draw_rays(data.scene.train, PIXELS, step_generator(data.seed, 2, 0))
-        truth = system.truth(ViewBatch(drawn.rays, drawn.pixels, 1, PIXELS))
+        truth = system.truth(ViewBatch(drawn.rays, drawn.pixels, 1, PIXELS).to(system.device))
     else:
-        truth = system.truth(data.held_out(0))
+        truth = system.truth(data.held_out(0).to(system.device))
     return float((truth - truth.mean(0)).square().mean())
 
 
@@ -83,6 +84,10 @@ class Guard(L.Callback):
         """Progress at the last new start."""
         self.softened = False
         self._given_up = False
+        self._finite = True
+        """Whether all losses so far were numbers."""
+        self._unread: list[Tensor] = []
+        """Losses since the last look: reading one makes the host wait for the device."""
         self._start: dict[str, Tensor] = {}
         self._good: dict[str, Tensor] = {}
 
@@ -95,7 +100,7 @@ class Guard(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         with Budget.of(trainer).paused():
             self.watch.plain = plain_error(data_of(trainer), pl_module)
-        if self.attempts and self.watch.learning and not self.watch.risen:
+        if self.attempts and self.watch.learning and not self.watch.risen and finite(pl_module.parameters()):
             self._good = copied(pl_module)  # of a run that is resumed
         if isinstance(pl_module, NeRF3D):
             if self.watch.began:
@@ -119,23 +124,39 @@ class Guard(L.Callback):
     ) -> None:
         if self._given_up or not self.attempts or trainer.world_size > 1:
             return
-        step, error = trainer.global_step, pl_module.stats.mse
-        found = None
-        if not math.isfinite(error):
+        step, found = trainer.global_step, None
+        self._unread.append(pl_module.stats.mse)
+        keep = step % self.keep_every == 0
+        if not keep and not self.watch.due(step):
+            return
+        self._read()
+        if not self._finite:
             found = Breakdown("the loss is no longer a finite number", apart=True)
-        else:
-            self.watch.note(error)
-            if self.watch.due(step):
-                found = self.watch.look(step, pl_module.stats.opacity)
-            if found is None and step % self.keep_every == 0 and self.watch.learning and not self.watch.risen:
-                if finite(pl_module.parameters()):
-                    self._good = copied(pl_module)
-                else:
-                    found = Breakdown("weights are no longer finite numbers", apart=True)
+        elif self.watch.due(step):
+            opacity = pl_module.stats.opacity
+            found = self.watch.look(step, None if opacity is None else float(opacity))
+        if found is None and keep and self.watch.learning and not self.watch.risen:
+            if finite(pl_module.parameters()):
+                self._good = copied(pl_module)
+            else:
+                found = Breakdown("weights are no longer finite numbers", apart=True)
         if found is not None:
             self._recover(trainer, pl_module, found)
 
+    def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        self._read()
+
+    def _read(self) -> None:
+        """Takes in the losses since the last look, all at once."""
+        errors = torch.stack(self._unread).tolist() if self._unread else []
+        self._unread = []
+        for error in errors:
+            self._finite = self._finite and math.isfinite(error)
+            if self._finite:
+                self.watch.note(error)
+
     def state_dict(self) -> dict[str, Any]:
+        self._read()
         return {
             **self.watch.state(),
             "recoveries": [asdict(one) for one in self.recoveries],
@@ -143,6 +164,7 @@ class Guard(L.Callback):
             "began_at": self.began_at,
             "softened": self.softened,
             "given_up": self._given_up,
+            "finite": self._finite,
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -151,11 +173,13 @@ class Guard(L.Callback):
         for key in ("rate", "began_at", "softened"):
             setattr(self, key, state_dict[key])
         self._given_up = state_dict["given_up"]
+        self._finite = state_dict.get("finite", True)  # older checkpoints lack it
 
     # What it does
 
     def _recover(self, trainer: L.Trainer, system: System, found: Breakdown) -> None:
         step = trainer.global_step
+        self._finite = True
         if len(self.recoveries) >= self.attempts:
             self._given_up = True
             print(f"guard: step {step}: {found.cause}; given up after {self.attempts} attempts", flush=True)
@@ -189,9 +213,11 @@ class Guard(L.Callback):
     def _start_again(self, system: System, step: int, apart: bool) -> str:
         """Fresh weights, and something else besides, as the same again would come to the same end."""
         system.load_state_dict(self._start)
+        fresh = copy.deepcopy(system.field).cpu()  # the same weights on every device, and none of its chance used up
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(step_generator(system.seed, 3, step).initial_seed() & 0xFFFFFFFF))
-            started_anew(system)
+            started_anew(fresh)
+        system.field.load_state_dict(fresh.state_dict())
         system.on_fit_start()  # what a sampler finds out about the scene is part of a start
         if isinstance(system, NeRF3D):
             system.sampler.restart(step)
@@ -222,8 +248,8 @@ def started_anew(module: torch.nn.Module) -> None:
 
 
 def finite(parameters: Iterable[torch.nn.Parameter]) -> bool:
-    """Whether all weights are numbers; a sum shows any that is not, and costs one reading."""
-    return all(math.isfinite(float(parameter.detach().sum())) for parameter in parameters)
+    """Whether all weights are numbers; a sum shows any that is not, and all together cost one reading."""
+    return bool(torch.stack([parameter.detach().sum() for parameter in parameters]).isfinite().all())
 
 
 def forget(trainer: L.Trainer) -> None:

@@ -42,9 +42,10 @@ class Throughput(L.Callback):
         seconds = Budget.of(trainer).seconds
         rays = self.rays - self._mark[1]
         if trainer.logger is not None:
+            mse = float(stats.mse)
             scalars = {
-                "train/loss": stats.mse,
-                "train/psnr": decibels(stats.mse),
+                "train/loss": mse,
+                "train/psnr": decibels(mse),
                 "train/learning_rate": pl_module.parameter_groups[0]["lr"],
                 "speed/rays_per_second": rays / max(seconds - self._mark[0], 1e-9),
                 "speed/samples_per_ray": self._samples / max(rays, 1),

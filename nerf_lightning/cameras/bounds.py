@@ -1,7 +1,10 @@
 """Bounds: where the scene's content is, and how world positions map to the unit cube that grids live in."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -11,6 +14,16 @@ from nerf_lightning.cameras.cameras import Rays
 
 UNBOUNDED_REACH = 50.0
 """An unbounded scene is sampled out to this many box half-sizes; what is beyond looks like a picture at infinity."""
+
+
+def once(of: Callable[[Any], Tensor]) -> cached_property:
+    """A tensor that is worked out when it is first asked for, and serves with gradients too if that was without."""
+
+    def made(self: Any) -> Tensor:
+        with torch.inference_mode(False):
+            return of(self)
+
+    return cached_property(made)
 
 
 @dataclass(frozen=True)
@@ -30,13 +43,26 @@ class Bounds:
     pixel: float | None = None
     """Width of what one pixel of the photos shows at the content, world units; None where that is not known."""
 
-    @property
+    @once
     def centre(self) -> Float[Tensor, "3"]:
         return self.aabb.mean(0)
 
-    @property
+    @once
     def half_size(self) -> Float[Tensor, "3"]:
         return (self.aabb[1] - self.aabb[0]) / 2
+
+    @once
+    def _low(self) -> Float[Tensor, "3"]:
+        return self.centre - self.half_size
+
+    @once
+    def _size(self) -> Float[Tensor, "3"]:
+        return 2 * self.half_size
+
+    @cached_property
+    def longest(self) -> float:
+        """The largest of the half-sizes."""
+        return float(self.half_size.max())
 
     @property
     def pixels_across(self) -> float:
@@ -44,16 +70,16 @@ class Bounds:
         if self.pixel is None:
             return math.inf
         # The contraction leaves the middle half of the unit cube to the box.
-        return (4 if self.unbounded else 2) * float(self.half_size.max()) / self.pixel
+        return (4 if self.unbounded else 2) * self.longest / self.pixel
 
     def to(self, device: torch.device | str) -> "Bounds":
         return replace(self, aabb=self.aabb.to(device))
 
     def to_unit(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """World positions -> [0, 1]^3. Bounded: outside the box leaves the unit cube. Unbounded: never leaves it."""
-        local = (positions - self.centre) / self.half_size
         if not self.unbounded:
-            return local * 0.5 + 0.5
+            return (positions - self._low) / self._size
+        local = (positions - self.centre) / self.half_size
         norm = local.abs().amax(-1, keepdim=True).clamp_min(1.0)
         return (2.0 - 1.0 / norm) * (local / norm) * 0.25 + 0.5
 
@@ -72,7 +98,7 @@ class Bounds:
         Bounded: the slab test against the box. Unbounded: from a small clearance to `UNBOUNDED_REACH` half-sizes.
         """
         if self.unbounded:
-            size = float(self.half_size.max())
+            size = self.longest
             near = torch.full_like(rays.origins[:, 0], 0.02 * size if self.near is None else self.near)
             return near, torch.full_like(near, UNBOUNDED_REACH * size if self.far is None else self.far)
         enter, leave = self._crossing(rays)
@@ -82,7 +108,7 @@ class Bounds:
     def _crossing(self, rays: Rays) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
         """Where each ray's line enters and leaves the box, by the slab test: leave < enter where it misses."""
         # A zero component never crosses its slab: nudge it, so that the division gives +-huge instead of nan.
-        safe = torch.where(rays.directions.abs() < 1e-9, torch.full_like(rays.directions, 1e-9), rays.directions)
+        safe = rays.directions.masked_fill(rays.directions.abs() < 1e-9, 1e-9)
         crossings = (self.aabb[:, None] - rays.origins) / safe
         return crossings.amin(0).amax(-1), crossings.amax(0).amin(-1)
 
@@ -104,12 +130,12 @@ class Bounds:
         near, far = near[:, None], torch.maximum(far, near)[:, None]
         if not self.unbounded:
             return near + (far - near) * s
-        inside, unit = self.inside(rays), self.half_size.max()
+        inside, unit = self.inside(rays), self.longest
         start = warp(near, inside, unit)
         return unwarp(start + (warp(far, inside, unit) - start) * s, inside, unit)
 
 
-def warp(t: Float[Tensor, "R S"], inside: Float[Tensor, "R 2"], unit: Float[Tensor, ""]) -> Float[Tensor, "R S"]:
+def warp(t: Float[Tensor, "R S"], inside: Float[Tensor, "R 2"], unit: float) -> Float[Tensor, "R S"]:
     """Distances along rays as numbers that are even where samples shall be: 0 at the nearer end of `inside`, growing by 1 a
     `unit` up to its other end, and by x / (1 + x) in all over x units beyond either end."""
     enter, leave = inside[:, :1], inside[:, 1:]
@@ -118,7 +144,7 @@ def warp(t: Float[Tensor, "R S"], inside: Float[Tensor, "R 2"], unit: Float[Tens
     return 1 / (1 + before) - 1 / (1 + behind) + within
 
 
-def unwarp(y: Float[Tensor, "R S"], inside: Float[Tensor, "R 2"], unit: Float[Tensor, ""]) -> Float[Tensor, "R S"]:
+def unwarp(y: Float[Tensor, "R S"], inside: Float[Tensor, "R 2"], unit: float) -> Float[Tensor, "R S"]:
     """The inverse of `warp`."""
     enter, leave = inside[:, :1], inside[:, 1:]
     length = (leave - enter) / unit
@@ -134,9 +160,11 @@ class InBounds(torch.nn.Module):
 
     def __init__(self, bounds: Bounds):
         super().__init__()
-        self._bounds = bounds
         self.register_buffer("aabb", bounds.aabb.clone(), persistent=False)
+        self._bounds = replace(bounds, aabb=self.aabb)
 
     @property
     def bounds(self) -> Bounds:
-        return replace(self._bounds, aabb=self.aabb)
+        if self._bounds.aabb is not self.aabb:  # the module has moved
+            self._bounds = replace(self._bounds, aabb=self.aabb)
+        return self._bounds

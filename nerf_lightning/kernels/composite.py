@@ -1,11 +1,14 @@
 """From samples to pixels: emission-absorption along rays (NeRF, eq. 3; Max 1995)."""
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.kernels.march import Packed
+from nerf_lightning.kernels.march import Packed, chosen
+from nerf_lightning.kernels.sums import before
 from nerf_lightning.kernels.switch import fast
 
 Pixels = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
@@ -30,16 +33,8 @@ def volume_weights(
     Returns:
         Weights in [0, 1]; over a ray they add up to its opacity.
     """
-    optical = density * dt
-    return torch.exp(-_thickness_before(optical, ray, offsets)).to(density.dtype) * -torch.expm1(-optical)
-
-
-def _thickness_before(
-    optical: Float[Tensor, "N"], ray: Int[Tensor, "N"], offsets: Int[Tensor, "R_plus_1"]
-) -> Float[Tensor, "N"]:
-    # One running sum over all rays, less its value where the ray starts. In double: the sum outgrows single precision.
-    total = torch.cat([optical.new_zeros(1, dtype=torch.float64), optical.double().cumsum(0)])
-    return total[:-1] - total[offsets[:-1]][ray]
+    thinner = -density * dt
+    return -torch.exp(before(thinner, ray, offsets)) * torch.expm1(thinner)
 
 
 def accumulate(
@@ -113,34 +108,59 @@ def composite(
     return composite_reference(density, rgb, t, dt, ray, offsets)
 
 
-def keep_visible_reference(density: Float[Tensor, "N"], packed: Packed, transparent: float, thin: float) -> Kept:
+def keep_visible_reference(
+    density: Float[Tensor, "N"],
+    packed: Packed,
+    transparent: float,
+    thin: float | Float[Tensor, ""],
+    room: int | None = None,
+) -> Kept:
     """`keep_visible` in plain torch, for every device."""
     t, dt, ray, offsets = packed
-    optical = density * dt
-    ended = _thickness_before(optical, ray, offsets) > -np.log(transparent)
-    keep = ~(ended | (optical < -np.log1p(-thin)))
-    kept = torch.cat([offsets.new_zeros(1), keep.cumsum(0)])[offsets]
-    return t[keep], dt[keep], ray[keep], kept
+    thickness = density * dt
+    # What is not a number stays.
+    keep = ~((before(thickness, ray, offsets) > -math.log(transparent)) | (thickness < thin))
+    if room is not None:  # what was repeated to fill the room before stays behind
+        keep = keep & (torch.arange(len(keep), device=keep.device) < offsets[-1])
+    index, there = chosen(keep, room)
+    counted = torch.cat([offsets.new_zeros(1), keep.cumsum(0)])
+    kept = counted.index_select(0, offsets if room is None else offsets.clamp_max(len(keep)))
+    t, dt, ray = (x.index_select(0, index) for x in (t, dt, ray))
+    return t, dt if there is None else dt * there, ray, kept
 
 
-def keep_visible(density: Float[Tensor, "N"], packed: Packed, transparent: float, thin: float) -> Kept:
+def keep_visible(
+    density: Float[Tensor, "N"],
+    packed: Packed,
+    transparent: float,
+    thin: float | Float[Tensor, ""],
+    room: int | None = None,
+) -> Kept:
     """Drops samples that light cannot reach, and those that hold nothing.
 
     Args:
         density: of each sample, 1 / world unit.
         packed: midpoints, lengths, rays and offsets of N samples.
         transparent: transmittance below which a ray has ended, above 0.
-        thin: opacity of a sample below which it holds nothing, below 1.
+        thin: optical thickness of a sample below which it holds nothing.
+        room: see `march`.
     """
     t, dt, ray, offsets = packed
-    if not fast(density, t, dt) or t.requires_grad or dt.requires_grad:
-        return keep_visible_reference(density, packed, transparent, thin)
+    if room is not None or not fast(density, t, dt) or t.requires_grad or dt.requires_grad:
+        return keep_visible_reference(density, packed, transparent, thin, room)
     from nerf_lightning.kernels.cpu import composite as cpu
     from nerf_lightning.kernels.cpu import workers
 
     threads, keep, counts = workers(), np.empty(len(t), np.bool_), np.empty(len(offsets) - 1, np.int64)
     cpu.visible(
-        density.detach().contiguous().numpy(), dt.numpy(), offsets.numpy(), transparent, thin, keep, counts, threads
+        density.detach().contiguous().numpy(),
+        dt.numpy(),
+        offsets.numpy(),
+        transparent,
+        float(thin),
+        keep,
+        counts,
+        threads,
     )
     kept = torch.zeros_like(offsets)
     np.cumsum(counts, out=kept.numpy()[1:])

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from nerf_lightning.kernels.switch import fast
 
-
 # Powers of (x, y, z) that the harmonics are made of: squares and products of two coordinates, then of three.
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 TRIPLES = tuple((pair, axis) for pair in (0, 1, 2) for axis in (0, 1, 2)) + ((3, 2),)

@@ -1,6 +1,5 @@
 """Bilinear interpolation on nested grids with hashed entries: `hashgrid` in two dimensions (Instant-NGP, section 3)."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 

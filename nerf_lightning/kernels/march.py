@@ -20,16 +20,36 @@ Packed = tuple[Float[Tensor, "N"], Float[Tensor, "N"], Int[Tensor, "N"], Int[Ten
 def cell_index(unit: Float[Tensor, "*batch 3"], resolution: int) -> Int[Tensor, "*batch"]:
     """Flat index of the cell of a resolution^3 grid over [0, 1]^3 that holds each position (clamped into the grid)."""
     x, y, z = (unit * resolution).long().clamp_(0, resolution - 1).unbind(-1)
-    return (x * resolution + y) * resolution + z
+    return torch.add(z, torch.add(y, x, alpha=resolution), alpha=resolution)
 
 
-def pack_intervals(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Packed:
-    """Packs the kept intervals between consecutive edges of each ray."""
-    counts = keep.sum(1)
-    offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-    ray, column = keep.nonzero(as_tuple=True)
-    start, end = edges[ray, column], edges[ray, column + 1]
-    return (start + end) / 2, end - start, ray, offsets
+def chosen(mask: Bool[Tensor, "M"], room: int | None) -> tuple[Int[Tensor, "K"], Bool[Tensor, "K"] | None]:
+    """Which entries of a mask are true, in their order.
+
+    Without `room` the host waits to learn how many there are. With it K = room, and nobody waits: where there are fewer, the
+    last one stands again, and the second tensor says which ones count.
+    """
+    if room is None:
+        return mask.nonzero()[:, 0], None
+    counted = mask.cumsum(0)
+    order, total = torch.arange(1, room + 1, device=mask.device), counted[-1:]
+    return torch.searchsorted(counted, torch.minimum(order, total)), order <= total
+
+
+def ends_of(mask: Bool[Tensor, "R S"]) -> Int[Tensor, "R_plus_1"]:
+    """Where each row's entries begin, if the true ones are packed one row after the other, and where the last ends."""
+    counts = mask.sum(1)
+    return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+
+
+def pack_intervals(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"], room: int | None = None) -> Packed:
+    """Packs the kept intervals between consecutive edges of each ray; for `room` see `march`."""
+    flat, there = chosen(keep.flatten(), room)
+    ray = flat // keep.shape[1]
+    first = flat + ray  # a row of edges is longer by one
+    start, end = edges.flatten().index_select(0, first), edges.flatten().index_select(0, first + 1)
+    length = end - start if there is None else (end - start) * there
+    return (start + end) / 2, length, ray, ends_of(keep)
 
 
 def march_reference(
@@ -41,6 +61,7 @@ def march_reference(
     occupied: Bool[Tensor, "cells"],
     samples: int,
     step: float,
+    room: int | None = None,
 ) -> Packed:
     """`march` in plain torch, for every device."""
     resolution = round(len(occupied) ** (1 / 3))
@@ -51,16 +72,14 @@ def march_reference(
     else:
         edges = torch.minimum(near[:, None] + steps.clamp_min(0) * step, far[:, None])
     keep = edges[:, 1:] > edges[:, :-1]
-    rows = max(1, MAX_CANDIDATES // samples)
+    rows = max(1, MAX_CANDIDATES // (samples + 1))
     for start in range(0, len(rays), rows):
         part = slice(start, start + rows)
-        inside = keep[part]
-        ray, column = inside.nonzero(as_tuple=True)
-        t = (edges[part][ray, column] + edges[part][ray, column + 1]) / 2
-        chunk = rays[part]
-        unit = bounds.to_unit(chunk.origins[ray] + t[:, None] * chunk.directions[ray])
-        inside[ray, column] = occupied[cell_index(unit, resolution)]
-    return pack_intervals(edges, keep)
+        t = (edges[part, :-1] + edges[part, 1:]) / 2
+        unit = bounds.to_unit(rays.origins[part, None] + t[..., None] * rays.directions[part, None])
+        cells = cell_index(unit, resolution)
+        keep[part] &= occupied.index_select(0, cells.flatten()).view(cells.shape)
+    return pack_intervals(edges, keep, room)
 
 
 def march(
@@ -72,6 +91,7 @@ def march(
     occupied: Bool[Tensor, "cells"],
     samples: int,
     step: float,
+    room: int | None = None,
 ) -> Packed:
     """Equal steps from near to far, of which those are kept whose midpoint lies in an occupied cell.
 
@@ -82,10 +102,12 @@ def march(
         occupied: cells of a cubic grid over the bounds' unit cube, last axis fastest.
         samples: steps of an unbounded ray, where they are as long as `Bounds.distances` says; otherwise at most so many.
         step: length of a step inside bounds.
+        room: entries to make, whatever is found, so that no host waits to learn how much that is. Where less is found, the
+            last interval is repeated with length 0; where more is found, rays that end beyond it in `offsets` lack some.
     """
     constants = not any(x.requires_grad for x in (rays.origins, rays.directions, near, far, shift))
-    if not (constants and fast(rays.origins, near, shift)):
-        return march_reference(rays, bounds, near, far, shift, occupied, samples, step)
+    if room is not None or not (constants and fast(rays.origins, near, shift)):
+        return march_reference(rays, bounds, near, far, shift, occupied, samples, step, room)
     from nerf_lightning.kernels.cpu import march as cpu
     from nerf_lightning.kernels.cpu import workers
 
@@ -116,7 +138,7 @@ def points_reference(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
 ) -> Float[Tensor, "N 3"]:
     """`points` in plain torch, for every device."""
-    return origins[ray] + t[:, None] * directions[ray]
+    return origins.index_select(0, ray) + t[:, None] * directions.index_select(0, ray)
 
 
 def points(
@@ -139,7 +161,7 @@ def mark_cells_reference(
 ) -> None:
     """`mark_cells` in plain torch, for every device."""
     unit = bounds.to_unit(points_reference(rays.origins, rays.directions, ray, t))
-    marks[cell_index(unit, round(len(marks) ** (1 / 3)))] = mark
+    marks.index_fill_(0, cell_index(unit, round(len(marks) ** (1 / 3))), mark)
 
 
 def mark_cells(

@@ -58,14 +58,14 @@ def locate(index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]) -> tuple[Int
     return rows, weights
 
 
-def mark_rows(seen: Int[Tensor, "V"], rows: Int[Tensor, "N 8"], step: Int[Tensor, ""]) -> None:
-    """Notes in `seen` that these rows were read at this step, all 32-bit."""
+def mark_rows(seen: Int[Tensor, "V"], rows: Int[Tensor, "N 8"], step: int) -> None:
+    """Notes in `seen` that these rows were read at this step; both tensors are 32-bit."""
     if not fast(seen):
-        seen[rows.flatten().long()] = step
+        seen.index_fill_(0, rows.flatten().long(), step)
         return
     from nerf_lightning.kernels.cpu import voxels, workers
 
-    voxels.mark(seen.numpy(), rows.numpy(), int(step), workers())
+    voxels.mark(seen.numpy(), rows.numpy(), step, workers())
 
 
 def interpolate_rows(

@@ -52,17 +52,21 @@ class Rectifier(torch.nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("soft", torch.tensor(False))  # in checkpoints, as it changes what the weights mean
+        self._soft = False
+        """The same, for the host to know."""
 
     def soften(self) -> None:
         """From now on `shifted_softplus`."""
         self.soft.fill_(True)
+        self._soft = True
 
     def forward(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        return shifted_softplus(x) if self.soft else torch.relu(x)
+        return shifted_softplus(x) if self._soft else torch.relu(x)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         state_dict.setdefault(prefix + "soft", torch.tensor(False))  # older checkpoints lack it
         super()._load_from_state_dict(state_dict, prefix, *rest)
+        self._soft = bool(self.soft)
 
 
 def density_activation(name: str) -> Callable[[Tensor], Tensor]:

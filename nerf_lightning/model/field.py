@@ -14,7 +14,7 @@ def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
     """Gives a parameter data of another shape. It stays the same parameter, in modules and optimisers."""
     parameter.grad = None
     # Autograd remembers a parameter's shape as long as some graph that used it lives; a change of type makes it forget.
-    parameter.data = data.new_empty(0, dtype=torch.float64)
+    parameter.data = data.new_empty(0, dtype=torch.float16)
     parameter.data = data
 
 
@@ -36,7 +36,7 @@ class Field(InBounds):
 
     def __init__(self, bounds: Bounds):
         super().__init__(bounds)
-        self.unit_length = float(bounds.half_size.max())
+        self.unit_length = bounds.longest
         self.sizing = ""
         """How the field's size follows from the data, in one line; "" where it does not."""
 

@@ -30,6 +30,8 @@ RECENT = 0.5
 PIECES = 4
 """Steps that share one look at the roughness of all vertices."""
 TABLES = ("log_density", "colours", "views")
+COUNTS = {"stage": torch.int64, "steps": torch.int32, "started": torch.int32}
+"""Whole numbers in checkpoints."""
 CHUNK = 1 << 16
 """Vertices interpolated together when growing: bounds the memory."""
 
@@ -65,9 +67,6 @@ class VoxelField(Field):
     index: Tensor
     vertex: Tensor
     seen: Tensor
-    stage: Tensor
-    steps: Tensor
-    started: Tensor
 
     def __init__(
         self,
@@ -103,9 +102,9 @@ class VoxelField(Field):
         self.register_buffer("index", torch.arange(1, rows, dtype=torch.int32))
         self.register_buffer("vertex", torch.arange(-1, rows - 1, dtype=torch.int32), persistent=False)
         self.register_buffer("seen", torch.zeros(rows, dtype=torch.int32))  # step of the last reading
-        self.register_buffer("stage", torch.tensor(0))
-        self.register_buffer("steps", torch.tensor(1, dtype=torch.int32))
-        self.register_buffer("started", torch.tensor(1, dtype=torch.int32))  # the stage's first step
+        self.stage, self.steps, self.started = 0, 1, 1
+        """Which size it has, steps so far, and the first one at that size. Checkpoints hold them too (`COUNTS`), but a step
+        must not ask a device for them."""
         self.log_density = torch.nn.Parameter(torch.zeros(rows))  # divided by density_rate
         self.log_density.data[0] = EMPTY / density_rate
         self.colours = torch.nn.Parameter(torch.zeros(rows, 3))
@@ -141,7 +140,7 @@ class VoxelField(Field):
 
     def penalty(self) -> Float[Tensor, ""] | None:
         """The roughness of the log-densities, in each step that of another piece of the table."""
-        rows, piece = len(self.vertex) - 1, int(self.steps) % PIECES
+        rows, piece = len(self.vertex) - 1, self.steps % PIECES
         first, last = (1 + rows * i // PIECES for i in (piece, piece + 1))
         if not self.smoothness or first == last:
             return None
@@ -152,15 +151,14 @@ class VoxelField(Field):
         """Moves on to the size that `progress` asks for."""
         self.steps += 1
         wanted = max(i for i, time in enumerate(self.times) if progress >= time)
-        if wanted <= int(self.stage):
+        if wanted <= self.stage:
             return []
         keep = self.surroundings(self.resolutions[wanted] + 1)
         values = torch.cat([table.view(len(table), -1) for table in self.tables], dim=1)
         parts = (keep.nonzero() / (keep.shape[0] - 1)).split(CHUNK)
         new = torch.cat([values[:1], *(interpolate_rows(values, *locate(self.index, part)) for part in parts)])
         self.hold(keep.flatten(), new.split([1, 3, 3 * self.terms], dim=1))
-        self.stage.fill_(wanted)
-        self.started.copy_(self.steps)
+        self.stage, self.started = wanted, self.steps
         return list(self.tables)
 
     def hold(self, keep: Bool[Tensor, "V"], tables: Sequence[Tensor]) -> None:
@@ -219,8 +217,16 @@ class VoxelField(Field):
         # Where nothing was rendered yet, everything stays.
         return widened(keep) if keep.any() else torch.ones_like(keep)
 
+    def _save_to_state_dict(self, destination: dict[str, Tensor], prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        for name, dtype in COUNTS.items():
+            destination[prefix + name] = torch.tensor(getattr(self, name), dtype=dtype)
+
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         """Takes the sizes of the state that is being loaded: a grid of another stage has other shapes."""
+        for name in COUNTS:
+            if prefix + name in state_dict:
+                setattr(self, name, int(state_dict.pop(prefix + name)))
         for name in ("index", "seen"):
             if prefix + name in state_dict:
                 setattr(self, name, torch.empty_like(state_dict[prefix + name], device=self.aabb.device))

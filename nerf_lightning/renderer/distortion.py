@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.kernels import volume_weights
+from nerf_lightning.kernels.sums import before
 from nerf_lightning.sampler import Samples
 
 
@@ -20,16 +22,9 @@ def distortion(density: Float[Tensor, "N"], samples: Samples, scale: float) -> F
     """
     if not len(samples):
         return density.sum()
-    thickness = density * samples.dt
-    first = samples.offsets[:-1].clamp(max=len(samples) - 1)  # rays without samples ask for nothing
-
-    def before(x: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-        """Sum over the samples of the same ray that come before each."""
-        total = torch.cumsum(x.double(), 0) - x
-        return (total - total[first][samples.ray]).to(x.dtype)
-
-    weight = torch.exp(-before(thickness)) * -torch.expm1(-thickness)
+    weight = volume_weights(density, samples.dt, samples.ray, samples.offsets)
     s = samples.t / (samples.t + scale)
     width = samples.dt * scale / (samples.t + scale) ** 2
-    apart = 2 * weight * (s * before(weight) - before(weight * s))
+    passed, far = before(torch.stack([weight, weight * s], dim=1), samples.ray, samples.offsets).unbind(1)
+    apart = 2 * weight * (s * passed - far)
     return (apart + weight**2 * width / 3).sum() / (len(samples.offsets) - 1)

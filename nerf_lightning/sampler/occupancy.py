@@ -1,5 +1,7 @@
 """Skip empty space: a coarse grid remembers where the field has density (Instant-NGP, appendix C)."""
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
@@ -7,6 +9,7 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import keep_visible, march, mark_cells
+from nerf_lightning.kernels.march import Packed
 from nerf_lightning.options import Count
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
 
@@ -14,6 +17,8 @@ MAX_ASKED = 1 << 17
 """Positions at which the density is asked together: bounds the memory of one call."""
 MOST_CAMERAS = 128
 """Cameras, evenly chosen, that tell which cells are in view."""
+ROOM = 1.25
+"""Times as many steps as were last counted there is room for, where they are not counted."""
 
 
 def in_view(camera: Cameras, points: Float[Tensor, "N 3"], near: float) -> Bool[Tensor, "N"]:
@@ -97,33 +102,50 @@ class OccupancySampler(Sampler):
         """Number of the last update; `reached` holds the number of the update after which light last met the cell."""
         self.look_everywhere = True
         """Whether the next training step looks at all occupied cells."""
-
-    @property
-    def step_length(self) -> float:
+        self.per_ray: tuple[float, float] | None = None
+        """Steps a ray in occupied cells, and those of them that were kept, when they were last counted; None where the next
+        training step is to count. To count is to wait for the device: but on a CPU, where that costs nothing, the steps
+        between two updates take it that there will be as many."""
+        self.step_length = 2 * float(bounds.half_size.norm()) / samples
         """Length of one step inside the box, in world units."""
-        return 2 * float(self.bounds.half_size.norm()) / self.samples
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
-        shift, cells = torch.zeros_like(near), self.occupied
-        if generator is not None:
-            shift = torch.rand(near.shape, generator=generator, device=near.device)
-            cells = self.occupied if self.look_everywhere else self.lit
-        packed = march(rays, self.bounds, near, far, shift, cells, self.samples, self.step_length)
-        candidates = Samples(*packed)
-        if not len(candidates):
-            return candidates
-        with torch.no_grad():
-            asked = candidates.positions(rays).split(MAX_ASKED)
-            found = torch.cat([density(part) for part in asked]).float()  # mixed precision gives halves
-        # A picture must not depend on how its rays are cut into calls: only training looks at the mean, and drops.
-        thin = 0.0
-        if generator is not None:
-            thin = min(self.thin, 0.5 * float(torch.dot(found, candidates.dt)) / len(candidates))
-        samples = Samples(*keep_visible(found, packed, self.transparent, thin))
-        if generator is not None:
-            mark_cells(self.reached, self.updates, rays, self.bounds, samples.ray, samples.t)
-        return samples
+        if generator is None:
+            packed = self._march(rays, near, far, torch.zeros_like(near), self.occupied)
+            # A picture must not depend on how its rays are cut into calls: only training looks at the mean, and drops.
+            return Samples(*keep_visible(self._ask(density, rays, packed), packed, self.transparent, 0.0))
+        shift = torch.rand(near.shape, generator=generator, device=near.device)
+        cells = self.occupied if self.look_everywhere else self.lit
+        rooms = [None, None] if self.per_ray is None else [math.ceil(ROOM * many * len(rays)) for many in self.per_ray]
+        packed = self._march(rays, near, far, shift, cells, rooms[0])
+        found = self._ask(density, rays, packed)
+        thin = (found * packed[1]).mean().mul(0.5).clamp_max(-math.log1p(-self.thin)) if len(found) else 0.0
+        kept = keep_visible(found, packed, self.transparent, thin, rooms[1])
+        mark_cells(self.reached, self.updates, rays, self.bounds, kept[2], kept[0])
+        if rooms[0] is not None:
+            whole = (packed[3][1:] <= rooms[0]) & (kept[3][1:] <= rooms[1])
+            return Samples(*kept, whole)
+        if rays.origins.device.type != "cpu":
+            self.per_ray = max(len(found), 1) / len(rays), max(len(kept[0]), 1) / len(rays)
+        return Samples(*kept)
+
+    def _march(
+        self,
+        rays: Rays,
+        near: Float[Tensor, "R"],
+        far: Float[Tensor, "R"],
+        shift: Float[Tensor, "R"],
+        cells: Bool[Tensor, "cells"],
+        room: int | None = None,
+    ) -> Packed:
+        return march(rays, self.bounds, near, far, shift, cells, self.samples, self.step_length, room)
+
+    @torch.no_grad()
+    def _ask(self, density: DensityFn, rays: Rays, packed: Packed) -> Float[Tensor, "N"]:
+        """The density at the middle of intervals; mixed precision gives halves."""
+        asked = Samples(*packed).positions(rays).split(MAX_ASKED)
+        return torch.cat([density(part) for part in asked]).float()
 
     @torch.no_grad()
     def look_through(self, cameras: Cameras) -> None:
@@ -154,11 +176,14 @@ class OccupancySampler(Sampler):
 
     def restart(self, step: int) -> None:
         self.first_step = step
+        self.per_ray = None
 
     @torch.no_grad()
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         self.updates, phase = divmod(step, self.update_every)
         self.look_everywhere = not phase
+        if phase <= 1:  # other cells than in the step before
+            self.per_ray = None
         if phase:
             return
         device = self.thickness.device
@@ -167,14 +192,14 @@ class OccupancySampler(Sampler):
             cells = torch.arange(total, device=device)
         else:
             # A random phase of a stride of four: no cell twice, and every cell has the same chance.
-            start = int(torch.randint(4, (), generator=generator, device=device))
-            cells = torch.arange(start, total, 4, device=device)
+            start = torch.randint(4, (1,), generator=generator, device=device)
+            cells = (torch.arange(0, total, 4, device=device) + start) % total
         n = self.resolution
         corner = torch.stack([cells // (n * n), cells // n % n, cells % n])
         unit = ((corner + torch.rand(corner.shape, generator=generator, device=device)) / n).T
         found = torch.cat([density(part) for part in self.bounds.to_world(unit).split(MAX_ASKED)]) * self.step_length
         self.thickness[cells] = torch.maximum(self.thickness[cells] * self.decay, found)
-        occupied = self.allowed & (self.thickness > min(self.threshold, 0.5 * float(self.thickness.mean())))
+        occupied = self.allowed & (self.thickness > self.thickness.mean().mul(0.5).clamp_max(self.threshold))
         # With no density anywhere there would be no samples, hence no gradient, for ever: look everywhere again.
-        self.occupied = occupied if occupied.any() else self.allowed.clone()
+        self.occupied = torch.where(occupied.any(), occupied, self.allowed)
         self.lit = self.occupied & (self.reached >= self.updates - self.memory)

@@ -27,6 +27,9 @@ class Samples:
     """Index of the ray each sample lies on."""
     offsets: Int[Tensor, "R_plus_1"]
     """Samples of ray r are offsets[r] : offsets[r + 1]."""
+    whole: Bool[Tensor, "R"] | None = None
+    """Which rays have all their samples, where the number of samples was settled before they were found: then some rays may
+    lack some, and where there are fewer, intervals of length 0 stand at the end. None: all have."""
 
     def __len__(self) -> int:
         return self.t.shape[0]
@@ -37,7 +40,7 @@ class Samples:
 
     def directions(self, rays: Rays) -> Float[Tensor, "N 3"]:
         """Unit viewing direction of each sample."""
-        return rays.directions[self.ray]
+        return rays.directions.index_select(0, self.ray)
 
     def between(self, near: float, far: float) -> "Samples":
         """Those whose midpoints lie within two distances along their rays."""

@@ -38,7 +38,7 @@ class NeRF2D(System):
 
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
         loss = torch.nn.functional.mse_loss(self.field(batch.uv), batch.rgb)
-        self.stats = StepStats(loss.detach().item(), len(batch.uv), len(batch.uv))
+        self.stats = StepStats(loss.detach(), len(batch.uv), len(batch.uv))
         return loss
 
     def truth(self, view: PictureBatch) -> Tensor:

@@ -67,9 +67,12 @@ class NeRF3D(System):
             samples = self.sampler(batch.rays, self.field.density, generator)
         backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
         rendered = self.renderer(batch.rays, samples, self.field, backgrounds)
-        loss = torch.nn.functional.mse_loss(rendered.rgb, batch.target(backgrounds))
-        opacity = float(rendered.opacity.detach().mean())
-        stats = StepStats(loss.detach().item(), len(batch.rays), len(samples), opacity)
+        truth = batch.target(backgrounds)
+        # A ray that lacks some of its samples teaches nothing.
+        rgb = rendered.rgb if samples.whole is None else torch.where(samples.whole[:, None], rendered.rgb, truth)
+        loss = torch.nn.functional.mse_loss(rgb, truth)
+        opacity = rendered.opacity.detach().mean()
+        stats = StepStats(loss.detach(), len(batch.rays), len(samples), samples.whole is None, opacity)
         for penalty in (self.field.penalty(), rendered.penalty):
             loss = loss if penalty is None else loss + penalty
         return loss, stats
@@ -77,6 +80,8 @@ class NeRF3D(System):
     def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
         generator = step_generator(self.seed, 1, self.global_step, self.device)
         loss, self.stats = self.loss(batch, generator, self.global_step)
+        if not self.stats.counted:
+            return loss
         drawn = self.stats.samples
         if self.trainer.world_size > 1:  # all processes draw from one stream, so they must adapt alike
             drawn = int(self.trainer.strategy.reduce(torch.tensor(drawn, device=self.device), reduce_op="sum"))

@@ -1,5 +1,6 @@
 """What NeRF2D and NeRF3D share: the optimiser, its schedule, and how a whole view is judged."""
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -22,12 +23,15 @@ Schedule = Callable[[float], float]
 class StepStats:
     """What the last training step did."""
 
-    mse: float
+    mse: Float[Tensor, ""]
+    """Where it was worked out: reading it makes the host wait for the device."""
     rays: int
     """Rays, or pixels in 2D."""
     samples: int
-    opacity: float | None = None
-    """Mean over the rays: 0 where all is empty, 1 where nothing is seen through."""
+    counted: bool = True
+    """Whether there are so many samples; otherwise there is room for so many."""
+    opacity: Float[Tensor, ""] | None = None
+    """Mean over the rays: 0 where all is empty, 1 where nothing is seen through. Likewise."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ class System(L.LightningModule):
         """Fraction of the budget done; the Budget callback keeps it."""
         self.rate = 1.0
         """Factor on the learning rate beside the schedule's; the Guard callback lowers it where training broke down."""
-        self.stats = StepStats(float("nan"), 0, 0)
+        self.stats = StepStats(torch.tensor(math.nan), 0, 0)
 
     def take(self, smaller: "System") -> None:
         """Goes on from what a system with a smaller field of the same kind has learned."""

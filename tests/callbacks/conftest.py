@@ -49,7 +49,7 @@ class Scripted(NeRF2D):
         super().__init__(Grey(), functools.partial(torch.optim.SGD, lr=0.1), constant)
         self.psnrs = iter(range(10, 1000))
         self.asked: list[Any] = []
-        self.stats = StepStats(0.01, 30, 90)
+        self.stats = StepStats(torch.tensor(0.01, dtype=torch.float64), 30, 90)
         self.groups = [{"lr": 0.1}]
 
     @property

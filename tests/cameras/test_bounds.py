@@ -133,7 +133,7 @@ def test_without_bounds_steps_are_even_in_the_box_and_grow_out_from_it():
     # Six before the box are three half-sizes, 3 / 4 of all there is before; then two in it; ten behind it are 5 / 6.
     even = torch.tensor([[-3 / 4, 0.0, 1.0, 2.0, 2 + 1 / 2, 2 + 5 / 6]])
     t = torch.tensor([[0.0, 6.0, 8.0, 10.0, 12.0, 20.0]])
-    inside, unit = cube.inside(rays), torch.tensor(2.0)
+    inside, unit = cube.inside(rays), 2.0
     torch.testing.assert_close(warp(t, inside[:1], unit), even)
     torch.testing.assert_close(unwarp(even, inside[:1], unit), t)
     near, far = torch.zeros(4), torch.full((4,), 40.0)

@@ -24,10 +24,10 @@ def test_what_is_seen_agrees_with_a_loop(counts: list[int], transparent: float, 
     for count in counts:
         transmittance = 1.0
         for _ in range(count):
-            opacity = 1 - math.exp(-float(density[i]) * float(samples.dt[i]))
-            if transmittance >= transparent and opacity >= thin:
+            thickness = float(density[i]) * float(samples.dt[i])
+            if transmittance >= transparent and thickness >= thin:
                 kept.append(i)
-            transmittance *= 1 - opacity
+            transmittance *= math.exp(-thickness)
             i += 1
         ends.append(len(kept))
     t, dt, ray, offsets = keep_visible(density, packed(samples), transparent, thin)

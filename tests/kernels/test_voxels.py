@@ -157,8 +157,8 @@ def test_what_is_not_a_number_stays_visible(kernels: str):
 def test_marking_notes_the_step_at_the_rows_that_are_read(kernels: str):
     index = torch.arange(1, SIDE**3 + 1, dtype=torch.int32)
     seen = torch.zeros(SIDE**3 + 1, dtype=torch.int32)
-    mark_rows(seen, locate(index, torch.tensor([[0.05, 0.05, 0.05]]))[0], torch.tensor(3, dtype=torch.int32))
-    mark_rows(seen, locate(index, torch.tensor([[0.95, 0.95, 0.95]]))[0], torch.tensor(7, dtype=torch.int32))
+    mark_rows(seen, locate(index, torch.tensor([[0.05, 0.05, 0.05]]))[0], 3)
+    mark_rows(seen, locate(index, torch.tensor([[0.95, 0.95, 0.95]]))[0], 7)
     near = [(i * SIDE + j) * SIDE + k + 1 for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     assert (seen == 3).nonzero()[:, 0].tolist() == near
     assert (seen == 7).nonzero()[:, 0].tolist() == [SIDE**3 + 1 - row for row in reversed(near)]

@@ -65,17 +65,16 @@ def visible(density, dt, offsets, transparent, thin, keep, counts, workers):
 
     Args:
         transparent: transmittance below which a ray has ended.
-        thin: opacity of a sample below which it holds nothing.
+        thin: optical thickness of a sample below which it holds nothing.
     """
     rays = len(offsets) - 1
     furthest = -math.log(transparent)
-    thinnest = -math.log1p(-thin)
     for worker in prange(workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
             optical, kept = 0.0, 0
             for n in range(offsets[ray], offsets[ray + 1]):
                 step = density[n] * dt[n]
-                keep[n] = not (optical > furthest or step < thinnest)  # what is not a number stays, to be noticed
+                keep[n] = not (optical > furthest or step < thin)  # what is not a number stays, to be noticed
                 kept += keep[n]
                 optical += step
             counts[ray] = kept

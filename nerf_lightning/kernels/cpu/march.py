@@ -41,9 +41,14 @@ def edge(k, shift, near, far, step, samples, unbounded, low, span, enter, leave,
 @inner
 def to_unit(x, y, z, centre, half, unbounded):
     """`Bounds.to_unit` of one position."""
-    a, b, c = (x - centre[0]) / half[0], (y - centre[1]) / half[1], (z - centre[2]) / half[2]
     if not unbounded:
-        return a * float32(0.5) + float32(0.5), b * float32(0.5) + float32(0.5), c * float32(0.5) + float32(0.5)
+        two = float32(2)
+        return (
+            (x - (centre[0] - half[0])) / (two * half[0]),
+            (y - (centre[1] - half[1])) / (two * half[1]),
+            (z - (centre[2] - half[2])) / (two * half[2]),
+        )
+    a, b, c = (x - centre[0]) / half[0], (y - centre[1]) / half[1], (z - centre[2]) / half[2]
     norm = max(max(abs(a), abs(b)), max(abs(c), float32(1)))
     reach = float32(2) - float32(1) / norm
     quarter, middle = float32(0.25), float32(0.5)
