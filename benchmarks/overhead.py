@@ -11,7 +11,7 @@ import torch
 
 from benchmarks.bare import bare_step
 from benchmarks.setup import built
-from nerf_lightning.build import build_trainer
+from nerf_lightning.build import build_trainer, device_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.system import NeRF3D
 
@@ -57,7 +57,7 @@ def measure(overrides: list[str]) -> dict[str, float]:
     settings = [*overrides, f"budget.steps={steps}", "callbacks.heldout.at=[]", "callbacks.snapshots.steps=[]"]
     with tempfile.TemporaryDirectory() as folder:
         cfg, data, system = built(settings, Path(folder))
-        trainer, alternation = build_trainer(cfg, Path(folder)), Alternation(data)
+        trainer, alternation = build_trainer(cfg, Path(folder), device_of(cfg)), Alternation(data)
         trainer.callbacks.insert(0, alternation)  # type: ignore[attr-defined]
         trainer.fit(system, data)
     full, bare = alternation.trainer_blocks[FIRST:], alternation.bare_blocks[FIRST:]

@@ -18,6 +18,7 @@ from nerf_lightning.capture.solve import Solved
 from nerf_lightning.capture.synthetic import write_capture
 from nerf_lightning.capture.tabletop import Tabletop
 from nerf_lightning.dataset.brickmodel import bulldozer
+from nerf_lightning.device import the_device
 from nerf_lightning.export.mesh import mesh_file
 from nerf_lightning.export.verb import views_of
 from nerf_lightning.export.volume import volume_of
@@ -68,7 +69,7 @@ def of_bricks(seconds: float, output: Path) -> Rows:
         folder = output / "shapes" / recipe
         given = ["dataset=bricks", f"recipe={recipe}", f"budget.seconds={seconds}", "renderer.background=random"]
         trained = train("lego", given, 0, folder)
-        mesh, voxel = mesh_of(open_scene_run(folder))
+        mesh, voxel = mesh_of(open_scene_run(folder, the_device("auto")))
         off = np.abs(distance_to_bricks(np.asarray(mesh.vertices))) / voxel
         row = {"field": recipe, "psnr": trained["psnr"], "voxel": voxel}
         row |= {f"p{share}_voxels": float(np.percentile(off, share)) for share in (50, 95, 99)}
@@ -118,7 +119,7 @@ def of_capture(seconds: float, output: Path) -> Rows:
     found = capture(folder / "calibration", folder / "photos", SIZE, Packing(folder / "scene.npz", LONGEST))
     given = [f"dataset.path='{folder}/scene.npz'", f"budget.seconds={LONGER * seconds}"]
     trained = train("capture", given, 0, folder / "run")
-    rows = size_of_capture(open_scene_run(folder / "run"), found.solved, layout)
+    rows = size_of_capture(open_scene_run(folder / "run", the_device("auto")), found.solved, layout)
     return [{**row, "psnr": trained["psnr"]} for row in rows]
 
 

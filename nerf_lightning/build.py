@@ -18,7 +18,9 @@ from omegaconf.errors import ConfigKeyError
 from nerf_lightning.callbacks import Budget, Results
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.device import CPU, the_device
 from nerf_lightning.errors import InputError
+from nerf_lightning.limits import limits_of
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.options import check_options
 from nerf_lightning.system import NeRF2D, NeRF3D, System
@@ -72,6 +74,15 @@ def resolved(cfg: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in plain.items()}
 
 
+def device_of(cfg: DictConfig) -> torch.device:
+    """The device that a run asks for, by its trainer.
+
+    Raises:
+        InputError: where it is not there.
+    """
+    return the_device(str(OmegaConf.select(cfg, "trainer.accelerator", default="auto")))
+
+
 def build_data(cfg: DictConfig, path: str | None = None) -> RayDataModule | PixelDataModule:
     """The data module, its scene loaded; from other photos than the configuration names, where a path is given."""
     if path is None:
@@ -94,14 +105,15 @@ def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> A
     return make(cfg, "model", **extra)
 
 
-def build_system(cfg: DictConfig, frame: "Frame") -> System:
-    """The LightningModule: NeRF3D for a scene's frame, NeRF2D for a picture's."""
+def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) -> System:
+    """The LightningModule: NeRF3D for a scene's frame, NeRF2D for a picture's. On the CPU, with the limits of a device."""
     optimizer = make(cfg, "optimizer")
     try:
         optimizer([torch.zeros(1)])  # a rate below zero is told now, not when training starts
     except (ValueError, TypeError, RuntimeError) as error:
         raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
-    common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed}
+    chunk = limits_of(cfg, device).chunk
+    common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
     if isinstance(frame, PictureFrame):
         return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
     field = build_field(cfg, Field, "three coordinates", bounds=frame.bounds)
@@ -168,13 +180,12 @@ def build_budget(cfg: DictConfig) -> Budget:
     return Budget(**limits)
 
 
-def build_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
-    """The Trainer with its callbacks, writing into `folder`."""
+def build_trainer(cfg: DictConfig, folder: Path, device: torch.device) -> L.Trainer:
+    """The Trainer with its callbacks, on a device, writing into `folder`."""
     logger: Logger | bool = make(cfg, "logger", save_dir=folder) if cfg.get("logger") is not None else False
     chosen = [name for name, node in (cfg.get("callbacks") or {}).items() if node is not None]
     callbacks = [make(cfg, f"callbacks.{name}") for name in chosen]
     results = Results("results.json", cfg.method, cfg.seed)
     # The budget goes first: the others read its clock. Results go before the orbit: figures should not wait for a GIF.
-    return make(
-        cfg, "trainer", callbacks=[build_budget(cfg), results, *callbacks], logger=logger, default_root_dir=folder
-    )
+    callbacks = [build_budget(cfg), results, *callbacks]
+    return make(cfg, "trainer", accelerator=device.type, callbacks=callbacks, logger=logger, default_root_dir=folder)

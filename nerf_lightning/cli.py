@@ -92,10 +92,11 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
         except InputError as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # the sweep decides what becomes of the other jobs
-            folder = Path(HydraConfig.get().runtime.output_dir)
-            if folder.resolve() != Path.cwd():  # where a verb writes nothing of its own
-                with suppress(OSError):  # a folder in which something stands stays
+            folder, here = Path(HydraConfig.get().runtime.output_dir).resolve(), Path.cwd()
+            with suppress(OSError):  # a folder in which something stands stays
+                while folder != here:  # where a verb writes nothing of its own
                     folder.rmdir()
+                    folder = folder.parent if here in folder.parents else here
             give_up(error)
 
     try:

@@ -34,10 +34,26 @@ def processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
+def accelerator(device: torch.device) -> str | None:
+    """The name of the chip that does the work, or of its kind where nothing tells more; None for the processor itself."""
+    if device.type == "cpu":
+        return None
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if device.type == "mps" and hasattr(torch.backends.mps, "get_name"):  # since PyTorch 2.8
+        return torch.backends.mps.get_name()
+    return device.type
+
+
+def device_in_words(device: torch.device) -> str:
+    """For people: cpu, or such as cuda (NVIDIA H100)."""
+    name = accelerator(device)
+    return device.type if name in (None, device.type) else f"{device.type} ({name})"
+
+
 def describe_machine(device: torch.device) -> dict[str, Any]:
     """What seconds depend on, for results.json."""
-    accelerator = torch.cuda.get_device_name(device) if device.type == "cuda" else None
-    return {"processor": processor(), "cores": cores(), "accelerator": accelerator}
+    return {"processor": processor(), "cores": cores(), "accelerator": accelerator(device)}
 
 
 def taken(cores: float, threads: float, others: float) -> float:

@@ -34,25 +34,25 @@ class SceneRun:
         return float(torch.linalg.det(self.to_source[:3, :3].double())) ** (1 / 3)
 
 
-def open_run(path: Path) -> RunFolder:
-    """Reads a trained system, ready to render with the kernels it was trained with.
+def open_run(path: Path, device: torch.device) -> RunFolder:
+    """Reads a trained system, ready to render on a device with the kernels it was trained with.
 
     Raises:
         InputError: where there is none, or it is broken, of another version, or names what is not trusted.
     """
     quiet()
-    found = load_compact(path) if path.suffix == ".npz" else load_run(path)
+    found = load_compact(path, device) if path.suffix == ".npz" else load_run(path, device=device)
     use_kernels(found.cfg.kernels)
     return found
 
 
-def open_scene_run(path: Path) -> SceneRun:
+def open_scene_run(path: Path, device: torch.device) -> SceneRun:
     """As `open_run`, of a scene.
 
     Raises:
         InputError: as said, and for a picture's run.
     """
-    found = open_run(path)
+    found = open_run(path, device)
     if not isinstance(found.system, NeRF3D) or found.orbit is None or found.to_source is None:
         raise InputError(path, "", "a picture's run", "a scene's run", "final.png shows a picture")
     return SceneRun(found.cfg, found.system, found.orbit, found.to_source, found.scene)

@@ -23,6 +23,7 @@ from torch import Tensor
 from nerf_lightning.build import Frame, PictureFrame, SceneFrame, build_system, frame_of, resolved
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
+from nerf_lightning.device import CPU
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic, write_json
 from nerf_lightning.system import System
@@ -130,15 +131,15 @@ def frame_from(scene: dict[str, Any]) -> tuple[Frame, Cameras | None, Tensor | N
     return SceneFrame(bounds, (red, green, blue)), orbit, to_source
 
 
-def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
-    """Rebuilds a trained system from its folder alone.
+def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device = CPU) -> RunFolder:
+    """Rebuilds a trained system from its folder alone, on a device.
 
     Raises:
         InputError: where a file is missing, broken, or does not fit the others.
     """
     cfg = load_config(folder)
     scene, (frame, orbit, to_source) = load_scene(folder)
-    system = build_system(cfg, frame)
+    system = build_system(cfg, frame, device)
     state = read_checkpoint(folder / "checkpoints" / checkpoint)
     try:
         system.load_state_dict(state["state_dict"])
@@ -146,7 +147,7 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt") -> RunFolder:
         raise InputError(
             folder / "checkpoints" / checkpoint, "state_dict", str(error), "the weights of this run's model"
         ) from error
-    return RunFolder(cfg, system.eval(), orbit, to_source, scene)
+    return RunFolder(cfg, system.eval().to(device), orbit, to_source, scene)
 
 
 def load_scene(folder: Path) -> tuple[dict[str, Any], tuple[Frame, Cameras | None, Tensor | None]]:

@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf.errors import OmegaConfBaseException
 
-from nerf_lightning import names  # noqa: F401  (a job's process needs its resolvers)
+from nerf_lightning import cli, names  # noqa: F401  (a job's process needs its resolvers)
 from nerf_lightning.errors import InputError
 from nerf_lightning.files import atomic, write_json
 from nerf_lightning.runs import FINISHED, Run, failed_results, find_runs, read_run, varied
@@ -146,8 +146,14 @@ class SweepReport(Callback):
         self.progress: SweepProgress | None = None
 
     def on_multirun_start(self, config: "DictConfig", **kwargs: Any) -> None:
-        from nerf_lightning.sweep_plan import SweepProgress, planned
+        from nerf_lightning.device import the_device
+        from nerf_lightning.sweep_plan import SweepProgress, devices_asked, planned
 
+        try:
+            for name in devices_asked(config):
+                the_device(name)
+        except InputError as error:  # which Hydra would only remark on
+            cli.give_up(error)
         # Names come from this process's command line: resolved here once, jobs in other processes find them cached.
         print(f"sweep: {config.hydra.sweep.dir}, one folder a job, such as {config.hydra.sweep.subdir}", flush=True)
         jobs = planned(config)

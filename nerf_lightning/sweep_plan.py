@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import OmegaConf
 
 from nerf_lightning.callbacks.progress import clock
 from nerf_lightning.names import fixed_keys, job_name
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
 
 GRID = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
 IN_TURN = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+HERE = ("BasicLauncher", "JoblibLauncher", "LocalLauncher")
+"""Launchers whose jobs run on this machine."""
 
 
 @dataclass(frozen=True)
@@ -34,20 +38,37 @@ def planned(config: "DictConfig") -> list[PlannedJob]:
     """All jobs of a sweep in their order; none where a sweeper thinks of them on the way, or a launcher starts several."""
     if config.hydra.sweeper._target_ != GRID or config.hydra.launcher._target_ != IN_TURN:
         return []
-    given = [*config.hydra.overrides.task]
-    swept = [f"{key}={value}" for key, value in (config.hydra.sweeper.get("params") or {}).items()]
     choices = []
-    for override in OverridesParser.create().parse_overrides([*swept, *given]):
+    for override in _overrides(config):
         key = override.get_key_element()
         if override.is_sweep_override():
             choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
         else:
             choices.append([override.input_line or ""])
-    fixed = fixed_keys(given)
+    fixed = fixed_keys([*config.hydra.overrides.task])
     jobs = []
     for overrides in itertools.product(*choices):
         jobs.append(PlannedJob(job_name(overrides, fixed), _seconds(config, dict(_halves(overrides)))))
     return jobs
+
+
+def devices_asked(config: "DictConfig") -> list[str]:
+    """The devices that the jobs of a sweep ask for, as far as its command line says, where they run on this machine."""
+    if config.hydra.launcher._target_.rsplit(".", 1)[-1] not in HERE:
+        return []
+    swept = [
+        value.strip("'\"")
+        for override in _overrides(config)
+        if override.get_key_element() in ("device", "trainer.accelerator") and override.is_sweep_override()
+        for value in override.sweep_string_iterator()
+    ]
+    return swept or [str(OmegaConf.select(config, "trainer.accelerator", default="auto"))]
+
+
+def _overrides(config: "DictConfig") -> list[Override]:
+    """Of a sweep's configuration and its command line."""
+    swept = [f"{key}={value}" for key, value in (config.hydra.sweeper.get("params") or {}).items()]
+    return OverridesParser.create().parse_overrides([*swept, *config.hydra.overrides.task])
 
 
 def _halves(overrides: Iterable[str]) -> Iterator[tuple[str, str]]:

@@ -15,13 +15,22 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from nerf_lightning.allocator import keep_freed_memory
-from nerf_lightning.build import build_data, build_system, build_trainer, check_background, frame_of, resolved
+from nerf_lightning.build import (
+    build_data,
+    build_system,
+    build_trainer,
+    check_background,
+    device_of,
+    frame_of,
+    resolved,
+)
 from nerf_lightning.callbacks import Results
 from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, draw_rays
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
+from nerf_lightning.limits import limits_of
 from nerf_lightning.machine import CROWDED, crowding
 from nerf_lightning.model import Field
 from nerf_lightning.options import AtLeast, Count, check_options
@@ -33,6 +42,8 @@ from nerf_lightning.system import NeRF2D, NeRF3D, System
 SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
 """What stands beside the options in TensorBoard's HParams tab."""
 log = logging.getLogger(__name__)
+LATER = {"device": "auto", "limits": {"batch": None, "chunk": None}}
+"""What runs of earlier versions do not have, and may be given when they are resumed."""
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
@@ -51,6 +62,7 @@ def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None =
     resumed = cfg.resume is not None
     if resumed:
         cfg, checkpoint = resume(cfg, folder)
+    device = device_of(cfg)
     quiet()
     settings = {"seed": cfg.seed, "threads": cfg.threads, "kernels": cfg.kernels}
     check_options("", prepare_process, settings)
@@ -59,20 +71,21 @@ def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None =
         data = data_again(cfg, load_scene(folder)[0], cfg.dataset.get("path"))
     else:
         data = build_data(cfg)
+    data.enlarge(limits_of(cfg, device).batch)
     doubts = check_scene(data.scene) if isinstance(data, RayDataModule) else []
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt)
-    system = build_system(cfg, frame_of(data))
+    system = build_system(cfg, frame_of(data), device)
     if system.field.sizing:
         log.info("model: %s", system.field.sizing)
     check_background(cfg, data, system)
-    trainer = build_trainer(cfg, folder)
+    trainer = build_trainer(cfg, folder, device)
     results_of(trainer).warnings = doubts
     check_processes(trainer, system)
     if trainer.is_global_zero:
         save_config(cfg, folder)
         save_scene(data, folder)
-    warm_up(system, data)
+    warm_up(system, data, trainer.strategy.root_device)
     trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(system, data, verbose=False)
     results = results_of(trainer).summary
@@ -85,16 +98,19 @@ def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None =
 
 def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     """The configuration of the run in `folder` with this command line's overrides on top, and its last checkpoint."""
-    saved = load_config(folder)
+    saved = OmegaConf.create(LATER)
+    saved.merge_with(load_config(folder))
     checkpoint = folder / "checkpoints" / "last.ckpt"
     read_checkpoint(checkpoint)  # a broken one is told in one line, before anything starts
-    for override in HydraConfig.get().overrides.task:
-        key, _, _ = override.partition("=")
+    given = [override.partition("=")[0] for override in HydraConfig.get().overrides.task]
+    for key in given:
         if key == "resume":
             continue
-        if OmegaConf.select(saved, key, default=override) is override:
+        if OmegaConf.select(saved, key, default=key) is key:
             raise InputError("resume", key, "an option the run does not have", f"one of those in {folder}/config.yaml")
         OmegaConf.update(saved, key, OmegaConf.select(cfg, key))
+    if "device" in given:  # its trainer's was resolved when the run began
+        OmegaConf.update(saved, "trainer.accelerator", cfg.trainer.accelerator)
     return saved, checkpoint
 
 
@@ -137,16 +153,19 @@ def check_processes(trainer: L.Trainer, system: System) -> None:
         )
 
 
-def warm_up(system: System, data: RayDataModule | PixelDataModule) -> None:
-    """Runs a small step on a copy, so that kernels are compiled before the clock starts (half a minute the first time)."""
-    with Console().status("getting the kernels ready (the first time they are compiled: half a minute)"):
-        trial = copy.deepcopy(system)
+def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch.device) -> None:
+    """Runs a small step on a copy, so that kernels are ready before the clock starts: a CPU's are compiled the first time."""
+    told = " (the first time they are compiled: half a minute)" if device.type == "cpu" else ""
+    with Console().status(f"getting the kernels ready{told}"):
+        trial = copy.deepcopy(system).to(device)
         if isinstance(trial, NeRF3D):
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
-            batch = draw_rays(data.scene.train, 64, step_generator(0, 0, 0))
-            trial.loss(batch, step_generator(0, 1, 0), 1)[0].backward()  # step 1: without a look at the whole grid
+            batch = draw_rays(data.scene.train, 64, step_generator(0, 0, 0)).to(device)
+            trial.loss(batch, step_generator(0, 1, 0, device), 1)[
+                0
+            ].backward()  # step 1: without a look at the whole grid
         elif isinstance(trial, NeRF2D):
-            trial.field(torch.rand(64, 2, generator=step_generator(0, 0, 0))).sum().backward()
+            trial.field(torch.rand(64, 2, generator=step_generator(0, 0, 0)).to(device)).sum().backward()
 
 
 def results_of(trainer: L.Trainer) -> Results:

@@ -26,6 +26,7 @@ def options(
     rays: Count,
     samples: Count,
     side: Count,
+    device: str,
     host: str,
     port: Annotated[int, AtLeast(0)],
 ) -> None:
@@ -41,7 +42,7 @@ def task(cfg: "DictConfig") -> None:
         raise InputError("config", "scene and run", found, "one of the two", "give scene=scene.npz or run=DIR")
     place = {"host": given["host"], "port": given["port"]}
     if given["run"] is not None:
-        view_run(given["run"], given["photo_side"], given["side"], **place)
+        view_run(given["run"], given["photo_side"], given["side"], given["device"], **place)
     else:
         keys = ("scene", "resize", "holdout", "photo_side", "rays", "samples")
         view_scene(**{key: given[key] for key in keys}, **place)
@@ -76,18 +77,22 @@ def view_scene(
             page.stop()
 
 
-def view_run(run: str, photo_side: int, side: int, host: str, port: int) -> None:
+def view_run(run: str, photo_side: int, side: int, device: str, host: str, port: int) -> None:
     """Serves a page about a trained run until Ctrl-C.
 
     Args:
         run: its folder, or its compact file.
         photo_side: longest side of the photos on the frusta, pixels.
         side: pixels along the longer side of the finest picture.
+        device: that renders, see `the_device`.
         host, port: see `view_scene`.
 
     Raises:
-        InputError: no such run, a damaged one, a picture's, no such address, or Viser is not installed.
+        InputError: no such device, no such run, a damaged one, a picture's, no such address, or Viser is not installed.
     """
+    from nerf_lightning.device import the_device
+
+    where = the_device(device)
     require_viser()
     address, free = find_port(host, port)
 
@@ -95,7 +100,7 @@ def view_run(run: str, photo_side: int, side: int, host: str, port: int) -> None
     from nerf_lightning.viewer.field_page import FieldPage
 
     source = Path(run).expanduser()
-    found = open_scene_run(source)
+    found = open_scene_run(source, where)
     with suppress(KeyboardInterrupt):
         page = FieldPage(source.name, found.system, found.orbit, photos_of(found), host, free, photo_side, side)
         try:

@@ -10,6 +10,7 @@ import lightning as L
 
 from nerf_lightning.callbacks.attached import agreed, attached, data_of
 from nerf_lightning.callbacks.plateau import HALF_AGAIN, Plateau
+from nerf_lightning.device import CPU, synchronize
 from nerf_lightning.errors import InputError
 from nerf_lightning.evenly import evenly
 from nerf_lightning.machine import Load
@@ -55,6 +56,7 @@ class Budget(L.Callback):
         """Progress as a function of what was spent: it runs from here (spent, progress) with this slope."""
         self._before = 0.0  # spent up to the last pause or restart
         self._since: float | None = None
+        self._device = CPU
         self.load = Load()
         """What this process and others did while the clock ran."""
 
@@ -96,10 +98,12 @@ class Budget(L.Callback):
                 self._start()
 
     def _start(self) -> None:
+        synchronize(self._device)
         self.load.start()
         self._since = time.perf_counter()
 
     def _stop(self) -> None:
+        synchronize(self._device)  # what was given to it is training too
         self._before, self._since = self.seconds, None
         self.load.stop()
 
@@ -109,6 +113,7 @@ class Budget(L.Callback):
         return progress if self.limit_seconds is None else agreed(trainer, progress)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        self._device = pl_module.device
         trainer.should_stop = self.shared_progress(trainer) >= 1.0  # a finished run resumed has nothing left
         self._start()
 

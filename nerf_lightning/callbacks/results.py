@@ -38,10 +38,15 @@ GOOD = 30.0
 """... unless what is held out reaches so many dB: then there is little to mend."""
 
 
-def peak_memory_bytes() -> int | None:
-    """The most memory this process has held so far (on CUDA, the most its tensors held on the device); None if unknown."""
-    if torch.cuda.is_available() and torch.cuda.max_memory_allocated():
-        return torch.cuda.max_memory_allocated()
+def peak_memory_bytes(device: torch.device) -> int | None:
+    """The most memory this process has held so far; None if unknown.
+
+    On CUDA, the most its tensors held on the device; on MPS, which keeps no such count, what its driver holds for it now.
+    """
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    if device.type == "mps":
+        return torch.mps.driver_allocated_memory()
     if resource is None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -187,7 +192,7 @@ class Results(L.Callback):
             "ssim": over_views(fmean, "ssim"),
             "psnr_worst_view": over_views(min, "psnr"),
             "render_seconds_per_view": over_views(median, "seconds"),
-            "peak_memory_bytes": peak_memory_bytes(),
+            "peak_memory_bytes": peak_memory_bytes(pl_module.device),
             "curve": curve,
             "warnings": self.warnings,
             "plateau": budget.stopped,

@@ -9,10 +9,10 @@ from typing import Any
 from nerf_lightning.chart.setting import Setting, setting_of
 from nerf_lightning.runs import Run, flat
 
-ELSEWHERE = ("callbacks", "logger", "resume", "name", "method", "recipe", "threads")
+ELSEWHERE = ("callbacks", "logger", "resume", "name", "method", "recipe", "threads", "device")
 """Options that do not change what is trained, or that are told by others."""
-PLACES = ("seed", "path", "folder", "url", "download")
-"""Last parts of options that tell runs of one configuration apart."""
+PLACES = ("seed", "path", "folder", "url", "download", "accelerator")
+"""Last parts of options that tell runs of one configuration apart, or that the setting tells."""
 MOST, MOST_DB = 1e15, 1e3
 """Figures as large as these are none: bytes or seconds, and dB."""
 

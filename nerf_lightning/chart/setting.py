@@ -64,6 +64,7 @@ def _machine(results: dict[str, Any]) -> str:
     found, device, threads = (results.get(key) for key in ("machine", "device", "threads"))
     if not isinstance(found, dict):
         return f"unknown machine ({device}, {threads} threads)"
-    if found.get("accelerator"):
-        return f"{found['accelerator']}"
-    return f"{found.get('processor', 'unknown processor')}, {threads} threads on {found.get('cores', '?')} cores"
+    kind = str(device or "cpu").partition(":")[0]
+    words = f"{found.get('processor', 'unknown processor')}, {threads} threads on {found.get('cores', '?')} cores"
+    accelerator = found.get("accelerator")
+    return words if kind == "cpu" and not accelerator else f"{accelerator or words} ({kind})"

@@ -111,6 +111,10 @@ class PixelDataModule(L.LightningDataModule):
         self.pixels = pixels
         self.seed = seed
 
+    def enlarge(self, batch: int) -> None:
+        """Takes so many times as many pixels a step, for a device that takes more at once. Before training."""
+        self.pixels *= batch
+
     def draw(self, step: int) -> PixelBatch:
         image = self.scene.image
         index = torch.randint(image[..., 0].numel(), (self.pixels,), generator=step_generator(self.seed, 0, step))

@@ -81,6 +81,13 @@ class RayDataModule(L.LightningDataModule):
         self.rays = self.first_rays = rays
         self.samples = samples
         self.seed = seed
+        self.batch = 1
+
+    def enlarge(self, batch: int) -> None:
+        """Takes so many times as many rays and samples a step, for a device that takes more at once. Before training."""
+        self.batch *= batch
+        self.rays = self.first_rays = self.first_rays * batch
+        self.samples = None if self.samples is None else self.samples * batch
 
     def adapt(self, drawn: int) -> None:
         """Called after each step with the samples its rays took: moves the number of rays toward the aim."""
@@ -114,7 +121,8 @@ class RayDataModule(L.LightningDataModule):
         return batch.to(device)
 
     def state_dict(self) -> dict[str, int]:
-        return {"rays": self.rays}
+        return {"rays": self.rays, "batch": self.batch}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        self.rays = state_dict["rays"]
+        before = state_dict.get("batch", 1)  # of another device, perhaps
+        self.rays = max(1, state_dict["rays"] * self.batch // before)

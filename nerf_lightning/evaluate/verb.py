@@ -6,12 +6,15 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
+import torch
 from rich.console import Console
 from rich.table import Table
 
 from nerf_lightning.callbacks.panels import result_panel, write_png
+from nerf_lightning.device import the_device
 from nerf_lightning.evaluate.perceptual import perceptual_distance
 from nerf_lightning.files import write_json
+from nerf_lightning.machine import describe_machine, device_in_words
 from nerf_lightning.open_run import beside, open_run
 from nerf_lightning.progress import tracked
 from nerf_lightning.run_data import data_again
@@ -31,20 +34,22 @@ class Judged:
     """Of rendering."""
 
 
-def evaluate(run: str, output: str | None, worst: int, photos: str | None) -> None:
+def evaluate(run: str, output: str | None, worst: int, device: str, photos: str | None) -> None:
     """Judges a run on held-out views, those of another file where one is given.
 
     Args:
         run: its folder, or its compact file.
         output: folder for the results; None puts them into `evaluation/` beside the run.
         worst: how many of the worst views are pictured.
+        device: that renders, see `the_device`.
         photos: another file or folder of photos.
 
     Raises:
-        InputError: where the run or the photos are no good, or do not fit each other.
+        InputError: where the device, the run or the photos are no good, or do not fit each other.
     """
+    where = the_device(device)
     source = Path(run).expanduser()
-    found = open_run(source)
+    found = open_run(source, where)
     data = data_again(found.cfg, found.scene, photos)
     folder = beside(source) / "evaluation" if output is None else Path(output).expanduser()
     first = data.held_out(0)
@@ -58,14 +63,15 @@ def evaluate(run: str, output: str | None, worst: int, photos: str | None) -> No
         kept[view] = result
         if len(kept) > worst:
             del kept[max(kept, key=lambda one: kept[one].psnr)]
-    write_json(folder / "views.json", as_json(judged, source, data.scene.describe()))
+    write_json(folder / "views.json", as_json(judged, source, data.scene.describe(), where))
     poorest = sorted(kept, key=lambda one: kept[one].psnr)
     write_png(
         folder / "worst.png", np.concatenate([result_panel(kept[one], captioned(judged[one])) for one in poorest])
     )
     Console(highlight=False, soft_wrap=True).print(table(judged))
     mean = fmean(one.psnr for one in judged)
-    print(f"{data.scene.name}: {mean:.2f} dB over {len(judged)} held-out views; {folder}/worst.png, views.json")
+    over = f"{len(judged)} held-out views on {device_in_words(where)}"
+    print(f"{data.scene.name}: {mean:.2f} dB over {over}; {folder}/worst.png, views.json")
     if why:
         print(f"no LPIPS: {why}")
 
@@ -101,10 +107,11 @@ def averages(judged: list[Judged]) -> dict[str, float | None]:
     return means
 
 
-def as_json(judged: list[Judged], source: Path, scene: dict[str, object]) -> dict[str, object]:
+def as_json(judged: list[Judged], source: Path, scene: dict[str, object], device: torch.device) -> dict[str, object]:
     """The evaluation as plain values."""
     views = [{key: _plain(value) for key, value in vars(one).items()} for one in judged]
-    return {"run": str(source), "scene": scene, "mean": averages(judged), "views": views}
+    taken = {"device": str(device), "machine": describe_machine(device)}
+    return {"run": str(source), "scene": scene, **taken, "mean": averages(judged), "views": views}
 
 
 def _plain(value: float | None) -> float | None:

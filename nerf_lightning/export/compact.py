@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from nerf_lightning.build import build_system
+from nerf_lightning.device import CPU
 from nerf_lightning.errors import InputError
 from nerf_lightning.run_folder import RunFolder, frame_from
 from nerf_lightning.system import NeRF3D, System
@@ -94,12 +95,13 @@ def _decoded(name: str, arrays: Arrays, code: str, shape: list[int]) -> Tensor:
     return torch.from_numpy(array.reshape(shape).copy())
 
 
-def decode(content: bytes, path: Path | str) -> RunFolder:
+def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunFolder:
     """A system, ready to render, from what `encode` gave.
 
     Args:
         content: of a compact file.
         path: where it came from, for messages.
+        device: where to render.
 
     Raises:
         InputError: where it is no compact file, or not whole, or of another version, or names what is not trusted.
@@ -120,14 +122,14 @@ def decode(content: bytes, path: Path | str) -> RunFolder:
     except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         raise InputError(path, "", f"{type(error).__name__}: {error}", expected) from error
     cfg = OmegaConf.create(check_config(config, path))
-    system = build_system(cfg, frame)
+    system = build_system(cfg, frame, device)
     try:
         system.field.unpack(_of("field", tensors))
         if isinstance(system, NeRF3D):
             system.sampler.unpack(_of("sampler", tensors))
     except (KeyError, RuntimeError) as error:
         raise InputError(path, "", str(error), "the weights of the model it names") from error
-    return RunFolder(cfg, system.eval(), orbit, to_source, scene)
+    return RunFolder(cfg, system.eval().to(device), orbit, to_source, scene)
 
 
 def _of(part: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -135,8 +137,8 @@ def _of(part: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
 
 
-def load_compact(path: Path) -> RunFolder:
-    """Reads a compact file.
+def load_compact(path: Path, device: torch.device = CPU) -> RunFolder:
+    """Reads a compact file, ready to render on a device.
 
     Raises:
         InputError: as `decode`, and where there is no such file.
@@ -147,4 +149,4 @@ def load_compact(path: Path) -> RunFolder:
         raise InputError(
             path, "", error.strerror or str(error), "a compact file", "python -m nerf_lightning.export"
         ) from error
-    return decode(content, path)
+    return decode(content, path, device)

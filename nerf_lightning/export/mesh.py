@@ -13,7 +13,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.surface import Surface, find_surface, lit_cells
-from nerf_lightning.export.volume import ASKED, Volume
+from nerf_lightning.export.volume import PLACES, Volume
 from nerf_lightning.open_run import SceneRun
 from nerf_lightning.system import NeRF3D
 
@@ -47,9 +47,10 @@ class Shape:
 @torch.no_grad()
 def colours_at(system: NeRF3D, places: Float[Tensor, "N 3"], outwards: Float[Tensor, "N 3"]) -> UInt8[ndarray, "N 3"]:
     """What a field shows at some places to one who looks at them straight, world frame."""
+    together = PLACES * system.chunk
     parts = [
         system.field(some.to(system.device), -away.to(system.device))[1].cpu()
-        for some, away in zip(places.split(ASKED), outwards.split(ASKED), strict=True)
+        for some, away in zip(places.split(together), outwards.split(together), strict=True)
     ]
     return (torch.cat([torch.zeros(0, 3), *parts]).clamp(0, 1) * 255).round().byte().numpy()
 

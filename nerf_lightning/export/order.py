@@ -19,4 +19,5 @@ class Order:
     resolution: Count | None
     threshold: float | None
     box: list[float] | None
+    device: str
     photos: str | None

@@ -10,7 +10,6 @@ from nerf_lightning.cameras import Cameras
 from nerf_lightning.model.pruning import widened
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.system.nerf3d import RENDER_RAYS
 
 NOTHING = 1e-3
 """Opacity of a step below which there is nothing in it."""
@@ -45,8 +44,8 @@ def seen_cells(system: System, cameras: Cameras) -> Cells | None:
     seen = torch.zeros(n**3, dtype=torch.bool, device=system.device)
     for view in range(len(fine)):
         rays = fine.view_rays(view)
-        for start in range(0, len(rays), RENDER_RAYS):
-            chunk = rays[start : start + RENDER_RAYS].to(system.device)
+        for start in range(0, len(rays), system.chunk_rays):
+            chunk = rays[start : start + system.chunk_rays].to(system.device)
             samples = system.sampler(chunk, system.field.density)
             positions = samples.positions(chunk)
             opacity = 1 - torch.exp(-system.field.density(positions) * samples.dt)

@@ -89,7 +89,7 @@ def smallest(
     for one in PRECISIONS if precision is None else (precision,):
         for part in confined:  # few photos do not see all that held-out views do
             content = encode(part, one, config, scene)
-            small = decode(content, "compact").system.to(system.device)
+            small = decode(content, "compact", system.device).system
             tried.append(Compact(content, one, held_out_psnr(small, data), before))
             if tried[-1].loss <= most_loss:
                 return tried[-1]

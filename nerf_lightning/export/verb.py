@@ -8,6 +8,7 @@ import torch
 
 from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.dataset import RayDataModule
+from nerf_lightning.device import the_device
 from nerf_lightning.errors import InputError
 from nerf_lightning.evenly import evenly
 from nerf_lightning.export.mesh import mesh_file, points_file, require_mesh, voxels_file
@@ -15,6 +16,7 @@ from nerf_lightning.export.order import Order
 from nerf_lightning.export.smallest import MOST_VIEWS, PRECISIONS, smallest, some_cameras
 from nerf_lightning.export.volume import volume_of
 from nerf_lightning.files import atomic
+from nerf_lightning.machine import device_in_words
 from nerf_lightning.open_run import SceneRun, beside, open_run, open_scene_run
 from nerf_lightning.run_data import data_again
 from nerf_lightning.run_folder import plain_config
@@ -33,8 +35,9 @@ def export(order: Order) -> None:
     """Writes a run's last state in another format, and says what became of it.
 
     Raises:
-        InputError: where an option or the run is no good, photos are missing, or more would be lost than allowed.
+        InputError: where the device, an option or the run is no good, photos are missing, or more would be lost than allowed.
     """
+    device = the_device(order.device)
     formats = sorted({one for one, _ in NAMES})
     if order.format not in formats:
         raise InputError("config", "format", repr(order.format), ", ".join(formats))
@@ -51,26 +54,26 @@ def export(order: Order) -> None:
         output = Path(order.output).expanduser()
     if order.format in ("ply", "glb"):
         require_mesh()
-    content, words = compacted(order, source) if order.format == "compact" else shaped(order, source)
+    content, words = (compacted if order.format == "compact" else shaped)(order, source, device)
     with atomic(output) as temporary:
         temporary.write_bytes(content)
     print(f"{output}: {words}")
 
 
-def compacted(order: Order, source: Path) -> tuple[bytes, str]:
+def compacted(order: Order, source: Path, device: torch.device) -> tuple[bytes, str]:
     """A run as one small file."""
-    found = open_run(source)
+    found = open_run(source, device)
     data = data_again(found.cfg, found.scene, order.photos)
     before = sum(tensor.numel() * tensor.element_size() for tensor in found.system.state_dict().values())
     compact = smallest(found.system, data, plain_config(found.cfg), order.loss, order.precision)
     size = f"{len(compact.content) / 1000:,.1f} kB of {before / 1000:,.1f} kB (precision={compact.precision})"
     quality = f"held-out PSNR {compact.before:.2f} -> {compact.psnr:.2f} dB, {max(compact.loss, 0):.3f} dB lost"
-    return compact.content, f"{size}, {quality}"
+    return compact.content, f"{size}, {quality}, on {device_in_words(device)}"
 
 
-def shaped(order: Order, source: Path) -> tuple[bytes, str]:
+def shaped(order: Order, source: Path, device: torch.device) -> tuple[bytes, str]:
     """A run as a mesh, points or voxels."""
-    found = open_scene_run(source)
+    found = open_scene_run(source, device)
     box = None if order.box is None else torch.tensor(order.box).view(2, 3)
     volume = volume_of(found, order.resolution, box)
     if order.format == "npz":

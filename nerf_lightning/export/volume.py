@@ -18,8 +18,8 @@ COARSEST, FINEST = 64, 256
 """Cells along the longest side, where nobody says how many."""
 PIXELS = 1.25
 """Width of a cell in pixels: at one pixel what a surface has too much is noise."""
-ASKED = 1 << 17
-"""Places asked together: bounds the memory of one call."""
+PLACES = 4
+"""So many places are asked together for each sample that is rendered together: bounds the memory of one call."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,8 @@ def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] 
     low = corners.mean(0) - torch.tensor(shape, device=system.device) * (cell / 2)
     volume = Volume(torch.zeros(shape), low.cpu(), cell)
     occupied = occupied_cells(system)
-    slab = max(1, ASKED // (shape[1] * shape[2]))
+    asked_together = PLACES * system.chunk
+    slab = max(1, asked_together // (shape[1] * shape[2]))
     starts = range(0, shape[0], slab)
     for start in tracked(starts, len(starts), "cells"):
         stop = min(start + slab, shape[0])
@@ -102,7 +103,7 @@ def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] 
             x, y, z = (unit * n).long().clamp(0, n - 1).unbind(1)
             asked &= occupied[x, y, z]
         found = torch.zeros(len(places), device=system.device)
-        found[asked] = torch.cat([system.field.density(part) for part in places[asked].split(ASKED)])
+        found[asked] = torch.cat([system.field.density(part) for part in places[asked].split(asked_together)])
         volume.density[start:stop] = found.view(stop - start, *shape[1:]).cpu()
     return replace(volume, density=volume.density.nan_to_num(0.0).clamp_min(0.0))
 

@@ -18,4 +18,5 @@ class Order:
     scale: Annotated[float, AtLeast(0.001)]
     channels: str | list[str]
     output: str | None
+    device: str
     photos: str | None

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from nerf_lightning.callbacks.panels import panel
 from nerf_lightning.dataset import RayDataModule
+from nerf_lightning.device import synchronize, the_device
 from nerf_lightning.errors import InputError
+from nerf_lightning.machine import device_in_words
 from nerf_lightning.open_run import SceneRun, beside, open_scene_run
 from nerf_lightning.render.film import Picture, check_output, make_film
 from nerf_lightning.render.frame import CHANNELS, ERROR_TIMES, Style, depth_range, draw, error_picture
@@ -28,17 +29,18 @@ def render(order: Order) -> None:
     """Renders, and says what came of it.
 
     Raises:
-        InputError: where the run, an option, or the place for the film is no good.
+        InputError: where the device, the run, an option, or the place for the film is no good.
     """
     began = time.perf_counter()
+    device = the_device(order.device)
     source = Path(order.run).expanduser()
     channels = the_channels(order.channels)
     output = the_output(order, source)
     check_output(output, order.background == "transparent")
-    found = open_scene_run(source)
+    found = open_scene_run(source, device)
     route = the_route(order, found)
     background = the_background(order, found.system, route)
-    found.system.renderer.colour = torch.tensor(background or BLACK)
+    found.system.renderer.colour = found.system.renderer.colour.new_tensor(background or BLACK)
     depths = depth_range(found.system, route.cameras) if "depth" in channels else (0.0, 1.0)
     style = Style(channels, background, depths)
     plan = the_plan(order, found.system, route, style)
@@ -47,10 +49,13 @@ def render(order: Order) -> None:
     there = make_film(
         plan, lambda index: draw_one(found.system, route, index, style), len(route.cameras), output, order.fps
     )
+    synchronize(device)
     seconds = time.perf_counter() - began
     size = f"{route.cameras.width} x {route.cameras.height}"
     before = f", {there} of them there already" if there else ""
-    print(f"{output}: {len(route.cameras)} frames of {size} pixels in {seconds:.1f} s{before}")
+    print(
+        f"{output}: {len(route.cameras)} frames of {size} pixels in {seconds:.1f} s on {device_in_words(device)}{before}"
+    )
 
 
 def the_channels(given: str | list[str]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.build import budget_options, build_system, build_trainer, frame_of, resolved
+from nerf_lightning.build import budget_options, build_system, build_trainer, device_of, frame_of, resolved
 from nerf_lightning.callbacks import Budget
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.evenly import evenly
@@ -81,18 +81,19 @@ def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = No
     """Trains a system, from what a smaller one has learned.
 
     Returns:
-        The system, and the seconds it took.
+        The system, on the device that trained it, and the seconds it took.
     """
     prepare_process(cfg.seed, cfg.threads, cfg.kernels)
     if isinstance(data, RayDataModule):
         data.rays = data.first_rays
-    system = build_system(cfg, frame_of(data))
+    device = device_of(cfg)
+    system = build_system(cfg, frame_of(data), device).to(device)
     if start is not None:
         system.take(start)
-    trainer = build_trainer(cfg, folder)
-    warm_up(system, data)
+    trainer = build_trainer(cfg, folder, device)
+    warm_up(system, data, device)
     trainer.fit(system, data)
-    return system.eval(), Budget.of(trainer).seconds
+    return system.to(device).eval(), Budget.of(trainer).seconds
 
 
 def quality(system: System, data: Data) -> float:
@@ -141,7 +142,7 @@ def settle(system: NeRF3D) -> None:
     """Lets a new sampler find out where the field is dense."""
     for look in range(LOOKS):
         step = look * getattr(system.sampler, "update_every", 1)
-        system.sampler.update(step, system.field.density, step_generator(system.seed, 4, look))
+        system.sampler.update(step, system.field.density, step_generator(system.seed, 4, look, system.device))
 
 
 def coarsest_sampler(
@@ -160,9 +161,10 @@ def coarsest_sampler(
         return {}
     scores = []
     for options in samplers:
-        probe = build_system(set_options(cfg, "sampler", options), frame_of(data))
+        probe = build_system(set_options(cfg, "sampler", options), frame_of(data), system.device)
         assert isinstance(probe, NeRF3D)  # of the same data
         probe.field = system.field
+        probe.to(system.device)
         probe.sampler.look_through(data.scene.train.cameras)
         settle(probe)
         scores.append(quality(probe.eval(), data))

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from nerf_lightning.callbacks.panels import write_png
 from nerf_lightning.files import atomic, write_json
 from nerf_lightning.ink import BLUE, DPI, GREY, ORANGE, VERMILLION, pixels_of
+from nerf_lightning.machine import describe_machine
 from nerf_lightning.rightsize.choose import knee
 from nerf_lightning.rightsize.climb import Rung, set_options
 from nerf_lightning.rightsize.ladder import overrides
@@ -69,6 +70,8 @@ def as_json(found: Found) -> dict[str, Any]:
         "reached": found.reached,
         "reason": found.reason,
         "knee": knee([rung.measured for rung in found.rungs]),
+        "device": str(found.device),
+        "machine": describe_machine(found.device),
         "noise_db": round(found.noise, 4),
         "search_seconds": round(found.seconds, 3),
         "wall_seconds": round(found.wall_seconds, 3),

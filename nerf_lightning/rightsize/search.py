@@ -6,14 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.build import build_data
+from nerf_lightning.build import build_data, device_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.export.smallest import Compact, smallest
 from nerf_lightning.files import atomic
 from nerf_lightning.kernels import use_kernels
+from nerf_lightning.limits import limits_of
 from nerf_lightning.rightsize.choose import Target, best_of, candidate, chosen, climbed_enough, expected, next_to_train
 from nerf_lightning.rightsize.climb import Rung, climb, coarsest_sampler, compact_bytes, set_options, spread
 from nerf_lightning.rightsize.ladder import Ladder, Options
@@ -58,18 +60,22 @@ class Found:
     """Of training, climbing and all."""
     wall_seconds: float
     compact: Compact
+    device: torch.device
+    """Where all of it was done."""
 
 
 def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Found:
     """Finds the smallest rung that is good enough, and leaves it trained in full, with its compact file.
 
     Raises:
-        InputError: where the data, or an option of the ladder, is no good.
+        InputError: where the device is not there, or the data, or an option of the ladder, is no good.
     """
     began = time.perf_counter()
+    device = device_of(cfg)
     quiet()
     use_kernels(cfg.kernels)
     data = build_data(cfg)
+    data.enlarge(limits_of(cfg, device).batch)
     for doubt in check_scene(data.scene) if isinstance(data, RayDataModule) else []:
         print(f"{data.scene.name}: {doubt}", flush=True)
     rungs: list[Rung] = []
@@ -107,7 +113,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     tried = {index: one.psnr for index, one in full.items()}
     found = chosen(tried, best, target)
     choice = found if found is not None else max(tried, key=lambda index: tried[index])
-    run = load_run(full[choice].folder)
+    run = load_run(full[choice].folder, device=device)
     compact = smallest(run.system, data, plain_config(run.cfg), COMPACT_LOSS)
     with atomic(output / "compact.npz") as temporary:
         temporary.write_bytes(compact.content)
@@ -115,7 +121,9 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     if target.psnr is not None and 0 < choice < len(rungs) and choice - 1 not in tried:
         reason += f"; rung {choice - 1} would be expected at {expected(choice - 1, tried, measured):.1f} dB"
     wall = time.perf_counter() - began
-    return Found(target, ladder, rungs, full, choice, found is not None, reason, noise, sampler, seconds, wall, compact)
+    return Found(
+        target, ladder, rungs, full, choice, found is not None, reason, noise, sampler, seconds, wall, compact, device
+    )
 
 
 def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Any, folder: Path) -> Full:
@@ -123,7 +131,7 @@ def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Any, 
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
     train(whole, folder=folder)
     results = read_run(folder).results
-    run = load_run(folder)
+    run = load_run(folder, device=device_of(cfg))
     size = compact_bytes(run.cfg, run.system, data)
     return Full(folder, results["psnr"], results["train_seconds"], size, results["parameters"])
 

@@ -125,6 +125,7 @@ def _train(cell: Cell, folder: Path) -> Outcome:
         f"dataset.path='{path}'",
         f"seed={cell.seed}",
         "threads=1",
+        "device=cpu",  # cells are small, and stand side by side
         f"budget.steps={cell.steps}",
     ]
     given += ["~logger", "callbacks.snapshots.steps=[]", "callbacks.heldout=null", "callbacks.checkpoints=null"]

@@ -15,7 +15,8 @@ def decibels(mse: float) -> float:
 
 def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> float:
     """Peak signal-to-noise ratio in dB, 10 log10(1 / MSE), of pictures in [0, 1]."""
-    return decibels(float(torch.mean((image.double() - truth.double()) ** 2)))
+    first, second = (x.cpu().double() for x in (image, truth))  # not every device has doubles
+    return decibels(float(torch.mean((first - second) ** 2)))
 
 
 SSIM_WINDOW = 11

@@ -7,11 +7,12 @@ from torch import Tensor
 from nerf_lightning.dataset import PictureBatch, PixelBatch
 from nerf_lightning.model import PictureField
 from nerf_lightning.system.metrics import psnr
-from nerf_lightning.system.system import MakeOptimizer, Schedule, StepStats, System
+from nerf_lightning.system.system import CHUNK, MakeOptimizer, Schedule, StepStats, System
 
-RENDER_CHUNK = 1 << 16
-"""Pixels rendered together without gradient."""
-
+PIXELS = 2
+"""So many pixels are rendered together for each sample of a scene that would be."""
+LOOKED = 1 << 16
+"""Most pixels, about, at which rectifiers are looked at."""
 SATURATED = 1 / 255
 """From 0 or 1, where the slope of a sigmoid is less than a fiftieth of its largest."""
 
@@ -21,13 +22,15 @@ class NeRF2D(System):
 
     Args:
         field: place -> rgb.
-        optimizer, schedule, seed: see `System`.
+        optimizer, schedule, seed, chunk: see `System`.
     """
 
     field: PictureField
 
-    def __init__(self, field: PictureField, optimizer: MakeOptimizer, schedule: Schedule, seed: int = 0):
-        super().__init__(optimizer, schedule, seed)
+    def __init__(
+        self, field: PictureField, optimizer: MakeOptimizer, schedule: Schedule, seed: int = 0, chunk: int = CHUNK
+    ):
+        super().__init__(optimizer, schedule, seed, chunk)
         self.field = field
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -50,7 +53,7 @@ class NeRF2D(System):
     @torch.no_grad()
     def colours(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         """The field's colours at any places, a chunk at a time, cut to [0, 1]."""
-        return torch.cat([self.field(part).clamp(0, 1) for part in uv.split(RENDER_CHUNK)])
+        return torch.cat([self.field(part).clamp(0, 1) for part in uv.split(PIXELS * self.chunk)])
 
     def between(self, view: PictureBatch) -> float | None:
         """PSNR where four pixels meet, against their mean: far below that of the pixels, the field runs wild between them.
@@ -86,7 +89,7 @@ def dead_rectifiers(field: PictureField, uv: Float[Tensor, "N 2"]) -> list[float
     alive: list[Tensor] = []
     layers = [module for module in field.modules() if isinstance(module, torch.nn.ReLU)]
     hooks = [layer.register_forward_hook(lambda _, __, out: alive.append((out > 0).any(0))) for layer in layers]
-    field(uv[:: max(1, len(uv) // RENDER_CHUNK)])
+    field(uv[:: max(1, len(uv) // LOOKED)])
     for hook in hooks:
         hook.remove()
     return [1 - float(units.float().mean()) for units in alive]

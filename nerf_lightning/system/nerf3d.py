@@ -11,10 +11,10 @@ from nerf_lightning.model import Field
 from nerf_lightning.renderer import Rendered, VolumeRenderer
 from nerf_lightning.sampler import Sampler, split
 from nerf_lightning.seeding import step_generator
-from nerf_lightning.system.system import MakeOptimizer, Schedule, StepStats, System
+from nerf_lightning.system.system import CHUNK, MakeOptimizer, Schedule, StepStats, System
 
-RENDER_RAYS, RENDER_SAMPLES = 4096, 1 << 15
-"""Rays sampled, and samples rendered, together without gradient: bounds the memory of a view, whatever its size."""
+RAYS = 8
+"""One ray is sampled for so many samples that are rendered together."""
 
 
 class NeRF3D(System):
@@ -24,7 +24,7 @@ class NeRF3D(System):
         field: position, direction -> density, rgb.
         sampler: rays -> samples.
         renderer: samples -> pixels.
-        optimizer, schedule, seed: see `System`.
+        optimizer, schedule, seed, chunk: see `System`.
     """
 
     field: Field
@@ -37,8 +37,9 @@ class NeRF3D(System):
         optimizer: MakeOptimizer,
         schedule: Schedule,
         seed: int = 0,
+        chunk: int = CHUNK,
     ):
-        super().__init__(optimizer, schedule, seed)
+        super().__init__(optimizer, schedule, seed, chunk)
         self.field = field
         self.sampler = sampler
         self.renderer = renderer
@@ -88,16 +89,21 @@ class NeRF3D(System):
         self.trainer.datamodule.adapt(drawn)  # type: ignore[attr-defined]
         return loss
 
+    @property
+    def chunk_rays(self) -> int:
+        """Rays sampled together without gradient."""
+        return max(1, self.chunk // RAYS)
+
     @torch.no_grad()
     def render(self, rays: Rays, near: float = 0.0, far: float = math.inf) -> Rendered:
         """Renders rays without gradient and without chance, a chunk at a time; what is nearer or farther is cut away."""
         parts = []
-        for start in range(0, len(rays), RENDER_RAYS):
-            chunk = rays[start : start + RENDER_RAYS]
+        for start in range(0, len(rays), self.chunk_rays):
+            chunk = rays[start : start + self.chunk_rays]
             found = self.sampler(chunk, self.field.density)
             if near > 0 or far < math.inf:
                 found = found.between(near, far)
-            for run, samples in split(found, RENDER_SAMPLES):
+            for run, samples in split(found, self.chunk):
                 parts.append(self.renderer(chunk[run], samples, self.field))
         return Rendered(*(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "depth")))
 

@@ -11,12 +11,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.device import synchronize
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system.metrics import psnr, ssim
 
 MakeOptimizer = Callable[[Iterable[torch.nn.Parameter]], torch.optim.Optimizer]
 Schedule = Callable[[float], float]
 """Progress in [0, 1] -> factor on the learning rate."""
+CHUNK = 1 << 15
+"""What is rendered together where nobody says more, see `System`."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +58,17 @@ class System(L.LightningModule):
         optimizer: makes the optimiser from the parameters.
         schedule: factor on its learning rate by progress.
         seed: of all chance in training steps.
+        chunk: samples rendered together without gradient: bounds the memory of a view, whatever its size.
     """
 
     field: Field | PictureField
 
-    def __init__(self, optimizer: MakeOptimizer, schedule: Schedule, seed: int):
+    def __init__(self, optimizer: MakeOptimizer, schedule: Schedule, seed: int, chunk: int):
         super().__init__()
         self.make_optimizer = optimizer
         self.schedule = schedule
         self.seed = seed
+        self.chunk = chunk
         self.progress = 0.0
         """Fraction of the budget done; the Budget callback keeps it."""
         self.rate = 1.0
@@ -114,8 +119,10 @@ class System(L.LightningModule):
     def evaluate(self, view: Any) -> ViewResult:
         """Renders a whole view and judges it."""
         view = view.to(self.device)
+        synchronize(self.device)
         start = time.perf_counter()
         rgb, depth, opacity = self.show(view)
+        synchronize(self.device)
         seconds = time.perf_counter() - start
 
         def image(x: Tensor) -> Tensor:

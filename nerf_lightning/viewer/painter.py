@@ -12,13 +12,14 @@ from numpy import ndarray
 
 from nerf_lightning.callbacks.panels import to_bytes
 from nerf_lightning.cameras import Cameras
+from nerf_lightning.device import synchronize
 from nerf_lightning.evenly import evenly
 from nerf_lightning.render.frame import Style, colours, depth_range
 from nerf_lightning.renderer import Rendered
 from nerf_lightning.system import NeRF3D
 
-SLICE = 1 << 14
-"""Rays between two looks at whether the picture is still wanted."""
+SLICE = 4
+"""So many times what is sampled together is painted between two looks at whether the picture is still wanted."""
 FIRST_SIDE = 24
 """Pixels along the longer side below which no picture is worth sending."""
 
@@ -83,17 +84,19 @@ class Painter:
 
     def paint(self, wish: Wish, side: int, wanted: Callable[[], bool]) -> UInt8[ndarray, "H W 3"] | None:
         """A picture of one size; None where it was no longer wanted before it was done."""
+        device, together = self.system.device, SLICE * self.system.chunk_rays
+        synchronize(device)  # what it still does for others is not the picture's time
         began = time.perf_counter()
-        cameras = wish.cameras(side)
-        rays = cameras.view_rays(0).to(self.system.device)
+        cameras = wish.cameras(side).to(device)
+        rays = cameras.view_rays(0)
         colour = self.system.renderer.colour
         parts = []
         try:
             self.system.renderer.colour = colour.new_tensor(wish.background)
-            for start in range(0, len(rays), SLICE):
+            for start in range(0, len(rays), together):
                 if not wanted():
                     return None
-                parts.append(self.system.render(rays[start : start + SLICE], wish.near, wish.far))
+                parts.append(self.system.render(rays[start : start + together], wish.near, wish.far))
         finally:
             self.system.renderer.colour = colour
         rendered = Rendered(

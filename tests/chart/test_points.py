@@ -6,6 +6,7 @@ import pytest
 from made_runs import MakeRun
 
 from nerf_lightning.chart.points import budget_of, points_of
+from nerf_lightning.chart.setting import setting_of
 from nerf_lightning.runs import read_run
 
 
@@ -55,6 +56,26 @@ def test_other_settings_are_apart_and_the_fullest_comes_first(make_run: MakeRun)
         == "toy 8x6 (abababab), 9 training and 2 held-out views, black background; abacus, 2 threads on 2 cores"
     )
     assert sum("unknown machine" in one for one in words) == 1 and sum("white" in one for one in words) == 1
+
+
+def test_charts_keep_devices_apart(make_run: MakeRun):
+    machine = {"processor": "abacus", "cores": 2, "accelerator": None}
+    card = machine | {"accelerator": "H100"}
+    runs = [
+        make_run("cpu", {"device": "auto", "trainer": {"accelerator": "auto"}}),
+        make_run("cpu_named", {"device": "cpu", "trainer": {"accelerator": "cpu"}}, seed=1),
+        make_run("cuda", device="cuda:0", machine=card),
+        make_run("second_card", device="cuda:1", machine=card),
+        make_run("another_card", device="cuda:0", machine=card | {"accelerator": "A100"}),
+        make_run("nameless", device="mps:0", machine=machine),
+        make_run("nameless_cuda", device="cuda:0", machine=machine),
+        make_run("unknown", device="cuda:0", machine=None),
+    ]
+    told = [setting_of(run).machine for run in runs]
+    assert told[0] == told[1] == "abacus, 2 threads on 2 cores"
+    assert told[2] == told[3] == "H100 (cuda)" and told[4] == "A100 (cuda)"
+    assert len(set(told)) == 6
+    assert len(points_of(runs[:2])) == 1, "seeds of one configuration, however the device was named"
 
 
 def test_a_lost_seed_counts_as_the_worst(make_run: MakeRun):

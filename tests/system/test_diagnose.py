@@ -93,7 +93,7 @@ def test_a_rectifier_is_dead_where_it_is_off_at_every_place(view, monkeypatch):
     assert dead_rectifiers(field, view.uv) == [0.5]
     assert dead_rectifiers(field, view.uv[:-20]) == [0.75]
     assert dead_rectifiers(SirenField(SIZE), view.uv) == []
-    monkeypatch.setattr(nerf2d, "RENDER_CHUNK", 25)
+    monkeypatch.setattr(nerf2d, "LOOKED", 25)
     assert dead_rectifiers(field, view.uv)[0] >= 0.5 and field.asked == 25, "some places of a large picture are enough"
 
 

@@ -1,0 +1,53 @@
+"""Which device does the work, and when it has done it."""
+
+import torch
+
+from nerf_lightning.errors import InputError
+
+CPU = torch.device("cpu")
+
+
+def devices() -> list[str]:
+    """The kinds of devices that are there, best first; the CPU always is. Last comes what somebody registered with torch."""
+    found = [name for name, kind in (("cuda", torch.cuda), ("mps", torch.backends.mps)) if kind.is_available()]
+    own = torch._C._get_privateuse1_backend_name()
+    module = getattr(torch, own, None)
+    registered = own != "privateuseone" and module is not None and module.is_available()
+    return [*found, "cpu", *([own] if registered else [])]
+
+
+def the_device(name: str) -> torch.device:
+    """The device of a name.
+
+    Args:
+        name: "auto" for the best that is there, or cpu, cuda, mps, or the name of a backend registered with torch.
+
+    Raises:
+        InputError: for another name, or one that is not there.
+    """
+    found = devices()
+    if name == "auto":
+        return torch.device(found[0])
+    if name in found:
+        return torch.device(name)
+    raise InputError("config", "device", _missing(name), f"auto, or what is there: {', '.join(found)}", _advice(name))
+
+
+def _missing(name: str) -> str:
+    if name == "cuda":
+        return f"cuda, but {'there is no such card' if torch.backends.cuda.is_built() else 'this PyTorch has no CUDA'}"
+    if name == "mps":
+        return f"mps, but this {'machine' if torch.backends.mps.is_built() else 'PyTorch'} has no MPS"
+    return repr(name)
+
+
+def _advice(name: str) -> str:
+    if name == "cuda" and not torch.backends.cuda.is_built():
+        return "install PyTorch's CUDA build, or give device=auto"
+    return "give device=auto"
+
+
+def synchronize(device: torch.device) -> None:
+    """Waits until a device has done all it was given, so that a clock can be read; a CPU always has."""
+    if device.type != "cpu":
+        torch.get_device_module(device).synchronize()
