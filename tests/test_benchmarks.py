@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks import capture, growth, kernels, methods, overhead
+from benchmarks import capture, cases, growth, methods, overhead
 
 CURVE = [[2.0, 100, 20.0], [8.0, 400, 24.5], [10.5, 500, 26.0], [30.0, 1500, 29.0]]
 
@@ -40,8 +40,8 @@ def test_the_table_has_a_column_for_every_key():
 
 
 def test_one_command_writes_table_and_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
-    monkeypatch.setattr(kernels, "RAYS", 16)
-    monkeypatch.setattr(kernels, "SAMPLES", 64)
+    monkeypatch.setattr(cases, "RAYS", 16)
+    monkeypatch.setattr(cases, "SAMPLES", 64)
     monkeypatch.setattr(overhead, "BLOCKS", 4)
     monkeypatch.setattr(overhead, "FIRST", 1)
     monkeypatch.setattr(overhead, "BLOCK", 3)

@@ -1,0 +1,155 @@
+"""The kernels' work in one training step: what they are called with, and which of that gets a gradient."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning import kernels
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.model import HashGrid, HashGrid2DField, VectorMatrix, VoxelField
+
+SAMPLES, RAYS = 1 << 15, 1 << 12
+STEPS, CELLS = 192, 64
+"""Steps along a ray at most, and cells along a side of the occupancy grid."""
+TRANSPARENT, THIN = 1e-4, 5e-3
+GONE = 1 / 3
+"""Share of the voxels' vertices that are not kept."""
+
+Outputs = Sequence[Tensor]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kernel as a training calls it; which version runs is for `use_kernels` and the inputs' device to say."""
+
+    call: Callable[..., Tensor | Outputs]
+    inputs: tuple[Tensor, ...]
+    """On the CPU."""
+    learns: int = 0
+    """How many of the inputs, from the first, get a gradient."""
+    kind: str = "dense"
+    """What comes out: "dense" tensors of one size; "packed" samples, however many; "located" rows and their weights."""
+
+    def on(self, device: torch.device) -> tuple[Tensor, ...]:
+        """Fresh inputs there, those that learn as leaves."""
+        copies = [x.detach().to(device, copy=True) for x in self.inputs]
+        return tuple(x.requires_grad_() if number < self.learns else x for number, x in enumerate(copies))
+
+    def outputs(self, inputs: tuple[Tensor, ...]) -> list[Tensor]:
+        """What comes out, as a list."""
+        out = self.call(*inputs)
+        return [out] if isinstance(out, Tensor) else list(out)
+
+    def gradients(self, inputs: tuple[Tensor, ...], outputs: list[Tensor], above: list[Tensor]) -> list[Tensor]:
+        """Those of the inputs that learn, `above` being what the outputs' are; none where none does."""
+        learning = inputs[: self.learns]
+        return list(torch.autograd.grad(outputs, learning, above)) if learning else []
+
+
+def march(unbounded: bool, *tensors: Tensor) -> Outputs:
+    origins, directions, aabb, near, far, shift, occupied = tensors
+    rays, bounds = Rays(origins, directions), Bounds(aabb, unbounded)
+    return kernels.march(rays, bounds, near, far, shift, occupied, STEPS, 3.46 / STEPS)
+
+
+def keep_visible(density: Tensor, *packed: Tensor) -> Outputs:
+    t, dt, ray, offsets = packed
+    return kernels.keep_visible(density, (t, dt, ray, offsets), TRANSPARENT, THIN)
+
+
+def mark_cells(marks: Tensor, origins: Tensor, directions: Tensor, aabb: Tensor, ray: Tensor, t: Tensor) -> Tensor:
+    marks = marks.clone()
+    kernels.mark_cells(marks, 3, Rays(origins, directions), Bounds(aabb), ray, t)
+    return marks
+
+
+def mark_rows(seen: Tensor, rows: Tensor, step: Tensor) -> Tensor:
+    seen = seen.clone()
+    kernels.mark_rows(seen, rows, step)
+    return seen
+
+
+def mlp(x: Tensor, *rest: Tensor) -> Tensor:
+    """The layers' matrices and biases in turn, then the extra inputs."""
+    *flat, extra = rest
+    return kernels.mlp(x, list(zip(flat[::2], flat[1::2], strict=True)), extra)
+
+
+def roughness(values: Tensor, vertex: Tensor, index: Tensor) -> Tensor:
+    return kernels.roughness(values, vertex, index, 1, len(vertex))
+
+
+def hash_interpolate(resolutions: list[int], sizes: list[int], tables: Tensor, unit: Tensor) -> Tensor:
+    return kernels.hash_interpolate(tables, unit, resolutions, sizes)
+
+
+def hash_interpolate_2d(resolutions: list[tuple[int, int]], sizes: list[int], tables: Tensor, unit: Tensor) -> Tensor:
+    return kernels.hash_interpolate_2d(tables, unit, resolutions, sizes)
+
+
+def toward_a_ball(unbounded: bool) -> tuple[Tensor, ...]:
+    """Rays from a sphere of radius 4 toward the middle of a box, the box, where rays begin and end, their shifts, and a ball
+    of occupied cells: what `march` takes."""
+    origins = 4 * normalize(torch.randn(RAYS, 3), dim=1)
+    directions = normalize(0.5 * torch.randn(RAYS, 3) - origins, dim=1)
+    axis = (torch.arange(CELLS) + 0.5) / (CELLS / 2) - 1
+    ball = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2 < 0.1).flatten()
+    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded)
+    return origins, directions, box.aabb, *box.near_far(Rays(origins, directions)), torch.rand(RAYS), ball
+
+
+def sparse(field: VoxelField) -> None:
+    """Leaves out some of a field's vertices, and gives the others something to tell."""
+    keep = torch.rand(len(field.index)) > GONE
+    rows = 1 + int(keep.sum())
+    field.hold(keep, [torch.randn(rows, *table.shape[1:]) for table in field.tables])
+
+
+def cases() -> dict[str, Case]:
+    """All kernels by name."""
+    torch.manual_seed(0)
+    bounded, unbounded = (toward_a_ball(boundless) for boundless in (False, True))
+    origins, directions, aabb = bounded[:3]
+    packed = tuple(march(False, *bounded))
+    t, dt, ray, _ = packed
+    density, rgb = torch.rand(len(t)), torch.rand(3, len(t)).T
+    unit = Bounds(aabb).to_unit(kernels.points(origins, directions, ray, t))[:SAMPLES]
+    seen_from = directions[ray][:SAMPLES]
+    harmonics = kernels.spherical_harmonics(seen_from)
+    grid, picture = HashGrid(), HashGrid2DField((512, 512))
+    layers = [torch.nn.Linear(i, o) for i, o in ((31, 32), (32, 32), (32, 3))]
+    flat = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
+    factors = VectorMatrix(128, 16)
+    voxels = VoxelField(Bounds(aabb), coarsest=64, finest=64, stages=1)
+    sparse(voxels)
+    rows, weights = kernels.locate(voxels.index, unit)
+    marks, step = torch.zeros(CELLS**3, dtype=torch.int32), torch.tensor(3, dtype=torch.int32)
+    return {
+        "march": Case(partial(march, False), bounded, kind="packed"),
+        "march, unbounded": Case(partial(march, True), unbounded, kind="packed"),
+        "points": Case(kernels.points, (origins, directions, ray, t)),
+        "keep_visible": Case(keep_visible, (density, *packed), kind="packed"),
+        "mark_cells": Case(mark_cells, (marks, origins, directions, aabb, ray, t)),
+        "hash_interpolate": Case(
+            partial(hash_interpolate, grid.resolutions, grid.sizes), (grid.tables, unit), learns=1
+        ),
+        "hash_interpolate_2d": Case(
+            partial(hash_interpolate_2d, picture.resolutions, picture.sizes),
+            (picture.tables, torch.rand(SAMPLES, 2)),
+            learns=1,
+        ),
+        "mlp": Case(mlp, (torch.rand(15, len(unit)).T, *flat, harmonics), learns=1 + len(flat)),
+        "spherical_harmonics": Case(kernels.spherical_harmonics, (seen_from,)),
+        "plane_line_products": Case(kernels.plane_line_products, (factors.planes, factors.lines, unit), learns=2),
+        "plane_line_sum": Case(kernels.plane_line_sum, (factors.planes, factors.lines, unit), learns=2),
+        "locate": Case(kernels.locate, (voxels.index, unit), kind="located"),
+        "mark_rows": Case(mark_rows, (voxels.seen, rows, step)),
+        "read_voxels": Case(kernels.read_voxels, (*voxels.tables, rows, weights, harmonics[:, 1:4]), learns=3),
+        "voxel_value": Case(kernels.voxel_value, (voxels.log_density, voxels.index, unit)),
+        "roughness": Case(roughness, (voxels.log_density, voxels.vertex, voxels.index), learns=1),
+        "composite": Case(kernels.composite, (density, rgb, *packed), learns=2),
+    }
