@@ -1,8 +1,12 @@
-"""python -m benchmarks: what methods, kernels, framework, capture, 2D fields, sizes and shapes cost, and how well they do."""
+"""python -m benchmarks: what methods, kernels, framework, capture, 2D fields, sizes and shapes cost, and how well they do.
+
+`python -m benchmarks device` tells whether the GPU at hand gives what the CPU gives, and how fast: its last line says it.
+"""
 
 import argparse
 import os
 import platform
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -10,10 +14,15 @@ from typing import Any
 import torch
 
 import nerf_lightning
-from benchmarks import capture, growth, kernels, methods, overhead, pictures, shapes, sizes
+from benchmarks import capture, device, growth, kernels, methods, overhead, pictures, shapes, sizes
+from nerf_lightning.device import the_device
+from nerf_lightning.errors import InputError
 from nerf_lightning.files import write_json
+from nerf_lightning.machine import describe_machine
 
 PARTS = ("methods", "kernels", "growth", "overhead", "capture", "pictures", "sizes", "shapes")
+ALONE = ("device",)
+"""Runs only when it is named."""
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -35,18 +44,23 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    chosen = f"which of {', '.join(PARTS)} (all by default), and overrides KEY=VALUE for all runs"
+    chosen = f"which of {', '.join(PARTS)} (all by default), or device; and overrides KEY=VALUE for all runs"
     parser.add_argument("parts", nargs="*", metavar="part", help=chosen)
     parser.add_argument("--experiments", default="lego,lego_hashgrid,lego_voxels", help="experiments to train")
     parser.add_argument("--budgets", default="60", help="seconds of training, separated by commas")
     parser.add_argument("--seeds", default="0,1,2")
+    parser.add_argument("--device", default="auto", help="of the part device: auto, cpu, cuda or mps")
     parser.add_argument("--output", type=Path, default=Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S"))
     arguments = parser.parse_intermixed_args()  # overrides may stand behind options
     overrides = [part for part in arguments.parts if "=" in part]
     parts = [part for part in arguments.parts if "=" not in part] or list(PARTS)
-    unknown = sorted(set(parts) - set(PARTS))
+    unknown = sorted(set(parts) - {*PARTS, *ALONE})
     if unknown:
-        parser.error(f"found {unknown[0]}, expected some of {', '.join(PARTS)}, or overrides KEY=VALUE")
+        parser.error(f"found {unknown[0]}, expected some of {', '.join([*PARTS, *ALONE])}, or overrides KEY=VALUE")
+    try:
+        chosen_device = the_device(arguments.device)
+    except InputError as error:
+        parser.error(str(error))
     budgets, seeds = [float(x) for x in arguments.budgets.split(",")], [int(x) for x in arguments.seeds.split(",")]
     experiments = arguments.experiments.split(",")
     report: dict[str, Any] = {
@@ -61,10 +75,18 @@ def main() -> None:
         },
         "overrides": overrides,
     }
-    text = []
+    text: list[str] = []
+    unequal: list[str] | None = None
     for part in parts:
         tables: dict[str, list[dict[str, Any]]]
-        if part == "capture":
+        if part == "device":
+            report["device"] = {"name": str(chosen_device), **describe_machine(chosen_device)}
+            print(
+                f"device: {report['device']['accelerator'] or report['device']['processor']} ({chosen_device})",
+                flush=True,
+            )
+            tables, unequal = device.measure(chosen_device, overrides, budgets[0], seeds[0], arguments.output)
+        elif part == "capture":
             tables = capture.measure(seeds, arguments.output)
         elif part == "pictures":
             tables = pictures.measure(overrides, seeds, arguments.output)
@@ -89,6 +111,9 @@ def main() -> None:
     (arguments.output / "table.txt").write_text("\n".join(text))
     write_json(arguments.output / "benchmarks.json", report)
     print(f"written to {arguments.output}")
+    if unequal is not None:
+        print(device.verdict(unequal))
+        sys.exit(bool(unequal))
 
 
 if __name__ == "__main__":

@@ -12,16 +12,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.cases import Case, cases
-from benchmarks.kernels import case_milliseconds, random_like, versions
+from benchmarks.cases import Case, cases, versions
+from benchmarks.kernels import case_milliseconds, random_like
 
 APART = 1e-4
 """Largest difference of floating numbers that counts as equal, as a share of the largest of them."""
 OTHERS = 1e-3
 """Share of whole numbers, or of samples, that may be others altogether."""
 
+FAILURES = (RuntimeError, TypeError)
+"""How torch says that a device cannot do something, or has no room for it."""
+
 Rows = list[dict[str, Any]]
 CPU = torch.device("cpu")
+
+
+def told(error: Exception) -> str:
+    """A failure in one line."""
+    return f"failed: {' '.join(str(error).split())[:200]}"
 
 
 def worst(shares: list[float]) -> float:
@@ -74,11 +82,11 @@ def packed(got: list[Tensor], wanted: list[Tensor]) -> tuple[float, float]:
         return math.inf, 1.0
     if not (len(places[0]) and len(places[1])):
         return 0.0, float(len(places[0]) != len(places[1]))
-    (ours, near), (theirs, _) = _nearest(places[0], places[1]), _nearest(places[1], places[0])
-    found = [distance <= APART * longest for distance in (ours, theirs)]
-    lonely = sum(int((~x).sum()) for x in found)
-    length = apart(got[1][found[0]], wanted[1][near[found[0]]])
-    return worst([float(ours[found[0]].max()) / longest if found[0].any() else 0.0, length]), lonely / len(places[1])
+    (off, counterpart), (theirs, _) = _nearest(places[0], places[1]), _nearest(places[1], places[0])
+    met, lonely = off <= APART * longest, int((~(theirs <= APART * longest)).sum())
+    lengths = apart(got[1][met], wanted[1][counterpart[met]])
+    share = (int((~met).sum()) + lonely) / len(places[1])
+    return worst([*(off[met] / longest).tolist(), lengths]), share
 
 
 def _nearest(places: Tensor, among: Tensor) -> tuple[Tensor, Tensor]:
@@ -122,7 +130,7 @@ def compared(case: Case, device: torch.device) -> tuple[dict[str, Any], str]:
     if not value <= APART:
         found.append(f"value, {few(value)} apart")
     if not other <= OTHERS:
-        found.append(f"value, {100 * other:.2g}% of entries are others")
+        found.append(f"value, {100 * other:.3g}% of entries are others")
     if not gradient <= APART:
         found.append(f"gradient, {few(gradient)} apart")
     row = {"value_apart": value, "entries_other": other, "gradient_apart": gradient if case.learns else None}
@@ -140,8 +148,8 @@ def measure(device: torch.device) -> tuple[Rows, list[str]]:
             figures, found = compared(case, device)
             ours, plain = (case_milliseconds(case, device, x, case.learns > 0) for x in ("auto", "reference"))
             row |= {**figures, "device_ms": ours, "reference_ms": plain, "times_faster": plain / ours}
-        except (RuntimeError, TypeError) as error:  # what a device cannot do is told as one of these
-            found = f"failed: {' '.join(str(error).split())[:200]}"
+        except FAILURES as error:
+            found = told(error)
         rows.append({**row, "equal": not found})
         if found:
             unequal.append(f"{name} ({found})")

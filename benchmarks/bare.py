@@ -5,6 +5,7 @@ import time
 import torch
 
 from nerf_lightning.dataset import RayDataModule
+from nerf_lightning.device import synchronize
 from nerf_lightning.seeding import step_generator
 from nerf_lightning.system import NeRF3D
 
@@ -12,17 +13,19 @@ from nerf_lightning.system import NeRF3D
 def bare_step(
     system: NeRF3D, data: RayDataModule, optimizer: torch.optim.Optimizer, step: int, progress: float
 ) -> float:
-    """One step as NeRF3D does it under a Trainer. Returns its seconds."""
+    """One step as NeRF3D does it under a Trainer, on the system's device. Returns its seconds."""
+    synchronize(system.device)
     start = time.perf_counter()
     system.progress = progress
     for group in optimizer.param_groups:
         group["lr"] = group["initial_lr"] * system.schedule(progress)
     for parameter in system.field.grow(progress):
         optimizer.state.pop(parameter, None)
-    batch = data.draw(step)
+    batch = data.draw(step).to(system.device)
     optimizer.zero_grad()
-    loss, stats = system.loss(batch, step_generator(system.seed, 1, step, system.device), step)
+    loss, system.stats = system.loss(batch, step_generator(system.seed, 1, step, system.device), step)
     loss.backward()
     optimizer.step()
-    data.adapt(stats.samples)
+    data.adapt(system.stats.samples)
+    synchronize(system.device)
     return time.perf_counter() - start

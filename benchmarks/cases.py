@@ -1,6 +1,7 @@
 """The kernels' work in one training step: what they are called with, and which of that gets a gradient."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 
@@ -48,6 +49,16 @@ class Case:
         """Those of the inputs that learn, `above` being what the outputs' are; none where none does."""
         learning = inputs[: self.learns]
         return list(torch.autograd.grad(outputs, learning, above)) if learning else []
+
+
+@contextmanager
+def versions(choice: str) -> Iterator[None]:
+    """What `use_kernels` says, for a while."""
+    kernels.use_kernels(choice)
+    try:
+        yield
+    finally:
+        kernels.use_kernels("auto")
 
 
 def march(unbounded: bool, *tensors: Tensor) -> Outputs:
@@ -109,8 +120,9 @@ def sparse(field: VoxelField) -> None:
     field.hold(keep, [torch.randn(rows, *table.shape[1:]) for table in field.tables])
 
 
+@versions("reference")
 def cases() -> dict[str, Case]:
-    """All kernels by name."""
+    """All kernels by name; what some take from others comes from the references."""
     torch.manual_seed(0)
     bounded, unbounded = (toward_a_ball(boundless) for boundless in (False, True))
     origins, directions, aabb = bounded[:3]

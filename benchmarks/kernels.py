@@ -1,36 +1,24 @@
 """Each kernel's fast version against its plain-torch reference, on the work of one training step."""
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from statistics import median
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from benchmarks.cases import Case, cases
+from benchmarks.cases import Case, cases, versions
 from nerf_lightning.device import synchronize
-from nerf_lightning.kernels import use_kernels
 
 ROUNDS = 15
 
 
-@contextmanager
-def versions(choice: str) -> Iterator[None]:
-    """What `use_kernels` says, for a while."""
-    use_kernels(choice)
-    try:
-        yield
-    finally:
-        use_kernels("auto")
-
-
-def milliseconds(work: Callable[[], object], device: torch.device, rounds: int = ROUNDS) -> float:
+def milliseconds(work: Callable[[], object], device: torch.device) -> float:
     """Median time of a call, after two to warm up."""
     work(), work()
     times = []
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         synchronize(device)
         start = time.perf_counter()
         work()

@@ -9,7 +9,7 @@ from typing import Any
 
 TARGETS_DB = (24, 27, 30)
 MOMENTS = (10, 30, 60, 300)
-CHECKS = (2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 180, 240)
+CHECKS = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 180, 240)
 """Seconds of training after which a run is measured, where its budget is longer."""
 
 Run = dict[str, Any]

@@ -1,12 +1,17 @@
 import json
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+from torch import Tensor
 
 from benchmarks import __main__ as command
-from benchmarks import capture, cases, growth, methods, overhead
+from benchmarks import alike, capture, cases, device, growth, methods, overhead, steps, trainings
+from benchmarks import kernels as timing
+from nerf_lightning import kernels
 
 CURVE = [[2.0, 100, 20.0], [8.0, 400, 24.5], [10.5, 500, 26.0], [30.0, 1500, 29.0]]
 
@@ -86,3 +91,145 @@ def test_errors_of_a_capture_are_told_in_the_true_frame():
     world = {tag: to_first @ pose for tag, pose in shifted.items()}
     solved = SimpleNamespace(tags=world, fixed=frozenset({2}))
     assert capture.layout_error(solved, layout) == pytest.approx(1.0)
+
+
+@pytest.fixture
+def few_samples(monkeypatch: pytest.MonkeyPatch):
+    """Kernels' cases that take no time."""
+    monkeypatch.setattr(cases, "RAYS", 64)
+    monkeypatch.setattr(cases, "SAMPLES", 256)
+    monkeypatch.setattr(timing, "ROUNDS", 1)
+
+
+def spoil(monkeypatch: pytest.MonkeyPatch, name: str, how: Callable[[Tensor], Tensor]) -> None:
+    """Spoils the version of a kernel that trainings run, and leaves the reference as it is."""
+    right = getattr(kernels, name)
+    monkeypatch.setattr(kernels, name, lambda *given: how(right(*given)) if kernels.fast(given[0]) else right(*given))
+
+
+def test_kernels_that_agree_are_all_equal(few_samples: None):
+    rows, unequal = alike.measure(alike.CPU)
+    assert unequal == [] and device.verdict(unequal) == "all equal"
+    assert all(row["equal"] and row["device_ms"] > 0 and row["reference_ms"] > 0 for row in rows)
+    assert {"march, unbounded", "plane_line_sum", "mark_cells", "voxel_value"} <= {row["kernel"] for row in rows}
+
+
+def test_kernels_whose_value_or_gradient_is_wrong_are_named(few_samples: None, monkeypatch: pytest.MonkeyPatch):
+    def refuse(x: Tensor) -> Tensor:
+        raise NotImplementedError("not on\nthis device")
+
+    spoil(monkeypatch, "hash_interpolate", lambda x: x + 0.03 * (x - x.detach()))
+    spoil(monkeypatch, "spherical_harmonics", lambda x: x * (1 + 1e-3))
+    spoil(monkeypatch, "points", lambda x: x * torch.nan)
+    spoil(monkeypatch, "voxel_value", refuse)
+    _, unequal = alike.measure(alike.CPU)
+    assert unequal == [
+        "points (value, nan apart)",
+        "hash_interpolate (gradient, 3.0e-2 apart)",
+        "spherical_harmonics (value, 1.0e-3 apart)",
+        "voxel_value (failed: not on this device)",
+    ]
+    assert device.verdict(unequal[1:2]) == "not equal: hash_interpolate (gradient, 3.0e-2 apart)"
+
+
+def samples_on_two_rays(*distances: float) -> list[Tensor]:
+    """As packed: those below 10 on the first ray, 10 less of the others on the second."""
+    along = torch.tensor(distances, dtype=torch.float32)
+    t, ray = along % 10, (along >= 10).long()
+    return [t, torch.ones_like(t), ray, torch.tensor([0, int((ray == 0).sum()), len(ray)])]
+
+
+def test_samples_are_compared_with_their_counterparts_on_the_same_ray():
+    wanted = samples_on_two_rays(1, 2, 3, 11, 12)
+    assert alike.packed(samples_on_two_rays(1, 2.00001, 3, 11, 12), wanted)[1] == 0
+    assert alike.packed(samples_on_two_rays(1, 3, 11, 12), wanted) == (0, 0.2)
+    assert alike.packed(samples_on_two_rays(1, 2, 3, 12), wanted) == (0, 0.2)
+    assert alike.packed(samples_on_two_rays(1, 2, 3, 11, 13), wanted) == (0, 0.4)
+    longer = samples_on_two_rays(1, 2, 3, 11, 12)
+    longer[1][4] = 1.5
+    assert alike.packed(longer, wanted) == (0.5, 0)
+    longer[3][1] = 2
+    assert alike.packed(longer, wanted)[1] == 1, "offsets that do not fit the rays"
+
+
+def test_entries_that_are_others_count_among_those_that_are_not_zero():
+    assert alike.others(torch.tensor([0, 0, 0, 3, 0]), torch.tensor([0, 0, 0, 3, 3])) == 0.5
+    rows, weights = torch.arange(16).view(2, 8), torch.rand(2, 8)
+    assert alike.located([rows + torch.tensor([[0], [1]]), weights + torch.tensor([[0.0], [1]])], [rows, weights]) == (
+        0,
+        0.5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("there", "seeds", "found"),
+    [
+        ([29.8], 1, []),
+        ([29.5, 30.1], 2, []),
+        ([29.2], 4, ["hashgrid (0.8 dB below the CPU)"]),
+        ([31.0], 1, []),
+        ([float("nan")], 4, ["hashgrid (nan dB below the CPU)"]),
+    ],
+)
+def test_a_method_far_below_the_cpu_is_named_with_more_seeds_where_in_doubt(there, seeds, found, monkeypatch, tmp_path):
+    def trained(overrides: list[str], kernels: str, seed: int, *rest: object) -> float:
+        spoilt = "recipe=hashgrid_medium" in overrides and kernels == "auto"
+        return there[min(seed, len(there) - 1)] if spoilt else 30.0
+
+    monkeypatch.setattr(trainings, "trained", trained)
+    rows, unequal = trainings.measure(alike.CPU, 0, tmp_path)
+    assert unequal == found and [row["seeds"] for row in rows] == [1, seeds, 1, 1, 1, 1, 1, 1]
+
+
+def test_short_trainings_of_rays_and_of_pictures_run_with_either_version(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setattr(trainings, "STEPS", 2)
+    monkeypatch.setattr(trainings, "SCENE", ("dataset=bricks", "dataset.size=16", "dataset.train_views=10"))
+    everything = trainings.everything()
+    for name in ("voxels", "hashgrid2d"):
+        quality = [
+            trainings.trained(everything[name], version, 0, alike.CPU, tmp_path / name / version)
+            for version in ("auto", "reference")
+        ]
+        assert quality[0] == pytest.approx(quality[1], abs=0.1) and quality[0] > 1
+    assert capsys.readouterr().out == ""
+
+
+def test_a_step_is_measured_in_time_operations_and_waits(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(steps, "WARMUP", 4)
+    monkeypatch.setattr(steps, "PERIODS", 1)
+    row = steps.of_method(["+experiment=smoke_3d", "dataset.size=16", "dataset.train_views=10"], alike.CPU)
+    assert row["step_ms"] > 0 and row["operations_on_average"] > row["operations"] > 20
+    assert row["waits"] >= 1 and row["samples"] > row["rays"] > 0 and row["peak_memory_bytes"] > 1e6
+
+
+@pytest.mark.parametrize(
+    ("unequal", "last"),
+    [([], "all equal"), (["march (failed: no)", "mlp (x)"], "not equal: march (failed: no), mlp (x)")],
+)
+def test_the_last_line_and_the_exit_code_say_what_is_not_equal(unequal, last, tmp_path, monkeypatch, capsys):
+    def trained(experiment: str, overrides: list[str], *rest: object) -> dict:
+        assert "trainer.accelerator=cpu" in overrides and "budget.seconds=7.0" in overrides
+        return run(CURVE, scene={"name": "bricks"}, device="cpu")
+
+    monkeypatch.setattr(alike, "measure", lambda *_: ([{"kernel": "mlp", "equal": not unequal}], unequal[:1]))
+    monkeypatch.setattr(trainings, "measure", lambda *_: ([{"method": "mlp"}], unequal[1:]))
+    monkeypatch.setattr(steps, "measure", lambda *_: ([{"method": "mlp", "step_ms": 1.0}], []))
+    monkeypatch.setattr(device, "train", trained)
+    arguments = ["benchmarks", "device", "--device", "cpu", "--budgets", "7", "--output", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", arguments)
+    with pytest.raises(SystemExit) as stopped:
+        command.main()
+    said = capsys.readouterr().out.splitlines()
+    assert said[-2:] == [f"written to {tmp_path}", last] and stopped.value.code == bool(unequal)
+    report = json.loads((tmp_path / "benchmarks.json").read_text())
+    assert report["device"]["name"] == "cpu" and report["device steps"] == [{"method": "mlp", "step_ms": 1.0}]
+    assert [row["method"] for row in report["device lego"]] == ["tensorf", "hashgrid", "voxels", "mlp"]
+    assert report["device lego"][0] | {"seconds_to_27_db": 30.0, "seconds_to_30_db": None} == report["device lego"][0]
+    assert "device kernels" in (tmp_path / "table.txt").read_text()
+
+
+def test_a_device_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.setattr("sys.argv", ["benchmarks", "device", "--device", "abacus"])
+    with pytest.raises(SystemExit) as stopped:
+        command.main()
+    assert stopped.value.code == 2 and "abacus" in capsys.readouterr().err
