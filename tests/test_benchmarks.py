@@ -233,3 +233,15 @@ def test_a_device_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, 
     with pytest.raises(SystemExit) as stopped:
         command.main()
     assert stopped.value.code == 2 and "abacus" in capsys.readouterr().err
+
+
+def test_a_training_that_fails_is_named_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def trained(experiment: str, overrides: list[str], *rest: object) -> dict:
+        if "recipe=voxels_medium" in overrides:
+            raise SystemExit("benchmarks: lego failed: ['no room']")
+        return run(CURVE, scene={"name": "lego"}, device="cpu")
+
+    monkeypatch.setattr(device, "train", trained)
+    rows, failed = device.lego(alike.CPU, [], 7.0, 0, tmp_path)
+    assert failed == ["voxels (its training failed)"] and "no room" in rows[2]["failed"]
+    assert [row.get("scene") for row in rows] == ["lego", "lego", None, "lego"]
