@@ -44,7 +44,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    chosen = f"which of {', '.join(PARTS)} (all by default), or device; and overrides KEY=VALUE for all runs"
+    chosen = f"which of {', '.join(PARTS)} (all by default), or device; and overrides KEY=VALUE for all runs but its short ones"
     parser.add_argument("parts", nargs="*", metavar="part", help=chosen)
     parser.add_argument("--experiments", default="lego,lego_hashgrid,lego_voxels", help="experiments to train")
     parser.add_argument("--budgets", default="60", help="seconds of training, separated by commas")

@@ -47,6 +47,7 @@ def test_the_table_has_a_column_for_every_key():
 def test_one_command_writes_table_and_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     monkeypatch.setattr(cases, "RAYS", 16)
     monkeypatch.setattr(cases, "SAMPLES", 64)
+    monkeypatch.setattr(timing, "ROUNDS", 1)
     monkeypatch.setattr(overhead, "BLOCKS", 4)
     monkeypatch.setattr(overhead, "FIRST", 1)
     monkeypatch.setattr(overhead, "BLOCK", 3)
