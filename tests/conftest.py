@@ -7,6 +7,10 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
+# Before OpenMP starts, here and in processes that tests start: threads that wait would spin, and take the cores from the tests
+# beside them.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 # While the hook below loads a module it looks for all compiled files under a name of its own, those of libraries too, and so
 # would compile thousands again: what takes long to import comes first.
 import cv2  # noqa: F401

@@ -1,4 +1,4 @@
-"""Trains every shipped model for a moment and prints a fingerprint of its weights; run as a process of its own.
+"""Trains every shipped model for a moment and takes a fingerprint of its weights; as a process of its own it prints them.
 
 python every_model.py FOLDER STOP     (interrupted after STOP steps and resumed; 0: in one go)
 """
@@ -41,7 +41,7 @@ class Stop(Exception):
     """Training is to end here."""
 
 
-def main(folder: Path, stop: int) -> None:
+def fingerprints(folder: Path, stop: int) -> dict[str, str]:
     save = Checkpoints.on_train_batch_end
 
     def save_and_stop(self: Checkpoints, trainer: Any, *rest: Any) -> None:
@@ -65,7 +65,7 @@ def main(folder: Path, stop: int) -> None:
             assert json.loads((run / "results.json").read_text())["steps"] == stop
         train(cfg, last if stop else None)
         prints[name] = fingerprint(run / "checkpoints" / "last.ckpt")
-    print(json.dumps(prints))
+    return prints
 
 
 def fingerprint(checkpoint: Path) -> str:
@@ -79,4 +79,4 @@ def fingerprint(checkpoint: Path) -> str:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]))
+    print(json.dumps(fingerprints(Path(sys.argv[1]), int(sys.argv[2]))))

@@ -34,7 +34,7 @@ def a_scene_for(small_scene: tuple[Path, Scene], tmp_path_factory: pytest.TempPa
             return ["dataset.max_side=24"]
         if experiment == "smoke_3d":
             return ["dataset.size=24"]
-        return [f"dataset.path={path}", "dataset.resize=null", "callbacks.orbit.frames=2"]
+        return [f"dataset.path={path}", "dataset.resize=null", "dataset.rays=256", "callbacks.orbit.frames=2"]
 
     return overrides
 
@@ -83,12 +83,14 @@ def test_every_option_of_every_group_runs(group: str, option: str, tmp_path: Pat
     experiment = "picture" if flat else "smoke_3d"
     chosen = f"{group}={option}"
     small = ["dataset.max_side=24"] if flat else ["dataset.size=24"]
+    # Few pixels, rays and pictures: the original network is slow.
+    few = ["dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", "dataset.rays=256"]
+    few += ["callbacks.orbit.frames=2"]
     if group == "model" and option != "hashgrid" and not flat:
-        # The experiment's own deltas speak of the hash grid. Few cells and pictures: the original network is slow.
-        few = ["sampler.resolution=16", "dataset.size=24", "dataset.train_views=4", "dataset.val_views=1"]
-        cfg = composed([chosen, *few, "callbacks.orbit.frames=2"], tmp_path)
+        # The experiment's own deltas speak of the hash grid.
+        cfg = composed([chosen, *few, "sampler.resolution=16"], tmp_path)
     elif group == "sampler" and option != "occupancy":
-        cfg = composed([chosen, "dataset.size=24", "dataset.train_views=4", "dataset.val_views=1"], tmp_path)
+        cfg = composed([chosen, *few], tmp_path)
     else:
         cfg = composed([f"+experiment={experiment}", chosen, *small], tmp_path)
     cfg.trainer.fast_dev_run = True

@@ -4,33 +4,37 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
-from every_model import ANOTHER, MODELS
+import pytest
+import torch
+from every_model import ANOTHER, MODELS, fingerprints
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-def start(folder: Path, stop: int) -> subprocess.Popen[str]:
-    line = [sys.executable, str(ROOT / "tests" / "every_model.py"), str(folder), str(stop)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(line, env={**os.environ, "PYTHONPATH": str(ROOT)}, **pipes)
-
-
-def prints_of(process: subprocess.Popen[str]) -> dict[str, str]:
-    out, err = process.communicate(timeout=300)
-    assert process.returncode == 0, err
-    return json.loads(out.splitlines()[-1])
 
 
 def test_every_shipped_model_is_among_them():
     assert set(MODELS) == {file.stem for file in (ROOT / "conf" / "model").glob("*.yaml")}
 
 
-def test_same_seed_same_weights_in_another_process_and_across_an_interruption(tmp_path: Path):
-    whole, broken = start(tmp_path / "whole", 0), start(tmp_path / "broken", 11)
-    first, second = prints_of(whole), prints_of(broken)
-    assert set(first) == {*MODELS, ANOTHER}
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Runs set them for their whole process; the next test finds them as they were."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def test_same_seed_same_weights_in_another_process_and_across_an_interruption(threads: None, tmp_path: Path):
+    line = [sys.executable, str(ROOT / "tests" / "every_model.py"), str(tmp_path / "broken"), "11"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(line, env={**os.environ, "PYTHONPATH": str(ROOT)}, **pipes) as process:
+        first = fingerprints(tmp_path / "whole", 0)
+        out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    second = json.loads(out.splitlines()[-1])
+    assert set(first) == set(second) == {*MODELS, ANOTHER}
     for name in first:
         assert first[name] == second[name], name
     assert first[ANOTHER] != first["siren"], "another seed must give other weights"

@@ -2,13 +2,10 @@
 
 import csv
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from test_cli import ROOT, command
+from test_cli import command
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3"]
 BARE = ["callbacks.baselines=null", "callbacks.charts=null", "callbacks.training_gif=null", "callbacks.enlarge=null"]
@@ -93,26 +90,18 @@ def test_a_study_is_one_command(inside, tmp_path: Path):
     assert {float(row["optimizer.lr"]) for row in table(root).values()} == {1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1}
 
 
-IN_TURN = """
-import json, sys
-from nerf_lightning.__main__ import main
-for line in json.loads(sys.argv.pop()):
-    sys.argv[1:] = line
-    main()
-"""
-"""Command lines one after the other, in a process of their own: Optuna warns, and here warnings are errors."""
-
-
-def test_optuna_proposes_the_same_trials_again_and_failing_ones_are_recorded(tmp_path: Path):
+@pytest.mark.filterwarnings("ignore")  # Optuna warns, and here warnings are errors
+def test_optuna_proposes_the_same_trials_again_and_failing_ones_are_recorded(inside, tmp_path: Path, capfd):
     line = ["+experiment=tune_picture", "dataset.max_side=16", "budget.steps=2", "hydra.sweeper.n_trials=2", *BARE]
-    lines = json.dumps([line, line, [*line, "model.coarsest=0"]])
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    called = [sys.executable, "-c", IN_TURN, lines]
-    done = subprocess.run(called, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode != 0, "no trial of the last one succeeds"
-    assert done.stdout.count(": starts") == 4 and done.stdout.count("done before") == 2, done.stdout + done.stderr
+    told = [inside(*line), inside(*line)]
+    assert [code for code, _, _ in told] == [0, 0], told
+    assert [out.count(": starts") for _, out, _ in told] == [2, 0]
+    assert [out.count("done before") for _, out, _ in told] == [0, 2]
+    with pytest.raises(ValueError, match="No trials are completed"):
+        inside(*line, "model.coarsest=0")
+    out, err = capfd.readouterr()
+    assert out.count(": starts") == 2 and err.count("failed: config: model.coarsest") == 2
     assert {len(table(path)) for path in (tmp_path / "outputs" / "tune_picture").iterdir()} == {2}
-    assert done.stderr.count("failed: config: model.coarsest") == 2
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])

@@ -27,7 +27,8 @@ def hashgrid(entries: int = 6, width: int = 8, **options: int) -> Field:
     return field
 
 
-def tensorf(components: int = 2, colours: int = 2, finest: int = 6, width: int = 8, degree: int = 3) -> Field:
+def tensorf(components: int = 3, colours: int = 3, finest: int = 6, width: int = 8, degree: int = 3) -> Field:
+    """Of numbers of components that kernels are compiled for anyway."""
     return TensoRFField(BOX, components, colours, finest, finest, stages=1, width=width, degree=degree)
 
 
@@ -47,10 +48,10 @@ SAME = [
     (hashgrid, {}, {"entries": 9}),
     (hashgrid, {}, {"entries": 13, "width": 12}),
     (hashgrid, {"degree": 0}, {"degree": 2, "width": 16}),
-    (tensorf, {}, {"components": 4}),
-    (tensorf, {}, {"colours": 5}),
-    (tensorf, {}, {"finest": 12, "width": 16, "components": 3, "colours": 3}),
-    (tensorf, {"degree": 1}, {"degree": 3, "colours": 4}),
+    (tensorf, {}, {"components": 8}),
+    (tensorf, {}, {"colours": 8}),
+    (tensorf, {}, {"finest": 12, "width": 16, "components": 8, "colours": 8}),
+    (tensorf, {"degree": 1}, {"degree": 3, "colours": 8}),
     (voxels, {}, {"degree": 2}),
     (voxels, {}, {"finest": 12}),
     (mlp, {}, {"width": 24}),

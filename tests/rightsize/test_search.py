@@ -16,7 +16,7 @@ from nerf_lightning.rightsize.__main__ import task
 from nerf_lightning.stability.toys import PILE, toy
 
 RUNGS = [
-    {"density_components": 2, "colour_components": 2, "coarsest": 4, "finest": 4, "width": 8, "stages": 1},
+    {"density_components": 3, "colour_components": 3, "coarsest": 4, "finest": 4, "width": 8, "stages": 1},
     {"density_components": 8, "colour_components": 8, "coarsest": 8, "finest": 16, "width": 16},
     {"density_components": 8, "colour_components": 8, "coarsest": 8, "finest": 24, "width": 16},
 ]
