@@ -189,7 +189,9 @@ def register() -> torch.device:
         halves = torch.library.Library("aten", "IMPL", "AutocastPrivateUse1")
         for name in HALVED:
             halves.impl(name, in_halves(getattr(torch.ops.aten, name)))
-        _kept.append(halves)
+        others = torch.library.Library("_", "IMPL", "AutocastPrivateUse1")
+        others.fallback(torch.library.fallthrough_kernel)
+        _kept.extend((halves, others))
         AcceleratorRegistry.register(NAME, PretendAccelerator)
         StrategyRegistry.register(NAME, SingleDeviceStrategy, device=torch.device(NAME, 0))
     return torch.device(NAME, 0)

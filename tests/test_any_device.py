@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from every_model import MODELS
+from every_model import MODELS, SCENE
 from once import once
 from pretend import NAME, Module, Pretend, device, like, missing, register  # noqa: F401  (a fixture)
 
@@ -25,10 +25,9 @@ ON_IT = ("device=pretend", "+trainer.strategy=pretend", "+trainer.inference_mode
 """It knows no inference mode."""
 QUICK = ("model.grown=0.5", "sampler.update_every=4", "sampler.warmup=8")
 SAMPLERS = {
-    "occupancy": (),
-    "uniform": ("sampler=uniform", "sampler.samples=16"),
-    "stratified": ("sampler=stratified", "sampler.samples=16"),
-    "importance": ("sampler=importance", "sampler.samples=8", "sampler.fine=8"),
+    "uniform": ["sampler=uniform", "sampler.samples=16"],
+    "stratified": ["sampler=stratified", "sampler.samples=16"],
+    "importance": ["sampler=importance", "sampler.samples=8", "sampler.fine=8"],
 }
 
 
@@ -114,10 +113,13 @@ def stepped(system: System, data: object, steps: int, where: torch.device) -> li
 
 
 VARIANTS = {
-    **{f"{name}, occupancy": (name, ()) for name in SCENES},
-    **{f"mlp, {name}": ("mlp", given) for name, given in SAMPLERS.items() if given},
-    "hashgrid, penalty, one colour behind": ("hashgrid", ("renderer.distortion=0.01", "renderer.background=white")),
-    "tensorf, random colours behind": ("tensorf", ("renderer.background=random",)),
+    **{name: options(name) for name in SCENES},
+    **{
+        name: [*(one for one in SCENE if not one.startswith("sampler.")), "model=mlp", "model.width=16", *given]
+        for name, given in SAMPLERS.items()
+    },
+    "penalty, one colour behind": [*options("hashgrid"), "renderer.distortion=0.01", "renderer.background=white"],
+    "random colours behind": [*options("tensorf"), "renderer.background=random"],
 }
 
 
@@ -126,15 +128,13 @@ VARIANTS = {
 def test_steps_come_to_what_they_come_to_on_the_cpu(
     variant: str, kind: str, device: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    name, more = VARIANTS[variant]
     monkeypatch.setattr(Pretend, "doubles", False)  # Apple's chips have none
     monkeypatch.setattr(sums, "WITHOUT_DOUBLE", (NAME,))
     use_kernels("reference")
     found = {}
-    given = [one for one in options(name) if not (variant.startswith("mlp, ") and more and one.startswith("sampler."))]
     for where in (torch.device("cpu"), device):
         torch.manual_seed(0)
-        system, data = system_of([*given, *more, "dataset.samples=null"], tmp_path)
+        system, data = system_of([*VARIANTS[variant], "dataset.samples=null"], tmp_path)
         assert isinstance(system, NeRF3D) and data.scene.train.images.shape[-1] == 4
         if kind == "unbounded":
             unbind(system)
