@@ -14,6 +14,7 @@ from torch import Tensor
 
 from benchmarks.cases import Case, cases, versions
 from benchmarks.kernels import case_milliseconds, random_like
+from nerf_lightning.device import CPU
 
 APART = 1e-4
 """Largest difference of floating numbers that counts as equal, as a share of the largest of them."""
@@ -24,7 +25,6 @@ FAILURES = (RuntimeError, TypeError)
 """How torch says that a device cannot do something, or has no room for it."""
 
 Rows = list[dict[str, Any]]
-CPU = torch.device("cpu")
 
 
 def told(error: Exception) -> str:
@@ -72,7 +72,8 @@ def located(got: list[Tensor], wanted: list[Tensor]) -> tuple[float, float]:
 
 
 def packed(got: list[Tensor], wanted: list[Tensor]) -> tuple[float, float]:
-    """The same of samples, those being others that have no counterpart on their ray."""
+    """The same of samples, those being others that have no counterpart on their ray; what only fills up room is left out."""
+    got, wanted = ([*(x[: int(offsets[-1])] for x in parts), offsets] for *parts, offsets in (got, wanted))
     longest = max((float(x[0].max()) for x in (got, wanted) if len(x[0])), default=1.0)
     places, counts = [], []
     for t, _, ray, offsets in (got, wanted):

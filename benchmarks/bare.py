@@ -26,6 +26,7 @@ def bare_step(
     loss, system.stats = system.loss(batch, step_generator(system.seed, 1, step, system.device), step)
     loss.backward()
     optimizer.step()
-    data.adapt(system.stats.samples)
+    if system.stats.counted:
+        data.adapt(system.stats.samples)
     synchronize(system.device)
     return time.perf_counter() - start

@@ -63,15 +63,15 @@ def versions(choice: str) -> Iterator[None]:
         kernels.use_kernels("auto")
 
 
-def march(unbounded: bool, *tensors: Tensor) -> Outputs:
+def march(unbounded: bool, room: int | None, *tensors: Tensor) -> Outputs:
     origins, directions, aabb, near, far, shift, occupied = tensors
     rays, bounds = Rays(origins, directions), Bounds(aabb, unbounded)
-    return kernels.march(rays, bounds, near, far, shift, occupied, STEPS, 3.46 / STEPS)
+    return kernels.march(rays, bounds, near, far, shift, occupied, STEPS, 3.46 / STEPS, room)
 
 
-def keep_visible(density: Tensor, *packed: Tensor) -> Outputs:
+def keep_visible(room: int | None, density: Tensor, *packed: Tensor) -> Outputs:
     t, dt, ray, offsets = packed
-    return kernels.keep_visible(density, (t, dt, ray, offsets), TRANSPARENT, THIN)
+    return kernels.keep_visible(density, (t, dt, ray, offsets), TRANSPARENT, THIN, room)
 
 
 def mark_cells(marks: Tensor, origins: Tensor, directions: Tensor, aabb: Tensor, ray: Tensor, t: Tensor) -> Tensor:
@@ -80,9 +80,9 @@ def mark_cells(marks: Tensor, origins: Tensor, directions: Tensor, aabb: Tensor,
     return marks
 
 
-def mark_rows(seen: Tensor, rows: Tensor, step: Tensor) -> Tensor:
+def mark_rows(seen: Tensor, rows: Tensor) -> Tensor:
     seen = seen.clone()
-    kernels.mark_rows(seen, rows, step)
+    kernels.mark_rows(seen, rows, 3)
     return seen
 
 
@@ -90,6 +90,11 @@ def mlp(x: Tensor, *rest: Tensor) -> Tensor:
     """The layers' matrices and biases in turn, then the extra inputs."""
     *flat, extra = rest
     return kernels.mlp(x, list(zip(flat[::2], flat[1::2], strict=True)), extra)
+
+
+def plane_line_sum_and_products(*tensors: Tensor) -> Outputs:
+    planes, lines, others, other_lines, unit = tensors
+    return kernels.plane_line_sum_and_products((planes, lines), (others, other_lines), unit)
 
 
 def roughness(values: Tensor, vertex: Tensor, index: Tensor) -> Tensor:
@@ -139,8 +144,10 @@ def cases() -> dict[str, Case]:
     torch.manual_seed(0)
     bounded, unbounded = (toward_a_ball(boundless) for boundless in (False, True))
     origins, directions, aabb = bounded[:3]
-    packed = tuple(march(False, *bounded))
+    packed = tuple(march(False, None, *bounded))
     t, dt, ray, _ = packed
+    room = 5 * len(t) // 4  # as samplers leave where nobody waits to count
+    roomy = tuple(march(False, room, *bounded))
     density = 100 * torch.rand(len(t)) ** 3  # some hold nothing, and some end their ray
     rgb = torch.rand(3, len(t)).T
     unit = Bounds(aabb).to_unit(kernels.points(origins, directions, ray, t))[:SAMPLES]
@@ -151,16 +158,20 @@ def cases() -> dict[str, Case]:
     flat = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
     features = torch.rand(15, len(unit)).T
     clear = clear_of_kinks(features, harmonics, layers)
-    factors = VectorMatrix(128, 16)
+    factors, colours = VectorMatrix(128, 16), VectorMatrix(128, 16)
     voxels = VoxelField(Bounds(aabb), coarsest=64, finest=64, stages=1)
     sparse(voxels)
     rows, weights = kernels.locate(voxels.index, unit)
-    marks, step = torch.zeros(CELLS**3, dtype=torch.int32), torch.tensor(3, dtype=torch.int32)
+    marks = torch.zeros(CELLS**3, dtype=torch.int32)
     return {
-        "march": Case(partial(march, False), bounded, kind="packed"),
-        "march, unbounded": Case(partial(march, True), unbounded, kind="packed"),
+        "march": Case(partial(march, False, None), bounded, kind="packed"),
+        "march, unbounded": Case(partial(march, True, None), unbounded, kind="packed"),
+        "march, into room": Case(partial(march, False, room), bounded, kind="packed"),
         "points": Case(kernels.points, (origins, directions, ray, t)),
-        "keep_visible": Case(keep_visible, (density, *packed), kind="packed"),
+        "keep_visible": Case(partial(keep_visible, None), (density, *packed), kind="packed"),
+        "keep_visible, into room": Case(
+            partial(keep_visible, room), (density[torch.arange(room) % len(t)], *roomy), kind="packed"
+        ),
         "mark_cells": Case(mark_cells, (marks, origins, directions, aabb, ray, t)),
         "hash_interpolate": Case(
             partial(hash_interpolate, grid.resolutions, grid.sizes), (grid.tables, unit), learns=1
@@ -174,8 +185,13 @@ def cases() -> dict[str, Case]:
         "spherical_harmonics": Case(kernels.spherical_harmonics, (seen_from,)),
         "plane_line_products": Case(kernels.plane_line_products, (factors.planes, factors.lines, unit), learns=2),
         "plane_line_sum": Case(kernels.plane_line_sum, (factors.planes, factors.lines, unit), learns=2),
+        "plane_line_sum_and_products": Case(
+            plane_line_sum_and_products,
+            (factors.planes, factors.lines, colours.planes, colours.lines, unit),
+            learns=4,
+        ),
         "locate": Case(kernels.locate, (voxels.index, unit), kind="located"),
-        "mark_rows": Case(mark_rows, (voxels.seen, rows, step)),
+        "mark_rows": Case(mark_rows, (voxels.seen, rows)),
         "read_voxels": Case(kernels.read_voxels, (*voxels.tables, rows, weights, harmonics[:, 1:4]), learns=3),
         "voxel_value": Case(kernels.voxel_value, (voxels.log_density, voxels.index, unit)),
         "roughness": Case(roughness, (voxels.log_density, voxels.vertex, voxels.index), learns=1),

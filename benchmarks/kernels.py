@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.cases import Case, cases, versions
-from nerf_lightning.device import synchronize
+from nerf_lightning.device import CPU, synchronize
 
 ROUNDS = 15
 
@@ -49,10 +49,10 @@ def case_milliseconds(case: Case, device: torch.device, choice: str, gradient: b
 
 def measure() -> list[dict[str, Any]]:
     """Milliseconds of each kernel on the CPU, fast and reference."""
-    rows, device = [], torch.device("cpu")
+    rows = []
     for name, case in cases().items():
         for gradient in (False, True) if case.learns else (False,):
-            ours, plain = (case_milliseconds(case, device, choice, gradient) for choice in ("auto", "reference"))
+            ours, plain = (case_milliseconds(case, CPU, choice, gradient) for choice in ("auto", "reference"))
             row = {"kernel": f"{name} + gradient" if gradient else name, "fast_ms": ours, "reference_ms": plain}
             rows.append({**row, "times_faster": plain / ours})
     return rows

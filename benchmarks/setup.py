@@ -8,6 +8,8 @@ from omegaconf import DictConfig
 from nerf_lightning.build import build_data, build_system, frame_of
 from nerf_lightning.compose import composed
 from nerf_lightning.dataset import RayDataModule
+from nerf_lightning.device import CPU
+from nerf_lightning.limits import limits_of
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training import prepare_process, quiet
 
@@ -17,16 +19,17 @@ METHODS = ("tensorf", "hashgrid", "voxels", "mlp")
 
 def on_device(device: torch.device) -> list[str]:
     """Overrides with which a run trains there."""
-    return [f"trainer.accelerator={device.type}"]
+    return [f"device={device.type}"]
 
 
-def built(overrides: list[str], folder: Path) -> tuple[DictConfig, RayDataModule, NeRF3D]:
-    """Configuration, data and system of a 3D run, the process prepared as for training."""
+def built(overrides: list[str], folder: Path, device: torch.device = CPU) -> tuple[DictConfig, RayDataModule, NeRF3D]:
+    """Configuration, data and system of a 3D run, the process prepared as for training on a device, the system there."""
     cfg = composed(overrides, folder)
     quiet()
     prepare_process(cfg.seed, cfg.threads, cfg.kernels)
     data = build_data(cfg)
-    system = build_system(cfg, frame_of(data))
+    data.enlarge(limits_of(cfg, device).batch)
+    system = build_system(cfg, frame_of(data), device).to(device)
     if not isinstance(system, NeRF3D) or not isinstance(data, RayDataModule):
         raise TypeError("only 3D runs are measured here")
     return cfg, data, system

@@ -19,17 +19,8 @@ PROGRESS = 0.5
 """Reached at the end of the warm-up: fields have their full size then."""
 
 
-def peak_memory(device: torch.device) -> int | None:
-    """The most that tensors held on the device since `forget_peak`; what MPS holds now, and on a CPU the process's."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    if device.type == "mps":
-        return torch.mps.driver_allocated_memory()
-    return peak_memory_bytes()
-
-
 def forget_peak(device: torch.device) -> None:
-    """Begins anew, where a device lets us."""
+    """Begins to count the device's memory anew, where it can."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     elif device.type == "mps":
@@ -39,9 +30,8 @@ def forget_peak(device: torch.device) -> None:
 def of_method(overrides: list[str], device: torch.device) -> dict[str, Any]:
     """One line. Operations and waits are counted step by step over a whole period of the sampler's updates."""
     with tempfile.TemporaryDirectory() as folder:
-        cfg, data, system = built(overrides, Path(folder))
-    forget_peak(device)
-    system.to(device)
+        forget_peak(device)
+        cfg, data, system = built(overrides, Path(folder), device)
     system.sampler.look_through(data.scene.train.cameras)
     optimizer = system.configure_optimizers()
     period = int(cfg.sampler.update_every)
@@ -60,7 +50,8 @@ def of_method(overrides: list[str], device: torch.device) -> dict[str, Any]:
     times, samples, rays = [], [], []
     for number in range(first + period, first + (1 + PERIODS) * period):
         times.append(1e3 * step(number))
-        samples.append(system.stats.samples)
+        if system.stats.counted:
+            samples.append(system.stats.samples)
         rays.append(system.stats.rays)
     between, whole = counts[1:] or counts, counts  # the first step of a period updates the sampler
     return {
@@ -70,9 +61,9 @@ def of_method(overrides: list[str], device: torch.device) -> dict[str, Any]:
         "waits": median(waits for _, waits in between),
         "operations_on_average": fmean(operations for operations, _ in whole),
         "waits_on_average": fmean(waits for _, waits in whole),
-        "samples": fmean(samples),
+        "samples": fmean(samples) if samples else None,
         "rays": fmean(rays),
-        "peak_memory_bytes": peak_memory(device),
+        "peak_memory_bytes": peak_memory_bytes(device),
     }
 
 

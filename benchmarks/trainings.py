@@ -9,10 +9,11 @@ from typing import Any
 
 import torch
 
-from benchmarks.alike import CPU, FAILURES, Rows, told
+from benchmarks.alike import FAILURES, Rows, told
 from benchmarks.cases import versions
 from benchmarks.setup import METHODS, on_device
 from nerf_lightning.compose import composed
+from nerf_lightning.device import CPU
 from nerf_lightning.training import train
 
 PICTURE_FIELDS = ("hashgrid2d", "picture_mlp", "fourier", "siren")
@@ -33,7 +34,8 @@ SEEDS = 4
 def everything() -> dict[str, list[str]]:
     """Overrides of each method's short training."""
     without, pictures = ([f"callbacks.{name}=null" for name in names] for names in (FILES, PICTURE_FILES))
-    common = [f"budget.steps={STEPS}", "~logger", *without]
+    # As many rays a step on every device: with more it would learn more.
+    common = [f"budget.steps={STEPS}", "limits.batch=1", "~logger", *without]
     return {
         **{name: [*SCENE, *SMALL, f"recipe={name}_medium", *common] for name in METHODS},
         **{name: [*PICTURE, f"model={name}", *common, *pictures] for name in PICTURE_FIELDS},

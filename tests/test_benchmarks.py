@@ -12,6 +12,7 @@ from benchmarks import __main__ as command
 from benchmarks import alike, capture, cases, device, growth, methods, overhead, steps, trainings
 from benchmarks import kernels as timing
 from nerf_lightning import kernels
+from nerf_lightning.device import CPU
 
 CURVE = [[2.0, 100, 20.0], [8.0, 400, 24.5], [10.5, 500, 26.0], [30.0, 1500, 29.0]]
 
@@ -109,7 +110,7 @@ def spoil(monkeypatch: pytest.MonkeyPatch, name: str, how: Callable[[Tensor], Te
 
 
 def test_kernels_that_agree_are_all_equal(few_samples: None):
-    rows, unequal = alike.measure(alike.CPU)
+    rows, unequal = alike.measure(CPU)
     assert unequal == [] and device.verdict(unequal) == "all equal"
     assert all(row["equal"] and row["device_ms"] > 0 and row["reference_ms"] > 0 for row in rows)
     assert {"march, unbounded", "plane_line_sum", "mark_cells", "voxel_value"} <= {row["kernel"] for row in rows}
@@ -123,7 +124,7 @@ def test_kernels_whose_value_or_gradient_is_wrong_are_named(few_samples: None, m
     spoil(monkeypatch, "spherical_harmonics", lambda x: x * (1 + 1e-3))
     spoil(monkeypatch, "points", lambda x: x * torch.nan)
     spoil(monkeypatch, "voxel_value", refuse)
-    _, unequal = alike.measure(alike.CPU)
+    _, unequal = alike.measure(CPU)
     assert unequal == [
         "points (value, nan apart)",
         "hash_interpolate (gradient, 3.0e-2 apart)",
@@ -178,7 +179,7 @@ def test_a_method_far_below_the_cpu_is_named_with_more_seeds_where_in_doubt(ther
         return there[min(seed, len(there) - 1)] if spoilt else 30.0
 
     monkeypatch.setattr(trainings, "trained", trained)
-    rows, unequal = trainings.measure(alike.CPU, 0, tmp_path)
+    rows, unequal = trainings.measure(CPU, 0, tmp_path)
     assert unequal == found and [row["seeds"] for row in rows] == [1, seeds, 1, 1, 1, 1, 1, 1]
 
 
@@ -188,7 +189,7 @@ def test_short_trainings_of_rays_and_of_pictures_run_with_either_version(tmp_pat
     everything = trainings.everything()
     for name in ("voxels", "hashgrid2d"):
         quality = [
-            trainings.trained(everything[name], version, 0, alike.CPU, tmp_path / name / version)
+            trainings.trained(everything[name], version, 0, CPU, tmp_path / name / version)
             for version in ("auto", "reference")
         ]
         assert quality[0] == pytest.approx(quality[1], abs=0.1) and quality[0] > 1
@@ -198,7 +199,7 @@ def test_short_trainings_of_rays_and_of_pictures_run_with_either_version(tmp_pat
 def test_a_step_is_measured_in_time_operations_and_waits(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(steps, "WARMUP", 4)
     monkeypatch.setattr(steps, "PERIODS", 1)
-    row = steps.of_method(["+experiment=smoke_3d", "dataset.size=16", "dataset.train_views=10"], alike.CPU)
+    row = steps.of_method(["+experiment=smoke_3d", "dataset.size=16", "dataset.train_views=10"], CPU)
     assert row["step_ms"] > 0 and row["operations_on_average"] > row["operations"] > 20
     assert row["waits"] >= 1 and row["samples"] > row["rays"] > 0 and row["peak_memory_bytes"] > 1e6
 
@@ -209,7 +210,7 @@ def test_a_step_is_measured_in_time_operations_and_waits(monkeypatch: pytest.Mon
 )
 def test_the_last_line_and_the_exit_code_say_what_is_not_equal(unequal, last, tmp_path, monkeypatch, capsys):
     def trained(experiment: str, overrides: list[str], *rest: object) -> dict:
-        assert "trainer.accelerator=cpu" in overrides and "budget.seconds=7.0" in overrides
+        assert "device=cpu" in overrides and "budget.seconds=7.0" in overrides
         return run(CURVE, scene={"name": "bricks"}, device="cpu")
 
     monkeypatch.setattr(alike, "measure", lambda *_: ([{"kernel": "mlp", "equal": not unequal}], unequal[:1]))
@@ -243,6 +244,6 @@ def test_a_training_that_fails_is_named_and_the_others_go_on(tmp_path: Path, mon
         return run(CURVE, scene={"name": "lego"}, device="cpu")
 
     monkeypatch.setattr(device, "train", trained)
-    rows, failed = device.lego(alike.CPU, [], 7.0, 0, tmp_path)
+    rows, failed = device.lego(CPU, [], 7.0, 0, tmp_path)
     assert failed == ["voxels (its training failed)"] and "no room" in rows[2]["failed"]
     assert [row.get("scene") for row in rows] == ["lego", "lego", None, "lego"]
