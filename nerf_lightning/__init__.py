@@ -13,6 +13,7 @@ The tree is the data flow, seven stages in order:
     system/     NeRF2D and NeRF3D: LightningModules that hold step, loss, metrics, optimiser
     callbacks/  budget, guard, held-out PSNR, snapshots, orbit, checkpoints, progress, results.json
     build.py    config -> objects, the only place that instantiates
+    device.py   which device does the work; limits.py what it takes at once
     view.py     a scene, or a trained run, in the browser: viewer/
     render/     films and pictures of a run; evaluate/ its figures, view by view; export/ files for other programs
     sweep.py    many runs from one command line; gallery.py draws what they made

@@ -11,6 +11,7 @@ import hydra
 import lightning as L
 import torch
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
@@ -24,6 +25,9 @@ from nerf_lightning.limits import limits_of
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.options import check_options
 from nerf_lightning.system import NeRF2D, NeRF3D, System
+
+KNOWN = ("cpu", "cuda", "mps")
+"""Devices that Lightning finds by itself; for any other it would take the CPU."""
 
 
 def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
@@ -188,4 +192,7 @@ def build_trainer(cfg: DictConfig, folder: Path, device: torch.device) -> L.Trai
     results = Results("results.json", cfg.method, cfg.seed)
     # The budget goes first: the others read its clock. Results go before the orbit: figures should not wait for a GIF.
     callbacks = [build_budget(cfg), results, *callbacks]
-    return make(cfg, "trainer", accelerator=device.type, callbacks=callbacks, logger=logger, default_root_dir=folder)
+    where: dict[str, Any] = {"accelerator": device.type}
+    if device.type not in KNOWN:
+        where["strategy"] = SingleDeviceStrategy(device)
+    return make(cfg, "trainer", callbacks=callbacks, logger=logger, default_root_dir=folder, **where)

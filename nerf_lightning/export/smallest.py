@@ -54,11 +54,11 @@ def some_cameras(data: RayDataModule, most: int = MOST_VIEWS) -> Cameras:
 
 
 def confined_to(system: System, cells: Cells | None) -> System:
-    """A copy of a system with only what some cells need; the system itself for None."""
+    """A copy of a system with only what some cells need, on the CPU, to be coded; the system itself for None."""
     if cells is None:
         return system
-    part = copy.deepcopy(system)
-    confine(part, cells)
+    part = copy.deepcopy(system).cpu()
+    confine(part, cells.cpu())
     return part
 
 

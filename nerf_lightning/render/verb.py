@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from nerf_lightning.callbacks.panels import panel
 from nerf_lightning.dataset import RayDataModule
@@ -40,7 +41,7 @@ def render(order: Order) -> None:
     found = open_scene_run(source, device)
     route = the_route(order, found)
     background = the_background(order, found.system, route)
-    found.system.renderer.colour = found.system.renderer.colour.new_tensor(background or BLACK)
+    found.system.renderer.colour = torch.tensor(background or BLACK, device=device)
     depths = depth_range(found.system, route.cameras) if "depth" in channels else (0.0, 1.0)
     style = Style(channels, background, depths)
     plan = the_plan(order, found.system, route, style)

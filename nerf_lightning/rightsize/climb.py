@@ -87,9 +87,10 @@ def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = No
     if isinstance(data, RayDataModule):
         data.rays = data.first_rays
     device = device_of(cfg)
-    system = build_system(cfg, frame_of(data), device).to(device)
+    system = build_system(cfg, frame_of(data), device)
     if start is not None:
-        system.take(start)
+        system.take(start.cpu())  # where a new system is
+        start.to(device)
     trainer = build_trainer(cfg, folder, device)
     warm_up(system, data, device)
     trainer.fit(system, data)

@@ -92,7 +92,7 @@ class Painter:
         colour = self.system.renderer.colour
         parts = []
         try:
-            self.system.renderer.colour = colour.new_tensor(wish.background)
+            self.system.renderer.colour = torch.tensor(wish.background, device=device)
             for start in range(0, len(rays), together):
                 if not wanted():
                     return None

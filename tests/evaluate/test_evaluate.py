@@ -31,7 +31,7 @@ def evaluated(run: Path, *given: str) -> dict:
 
 
 def test_every_view_is_judged_as_the_run_was(run: Path, capsys: pytest.CaptureFixture[str]):
-    found = evaluated(run)
+    found = evaluated(run, "device=cpu")
     out = capsys.readouterr().out
     results = json.loads((run / "results.json").read_text())
     assert len(found["views"]) == results["scene"]["views"]["val"] == 2
@@ -40,6 +40,7 @@ def test_every_view_is_judged_as_the_run_was(run: Path, capsys: pytest.CaptureFi
     assert found["mean"]["ssim"] == pytest.approx(results["ssim"], abs=1e-3)
     assert found["mean"]["lpips"] is None and "no LPIPS: photos of less than 64 pixels" in out
     assert out.count("<- worst") == 1 and f"{found['mean']['psnr']:.2f} dB over 2 held-out views" in out
+    assert (found["device"], found["machine"]["accelerator"]) == ("cpu", None) and "held-out views on cpu;" in out
     both = imageio.imread(run / "evaluation" / "worst.png")
     evaluated(run, "worst=1")
     assert len(imageio.imread(run / "evaluation" / "worst.png")) == len(both) // 2

@@ -43,9 +43,9 @@ def render(
 
 
 def test_frames_show_what_the_system_renders(render: Render, tmp_path: Path):
-    code, out, err = render("frames=2", "output=frames", "background=0.2,0.4,0.6")
+    code, out, err = render("frames=2", "output=frames", "background=0.2,0.4,0.6", "device=cpu")
     assert code == 0, err
-    assert out.startswith("frames: 2 frames of 16 x 16 pixels")
+    assert out.startswith("frames: 2 frames of 16 x 16 pixels in ") and out.endswith(" s on cpu\n")
     run = load_run(tmp_path / "run")
     assert isinstance(run.system, NeRF3D) and run.orbit is not None
     run.system.renderer.colour = torch.tensor([0.2, 0.4, 0.6])

@@ -34,6 +34,7 @@ def given(tmp_path: Path) -> list[str]:
         f"ladder={tmp_path}/ladder.yaml",
         "budget.steps=120",
         "threads=1",
+        "device=cpu",
         "callbacks.orbit=null",
         "callbacks.snapshots.steps=[]",
         f"output={tmp_path}/found",
@@ -50,6 +51,7 @@ def test_a_search_leaves_the_smallest_that_is_enough(
 ):
     found = search([*given, "target.psnr=14"], tmp_path)
     assert found["target"] == {"psnr": 14, "within_db": None} and found["reached"]
+    assert found["device"] == "cpu" and found["machine"].keys() == {"processor", "cores", "accelerator"}
     mine = found["rungs"][found["chosen"]["rung"]]
     assert mine["psnr"] >= 14 and all(
         rung["psnr"] < 14 for rung in found["rungs"][: found["chosen"]["rung"]] if rung["run"]
