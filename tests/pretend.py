@@ -1,7 +1,7 @@
 """A device that exists only in the dispatcher: what runs on it would run on a GPU, though the machine has none.
 
 Its tensors keep their numbers in a CPU tensor, but refuse to meet CPU tensors and know no `.numpy()`. Autograd, modules, fused
-optimisers, mixed precision and Lightning's Trainer work on it (`accelerator="pretend"`, `strategy="pretend"`); what is asked of
+optimisers, mixed precision and Lightning's Trainer work on it (`accelerator="pretend"`); what is asked of
 it passes the dispatcher, so `benchmarks.count` counts it. Random numbers come from the CPU's generators, as a generator cannot
 live here.
 """
@@ -13,7 +13,6 @@ import pytest
 import torch
 from lightning.pytorch.accelerators import Accelerator, AcceleratorRegistry
 from lightning.pytorch.plugins import MixedPrecision
-from lightning.pytorch.strategies import SingleDeviceStrategy, StrategyRegistry
 from lightning.pytorch.trainer.connectors import accelerator_connector
 from torch.utils import _pytree as pytree
 from torch.utils import backend_registration
@@ -193,7 +192,6 @@ def register() -> torch.device:
         others.fallback(torch.library.fallthrough_kernel)
         _kept.extend((halves, others))
         AcceleratorRegistry.register(NAME, PretendAccelerator)
-        StrategyRegistry.register(NAME, SingleDeviceStrategy, device=torch.device(NAME, 0))
     return torch.device(NAME, 0)
 
 

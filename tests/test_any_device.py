@@ -21,7 +21,7 @@ from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training import quiet, train
 
 SCENES = ("hashgrid", "voxels", "tensorf", "mlp")
-ON_IT = ("device=pretend", "+trainer.strategy=pretend", "+trainer.inference_mode=false", "~logger")
+ON_IT = ("device=pretend", "+trainer.inference_mode=false", "~logger")
 """It knows no inference mode."""
 QUICK = ("model.grown=0.5", "sampler.update_every=4", "sampler.warmup=8")
 SAMPLERS = {
