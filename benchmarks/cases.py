@@ -69,14 +69,14 @@ def march(unbounded: bool, room: int | None, *tensors: Tensor) -> Outputs:
     return kernels.march(rays, bounds, near, far, shift, occupied, STEPS, 3.46 / STEPS, room)
 
 
-def keep_visible(room: int | None, density: Tensor, *packed: Tensor) -> Outputs:
+def keep_visible(room: int | None, thickness: Tensor, *packed: Tensor) -> Outputs:
     t, dt, ray, offsets = packed
-    return kernels.keep_visible(density, (t, dt, ray, offsets), TRANSPARENT, THIN, room)
+    return kernels.keep_visible(thickness, (t, dt, ray, offsets), TRANSPARENT, THIN, room)
 
 
-def mark_cells(marks: Tensor, origins: Tensor, directions: Tensor, aabb: Tensor, ray: Tensor, t: Tensor) -> Tensor:
+def mark_cells(marks: Tensor, aabb: Tensor, positions: Tensor) -> Tensor:
     marks = marks.clone()
-    kernels.mark_cells(marks, 3, Rays(origins, directions), Bounds(aabb), ray, t)
+    kernels.mark_cells(marks, 3, Bounds(aabb), positions)
     return marks
 
 
@@ -168,11 +168,11 @@ def cases() -> dict[str, Case]:
         "march, unbounded": Case(partial(march, True, None), unbounded, kind="packed"),
         "march, into room": Case(partial(march, False, room), bounded, kind="packed"),
         "points": Case(kernels.points, (origins, directions, ray, t)),
-        "keep_visible": Case(partial(keep_visible, None), (density, *packed), kind="packed"),
+        "keep_visible": Case(partial(keep_visible, None), (density * packed[1], *packed), kind="packed"),
         "keep_visible, into room": Case(
-            partial(keep_visible, room), (density[torch.arange(room) % len(t)], *roomy), kind="packed"
+            partial(keep_visible, room), (density[torch.arange(room) % len(t)] * roomy[1], *roomy), kind="packed"
         ),
-        "mark_cells": Case(mark_cells, (marks, origins, directions, aabb, ray, t)),
+        "mark_cells": Case(mark_cells, (marks, aabb, kernels.points(origins, directions, ray, t))),
         "hash_interpolate": Case(
             partial(hash_interpolate, grid.resolutions, grid.sizes), (grid.tables, unit), learns=1
         ),

@@ -1,10 +1,11 @@
-"""What a piece of work asks of a device: operations, each a launch or at least a call, and waits of the host for it."""
+"""What a piece of work asks of a device: operations, each a launch, and waits of the host for it."""
 
 from collections import Counter
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
 WAITS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "aten::equal", "aten::_unique2")
@@ -12,27 +13,43 @@ WAITS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "a
 INDEXED = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
 """Operations that look for the true entries of a mask where they are given one."""
 
+IDLE = (
+    "aten::detach",
+    "aten::_unsafe_view",
+    "aten::empty",
+    "aten::empty_like",
+    "aten::empty_strided",
+    "aten::new_empty",
+)
+"""Operations, beside views, that launch nothing."""
 
-def waits(name: str, arguments: Any) -> bool:
+
+def waits(name: str, args: Any, kwargs: Any) -> bool:
     """Whether the host waits for a device in an operation.
 
     Args:
         name: of the operation, without that of its overload.
-        arguments: positional ones.
+        args, kwargs: what it is given.
     """
     if name in WAITS:
         return True
     if name in INDEXED:
-        return any(isinstance(x, Tensor) and x.dtype in (torch.bool, torch.uint8) for x in arguments[1])
-    return False
+        return any(isinstance(x, Tensor) and x.dtype in (torch.bool, torch.uint8) for x in args[1])
+    if name == "aten::_to_copy":
+        to = kwargs.get("device")
+        return to is not None and torch.device(to).type == "cpu" != args[0].device.type
+    return name == "aten::copy_" and args[0].device.type == "cpu" != args[1].device.type
 
 
 class Count(TorchDispatchMode):
-    """Counts what is asked of the dispatcher inside `with Count() as count:`, views among it; autograd's work too."""
+    """Counts what is asked of the dispatcher inside `with Count() as count:`, autograd's work too."""
 
     def __init__(self) -> None:
         super().__init__()
         self.names: Counter[str] = Counter()
+        """Operations that work on a device."""
+        self.idle: Counter[str] = Counter()
+        """Those that the host does by itself: other ways of looking at a tensor, and memory to write into."""
         self.waits = 0
 
     @property
@@ -41,6 +58,9 @@ class Count(TorchDispatchMode):
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = function._schema.name
-        self.names[name] += 1
-        self.waits += waits(name, args)
-        return function(*args, **(kwargs or {}))
+        kwargs = kwargs or {}
+        idle = function.is_view or name in IDLE
+        if any(isinstance(leaf, Tensor) for leaf in pytree.tree_leaves((args, kwargs))) or "device" in kwargs:
+            (self.idle if idle else self.names)[name] += 1
+            self.waits += waits(name, args, kwargs)
+        return function(*args, **kwargs)

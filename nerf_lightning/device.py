@@ -47,6 +47,15 @@ def _advice(name: str) -> str:
     return "give device=auto"
 
 
+def fits(size: int, device: torch.device) -> bool:
+    """Whether so many bytes take at most half of the memory that a device has left."""
+    if device.type == "cuda":
+        return size <= torch.cuda.mem_get_info(device)[0] // 2
+    if device.type == "mps":
+        return size <= (torch.mps.recommended_max_memory() - torch.mps.driver_allocated_memory()) // 2
+    return True
+
+
 def synchronize(device: torch.device) -> None:
     """Waits until a device has done all it was given, so that a clock can be read; a CPU always has."""
     if device.type != "cpu":

@@ -39,6 +39,7 @@ install_import_hook(checked_modules(), "typechecker.check")
 # ruff: noqa: E402
 import pytest
 from once import once
+from pretend import device  # noqa: F401  (a fixture)
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Rays

@@ -134,7 +134,7 @@ class Guard(L.Callback):
             found = Breakdown("the loss is no longer a finite number", apart=True)
         elif self.watch.due(step):
             opacity = pl_module.stats.opacity
-            found = self.watch.look(step, None if opacity is None else float(opacity))
+            found = self.watch.look(step, None if opacity is None else float(opacity.mean()))
         if found is None and keep and self.watch.learning and not self.watch.risen:
             if finite(pl_module.parameters()):
                 self._good = copied(pl_module)

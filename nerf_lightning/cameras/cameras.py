@@ -72,9 +72,10 @@ class Cameras:
     @cached_property
     def pixel_axes(self) -> Float[Tensor, "V 3 3"]:
         """World vectors a, b, c of each view: pixel (u, v) looks along u a + v b + c, as `pixel_to_ray` says of one pixel."""
-        identity = torch.eye(3, dtype=torch.float64, device=self.K.device).expand_as(self.K)
-        inverse = torch.linalg.solve_triangular(self.K.double(), identity, upper=True)
-        return (self.c2w[:, :3, :3].double() @ inverse).mT.to(self.K.dtype).contiguous()
+        K, rotation = self.K.cpu().double(), self.c2w[:, :3, :3].cpu().double()  # not every device has doubles
+        identity = torch.eye(3, dtype=torch.float64).expand_as(K)
+        inverse = torch.linalg.solve_triangular(K, identity, upper=True)
+        return (rotation @ inverse).mT.to(self.K).contiguous()
 
     def view_rays(self, view: int) -> Rays:
         """All H*W rays of one view, row by row."""

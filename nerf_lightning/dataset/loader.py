@@ -4,6 +4,9 @@ from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import lightning as L
+import torch
+
+from nerf_lightning.device import CPU, fits
 
 Batch = TypeVar("Batch")
 
@@ -14,6 +17,12 @@ ENDLESS = 2**31 - 1
 def share(trainer: L.Trainer | None) -> slice:
     """Which entries of a step's draw are this process's, where several share a run: all together make the whole draw."""
     return slice(None) if trainer is None else slice(trainer.global_rank, None, trainer.world_size)
+
+
+def drawn_on(trainer: L.Trainer | None, size: int) -> torch.device:
+    """Where batches are drawn: on the device that trains, if it has room for so many bytes of photos."""
+    device = CPU if trainer is None else trainer.strategy.root_device
+    return device if fits(size, device) else CPU
 
 
 class StepLoader:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader, share
+from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader, drawn_on, share
 from nerf_lightning.errors import InputError
 from nerf_lightning.seeding import step_generator
 
@@ -110,15 +110,23 @@ class PixelDataModule(L.LightningDataModule):
         self.scene = scene
         self.pixels = pixels
         self.seed = seed
+        self._near: UInt8[Tensor, "H W 3"] | None = None
+        """The picture where batches are drawn."""
 
     def enlarge(self, batch: int) -> None:
         """Takes so many times as many pixels a step, for a device that takes more at once. Before training."""
         self.pixels *= batch
 
     def draw(self, step: int) -> PixelBatch:
-        image = self.scene.image
-        index = torch.randint(image[..., 0].numel(), (self.pixels,), generator=step_generator(self.seed, 0, step))
-        return pixels_at(image, index[share(self.trainer)])
+        if self._near is None:
+            self._near = self.scene.image.to(drawn_on(self.trainer, self.scene.image.nbytes))
+        device, whole = self._near.device, self._near[..., 0].numel()
+        generator = step_generator(self.seed, 0, step, device)
+        index = torch.randint(whole, (self.pixels,), generator=generator, device=device)
+        return pixels_at(self._near, index[share(self.trainer)])
+
+    def teardown(self, stage: str) -> None:
+        self._near = None  # another trainer may have another device
 
     def train_dataloader(self) -> StepLoader:
         return StepLoader(self.draw, lambda: self.trainer.global_step if self.trainer else 0)

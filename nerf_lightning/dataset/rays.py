@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader, share
+from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader, drawn_on, share
 from nerf_lightning.dataset.scene import Scene, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.seeding import step_generator
@@ -27,10 +27,10 @@ class RayBatch:
 
     def target(self, backgrounds: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
         """The pixels in [0, 1], composited onto `backgrounds` where they have alpha."""
-        pixels = self.pixels.to(backgrounds.dtype) / 255
+        pixels = (self.pixels / 255).to(backgrounds.dtype)
         if pixels.shape[1] == 3:
             return pixels
-        return pixels[:, :3] * pixels[:, 3:] + backgrounds * (1 - pixels[:, 3:])
+        return torch.lerp(backgrounds, pixels[:, :3], pixels[:, 3:])
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ def draw_rays(views: Views, count: int, generator: torch.Generator, part: slice 
     Photos stay as bytes and rays are made for the drawn pixels alone, so the cost does not depend on how many there are.
     """
     height, width = views.cameras.height, views.cameras.width
-    flat = torch.randint(len(views) * height * width, (count,), generator=generator)[part]
+    whole = len(views) * height * width
+    flat = torch.randint(whole, (count,), generator=generator, device=views.images.device)[part]
     view, pixel = flat // (height * width), flat % (height * width)
     row, col = pixel // width, pixel % width
     return RayBatch(views.cameras.rays(view, row, col), views.images[view, row, col])
@@ -82,6 +83,8 @@ class RayDataModule(L.LightningDataModule):
         self.samples = samples
         self.seed = seed
         self.batch = 1
+        self._near: Views | None = None
+        """The photos where batches are drawn."""
 
     def enlarge(self, batch: int) -> None:
         """Takes so many times as many rays and samples a step, for a device that takes more at once. Before training."""
@@ -99,7 +102,13 @@ class RayDataModule(L.LightningDataModule):
         self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
 
     def draw(self, step: int) -> RayBatch:
-        return draw_rays(self.scene.train, self.rays, step_generator(self.seed, 0, step), share(self.trainer))
+        if self._near is None:
+            self._near = self.scene.train.to(drawn_on(self.trainer, self.scene.train.images.nbytes))
+        device = self._near.images.device
+        return draw_rays(self._near, self.rays, step_generator(self.seed, 0, step, device), share(self.trainer))
+
+    def teardown(self, stage: str) -> None:
+        self._near = None  # another trainer may have another device
 
     def train_dataloader(self) -> StepLoader:
         return StepLoader(self.draw, lambda: self.trainer.global_step if self.trainer else 0)

@@ -24,6 +24,9 @@ class Views:
     def __len__(self) -> int:
         return self.images.shape[0]
 
+    def to(self, device: torch.device) -> "Views":
+        return Views(self.images.to(device), self.cameras.to(device))
+
 
 @dataclass(frozen=True)
 class Scene:

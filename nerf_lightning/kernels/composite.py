@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.kernels.march import Packed, chosen
+from nerf_lightning.kernels.march import Packed, counted, within
 from nerf_lightning.kernels.sums import before
 from nerf_lightning.kernels.switch import fast
 
@@ -56,7 +56,8 @@ def composite_reference(
     weights = volume_weights(density, dt, ray, offsets)
     values = torch.cat([rgb, torch.ones_like(weights)[:, None], t[:, None]], dim=1)
     summed = accumulate(weights, values, ray, len(offsets) - 1)
-    return summed[:, :3], summed[:, 3], summed[:, 4]
+    colour, opacity, distance = summed.split([3, 1, 1], dim=1)
+    return colour, opacity.squeeze(1), distance.squeeze(1)
 
 
 class _Composite(torch.autograd.Function):
@@ -109,7 +110,7 @@ def composite(
 
 
 def keep_visible_reference(
-    density: Float[Tensor, "N"],
+    thickness: Float[Tensor, "N"],
     packed: Packed,
     transparent: float,
     thin: float | Float[Tensor, ""],
@@ -117,20 +118,21 @@ def keep_visible_reference(
 ) -> Kept:
     """`keep_visible` in plain torch, for every device."""
     t, dt, ray, offsets = packed
-    thickness = density * dt
     # What is not a number stays.
     keep = ~((before(thickness, ray, offsets) > -math.log(transparent)) | (thickness < thin))
     if room is not None:  # what was repeated to fill the room before stays behind
-        keep = keep & (torch.arange(len(keep), device=keep.device) < offsets[-1])
-    index, there = chosen(keep, room)
-    counted = torch.cat([offsets.new_zeros(1), keep.cumsum(0)])
-    kept = counted.index_select(0, offsets if room is None else offsets.clamp_max(len(keep)))
-    t, dt, ray = (x.index_select(0, index) for x in (t, dt, ray))
-    return t, dt if there is None else dt * there, ray, kept
+        keep = keep & (dt > 0)
+    counts = counted(keep)
+    if room is None:
+        index, kept = keep.nonzero()[:, 0], counts.index_select(0, offsets)
+        return t.index_select(0, index), dt.index_select(0, index), ray.index_select(0, index), kept
+    index, there = within(room, counts)
+    kept = counts.index_select(0, offsets.clamp_max(len(keep)))  # rays may have ended beyond the room before
+    return t.index_select(0, index), dt.index_select(0, index) * there, ray.index_select(0, index), kept
 
 
 def keep_visible(
-    density: Float[Tensor, "N"],
+    thickness: Float[Tensor, "N"],
     packed: Packed,
     transparent: float,
     thin: float | Float[Tensor, ""],
@@ -139,22 +141,21 @@ def keep_visible(
     """Drops samples that light cannot reach, and those that hold nothing.
 
     Args:
-        density: of each sample, 1 / world unit.
+        thickness: optical, of each sample: density times length.
         packed: midpoints, lengths, rays and offsets of N samples.
         transparent: transmittance below which a ray has ended, above 0.
         thin: optical thickness of a sample below which it holds nothing.
         room: see `march`.
     """
     t, dt, ray, offsets = packed
-    if room is not None or not fast(density, t, dt) or t.requires_grad or dt.requires_grad:
-        return keep_visible_reference(density, packed, transparent, thin, room)
+    if room is not None or not fast(thickness, t, dt) or t.requires_grad or dt.requires_grad:
+        return keep_visible_reference(thickness, packed, transparent, thin, room)
     from nerf_lightning.kernels.cpu import composite as cpu
     from nerf_lightning.kernels.cpu import workers
 
     threads, keep, counts = workers(), np.empty(len(t), np.bool_), np.empty(len(offsets) - 1, np.int64)
     cpu.visible(
-        density.detach().contiguous().numpy(),
-        dt.numpy(),
+        thickness.detach().contiguous().numpy(),
         offsets.numpy(),
         transparent,
         float(thin),

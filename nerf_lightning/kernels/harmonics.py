@@ -1,11 +1,10 @@
 """Real spherical harmonics: the directions a colour network sees."""
 
-import functools
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import fast
 
 # Powers of (x, y, z) that the harmonics are made of: squares and products of two coordinates, then of three.
@@ -40,24 +39,26 @@ TERMS: tuple[dict[int, float], ...] = (
 CONSTANTS = {0: 0.28209479177387814, 6: -0.31539156525252005}
 
 
-@functools.lru_cache(maxsize=64)
+@constant
 def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Factors of all powers, constants, and which coordinates and pairs are multiplied. Made once: each costs a copy."""
+    """Factors of all powers, constants, and which coordinates and pairs are multiplied."""
     factors, constants = (torch.zeros(*shape, len(TERMS), dtype=torch.float64) for shape in ((9 + len(TRIPLES),), ()))
     for function, powers in enumerate(TERMS):
         for power, factor in powers.items():
             factors[power, function] = factor
-    for function, constant in CONSTANTS.items():
-        constants[function] = constant
-    columns = [torch.tensor(column, device=device) for pairs in (PAIRS, TRIPLES) for column in zip(*pairs, strict=True)]
+    for function, value in CONSTANTS.items():
+        constants[function] = value
+    firsts, seconds, pairs, axes = (list(column) for both in (PAIRS, TRIPLES) for column in zip(*both, strict=True))
+    columns = [torch.tensor(column, device=device) for column in (firsts + seconds + axes, pairs)]
     return factors.to(dtype).to(device), constants.to(dtype).to(device), columns
 
 
 def spherical_harmonics_reference(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:
     """`spherical_harmonics` in plain torch, for every device and precision: one product with the powers of the coordinates."""
-    factors, constants, (first, second, pair, axis) = _tables(d.dtype, d.device)
-    pairs = d.index_select(1, first) * d.index_select(1, second)
-    triples = pairs.index_select(1, pair) * d.index_select(1, axis)
+    factors, constants, (places, pair) = _tables(d.dtype, d.device)
+    first, second, axis = d.index_select(1, places).split([len(PAIRS), len(PAIRS), len(TRIPLES)], dim=1)
+    pairs = first * second
+    triples = pairs.index_select(1, pair) * axis
     return torch.addmm(constants, torch.cat([d, pairs, triples], dim=1), factors)
 
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import fast
 
 # Instant-NGP, eq. 4: pi_1 = 1, pi_2 = 2654435761, pi_3 = 805459861; the second as the int32 it wraps to.
@@ -56,8 +57,9 @@ class _Levels(NamedTuple):
     """All levels' constants on a device."""
 
     cells: Float[Tensor, "L D 1"]
-    lower: Int[Tensor, "L D 1"]
-    """The last cell of each axis."""
+    least: Int[Tensor, "1"]
+    most: Int[Tensor, "L D 1"]
+    """The first cell of all axes, and the last of each."""
     factors: Int[Tensor, "L D 1"]
     steps: Int[Tensor, "L D 2 1"]
     """What either end of a cell adds."""
@@ -67,11 +69,11 @@ class _Levels(NamedTuple):
     """Levels in a row that are all dense, or all hashed, and the last entries of their tables."""
 
 
-@functools.lru_cache(maxsize=64)
+@constant
 def _levels(
     resolutions: tuple[Cells, ...], sizes: tuple[int, ...], dtype: torch.dtype, device: torch.device
 ) -> _Levels:
-    """Made once: each would cost a copy to the device, and a wait."""
+    """What all levels are, for `hash_interpolate_reference`."""
 
     def whole(values: object) -> Tensor:
         return torch.tensor(values, dtype=torch.int32, device=device)
@@ -87,6 +89,7 @@ def _levels(
     each = whole(table)[..., None]
     return _Levels(
         torch.tensor(resolutions, dtype=dtype, device=device)[..., None],
+        whole([0]),
         whole(resolutions)[..., None] - 1,
         each,
         torch.stack([torch.zeros_like(each), each], dim=2),
@@ -112,7 +115,7 @@ def hash_interpolate_reference(
     levels = _levels(tuple(resolutions), tuple(sizes), unit.dtype, unit.device)
     scaled = unit.clamp(0, 1).T * levels.cells  # positions run last: long, contiguous vector operations
     # What is not a number stays so, in some cell.
-    cell = scaled.to(torch.int32).clamp_(min=0).minimum(levels.lower)
+    cell = scaled.to(torch.int32).clamp_(levels.least, levels.most)
     fraction = scaled - cell
     ends = (cell * levels.factors)[:, :, None] + levels.steps
     shares = torch.stack([1 - fraction, fraction], dim=2)

@@ -6,6 +6,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import fast
 
 MAX_CANDIDATES = 1 << 20
@@ -23,33 +24,49 @@ def cell_index(unit: Float[Tensor, "*batch 3"], resolution: int) -> Int[Tensor, 
     return torch.add(z, torch.add(y, x, alpha=resolution), alpha=resolution)
 
 
-def chosen(mask: Bool[Tensor, "M"], room: int | None) -> tuple[Int[Tensor, "K"], Bool[Tensor, "K"] | None]:
-    """Which entries of a mask are true, in their order.
+def counted(mask: Bool[Tensor, "M"]) -> Int[Tensor, "M_plus_1"]:
+    """How many entries before each one are true, and how many in all."""
+    return torch.cat([_nothing(mask.device), mask.cumsum(0)])
 
-    Without `room` the host waits to learn how many there are. With it K = room, and nobody waits: where there are fewer, the
-    last one stands again, and the second tensor says which ones count.
+
+@constant
+def _nothing(device: torch.device) -> Int[Tensor, "1"]:
+    return torch.zeros(1, dtype=torch.int64, device=device)
+
+
+@constant
+def _numbers(bits: int, device: torch.device) -> Int[Tensor, "numbers"]:
+    """1, 2, 3, ... 2^bits."""
+    return torch.arange(1, (1 << bits) + 1, device=device)
+
+
+def within(room: int, counts: Int[Tensor, "M_plus_1"]) -> tuple[Int[Tensor, "room"], Bool[Tensor, "room"]]:
+    """Which entries are true, by what `counted` says, and which of these places hold one, without a wait for how many.
+
+    Where there are fewer than room, the last one stands again.
     """
+    order, total = _numbers(room.bit_length(), counts.device)[:room], counts[-1:]
+    return torch.searchsorted(counts[1:], torch.minimum(order, total)), order <= total
+
+
+def _pack(
+    t: Float[Tensor, "R S"], dt: Float[Tensor, "R S"], keep: Bool[Tensor, "R S"], room: int | None = None
+) -> Packed:
+    steps, flat = keep.shape[1], keep.flatten()
     if room is None:
-        return mask.nonzero()[:, 0], None
-    counted = mask.cumsum(0)
-    order, total = torch.arange(1, room + 1, device=mask.device), counted[-1:]
-    return torch.searchsorted(counted, torch.minimum(order, total)), order <= total
+        chosen, each = flat.nonzero()[:, 0], keep.sum(1)
+        offsets = torch.cat([each.new_zeros(1), each.cumsum(0)])
+        return t.flatten().index_select(0, chosen), dt.flatten().index_select(0, chosen), chosen // steps, offsets
+    counts = counted(flat)
+    chosen, there = within(room, counts)
+    length = dt.flatten().index_select(0, chosen) * there
+    return t.flatten().index_select(0, chosen), length, chosen // steps, counts[::steps]
 
 
-def ends_of(mask: Bool[Tensor, "R S"]) -> Int[Tensor, "R_plus_1"]:
-    """Where each row's entries begin, if the true ones are packed one row after the other, and where the last ends."""
-    counts = mask.sum(1)
-    return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-
-
-def pack_intervals(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"], room: int | None = None) -> Packed:
-    """Packs the kept intervals between consecutive edges of each ray; for `room` see `march`."""
-    flat, there = chosen(keep.flatten(), room)
-    ray = flat // keep.shape[1]
-    first = flat + ray  # a row of edges is longer by one
-    start, end = edges.flatten().index_select(0, first), edges.flatten().index_select(0, first + 1)
-    length = end - start if there is None else (end - start) * there
-    return (start + end) / 2, length, ray, ends_of(keep)
+def pack_intervals(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Packed:
+    """Packs the kept intervals between consecutive edges of each ray."""
+    start, end = edges[:, :-1], edges[:, 1:]
+    return _pack((start + end) / 2, end - start, keep)
 
 
 def march_reference(
@@ -66,20 +83,20 @@ def march_reference(
     """`march` in plain torch, for every device."""
     resolution = round(len(occupied) ** (1 / 3))
     # One more than the steps: the first one may be cut short by the shift, and the last must reach the far end.
-    steps = torch.arange(samples + 2, device=near.device) + shift[:, None] - 0.5
+    steps = torch.arange(-0.5, samples + 1, device=near.device) + shift[:, None]
     if bounds.unbounded:
         edges = bounds.distances(rays, near, far, (steps / samples).clamp(0, 1))
     else:
         edges = torch.minimum(near[:, None] + steps.clamp_min(0) * step, far[:, None])
-    keep = edges[:, 1:] > edges[:, :-1]
+    start, end = edges[:, :-1], edges[:, 1:]
+    t, keep = (start + end) / 2, end > start
     rows = max(1, MAX_CANDIDATES // (samples + 1))
-    for start in range(0, len(rays), rows):
-        part = slice(start, start + rows)
-        t = (edges[part, :-1] + edges[part, 1:]) / 2
-        unit = bounds.to_unit(rays.origins[part, None] + t[..., None] * rays.directions[part, None])
+    for first in range(0, len(rays), rows):
+        part = slice(first, first + rows)
+        unit = bounds.to_unit(rays.origins[part, None] + t[part, :, None] * rays.directions[part, None])
         cells = cell_index(unit, resolution)
-        keep[part] &= occupied.index_select(0, cells.flatten()).view(cells.shape)
-    return pack_intervals(edges, keep, room)
+        keep[part].logical_and_(occupied.index_select(0, cells.flatten()).view(cells.shape))
+    return _pack(t, end - start, keep, room)
 
 
 def march(
@@ -157,22 +174,19 @@ def points(
 
 
 def mark_cells_reference(
-    marks: Int[Tensor, "cells"], mark: int, rays: Rays, bounds: Bounds, ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
+    marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions: Float[Tensor, "N 3"]
 ) -> None:
     """`mark_cells` in plain torch, for every device."""
-    unit = bounds.to_unit(points_reference(rays.origins, rays.directions, ray, t))
-    marks.index_fill_(0, cell_index(unit, round(len(marks) ** (1 / 3))), mark)
+    marks.index_fill_(0, cell_index(bounds.to_unit(positions), round(len(marks) ** (1 / 3))), mark)
 
 
-def mark_cells(
-    marks: Int[Tensor, "cells"], mark: int, rays: Rays, bounds: Bounds, ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
-) -> None:
-    """Writes `mark` into each cell of a cubic grid over the bounds that holds one of the samples."""
-    if not fast(rays.origins, rays.directions, t):
-        return mark_cells_reference(marks, mark, rays, bounds, ray, t)
+def mark_cells(marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions: Float[Tensor, "N 3"]) -> None:
+    """Writes `mark` into each cell of a cubic grid over the bounds that holds one of some positions, world units."""
+    if not fast(positions):
+        return mark_cells_reference(marks, mark, bounds, positions)
     from nerf_lightning.kernels.cpu import march as cpu
     from nerf_lightning.kernels.cpu import workers
 
-    arrays = (x.detach().contiguous().numpy() for x in (rays.origins, rays.directions, ray, t))
     box = bounds.centre.numpy(), bounds.half_size.numpy(), bounds.unbounded
-    cpu.mark(*arrays, *box, marks.numpy(), round(len(marks) ** (1 / 3)), mark, workers())
+    places = positions.detach().T.contiguous().numpy()
+    cpu.mark(places, *box, marks.numpy(), round(len(marks) ** (1 / 3)), mark, workers())

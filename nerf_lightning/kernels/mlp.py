@@ -72,12 +72,11 @@ def mlp_heads(
 ) -> tuple[Float[Tensor, "N first"], Float[Tensor, "N rest"]]:
     """Like `mlp`, with the first outputs apart from the others, which spares taking them apart."""
     parameters = [parameter for layer in layers for parameter in layer]
-    if extra is None:
-        extra = x.new_empty(len(x), 0)
-    if fast(x, extra, *parameters):
-        return _MLP.apply(x, extra, first, *parameters)
-    out = mlp_reference(x, layers, extra.detach())
-    return out[:, :first], out[:, first:]
+    if not fast(x, *parameters, *(() if extra is None else (extra,))):
+        out = mlp_reference(x, layers, None if extra is None else extra.detach())
+        head, rest = out.split([first, out.shape[1] - first], dim=1)
+        return head, rest
+    return _MLP.apply(x, x.new_empty(len(x), 0) if extra is None else extra, first, *parameters)
 
 
 def mlp(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None) -> Float[Tensor, "N O"]:
@@ -88,4 +87,6 @@ def mlp(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | N
         layers: of each layer the matrix [outputs, inputs] and the bias.
         extra: further inputs after `x`, taken as constants: they get no gradient.
     """
+    if not fast(x, *(parameter for layer in layers for parameter in layer), *(() if extra is None else (extra,))):
+        return mlp_reference(x, layers, None if extra is None else extra.detach())
     return mlp_heads(x, layers, 0, extra)[1]

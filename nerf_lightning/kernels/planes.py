@@ -1,12 +1,12 @@
 """Planes times lines: a volume as a sum of products (vector-matrix decomposition; TensoRF, Chen et al. 2022, eq. 3)."""
 
-import functools
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import fast
 
 PLANE_AXES = ((1, 2), (0, 2), (0, 1))
@@ -22,24 +22,24 @@ class Footprint(NamedTuple):
     line_shares: Float[Tensor, "N 3 2 1"]
 
 
-@functools.lru_cache(maxsize=64)
-def _axes_and_steps(side: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The axes of the planes, and what modes, corners and ends add to a row. Made once: each costs a copy to the device."""
-    first, second = torch.tensor(PLANE_AXES, device=device).unbind(1)
+@constant
+def _axes_and_steps(side: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """The first axes of all planes, then the second ones; and what modes, corners and ends add to a row."""
+    axes = torch.tensor(PLANE_AXES, device=device).T.flatten()
     mode, end = torch.arange(3, device=device)[:, None], torch.arange(2, device=device)
     corner = (end[:, None] * side + end).flatten()
-    return first, second, mode * side * side + corner, mode * side + end
+    return axes, mode * side * side + corner, mode * side + end
 
 
 def footprint(unit: Float[Tensor, "N 3"], side: int) -> Footprint:
     """Where positions in [0, 1]^3 read in planes and lines of so many vertices along a side; outside they are clamped."""
-    first, second, plane_steps, line_steps = _axes_and_steps(side, unit.device)
+    axes, plane_steps, line_steps = _axes_and_steps(side, unit.device)
     scaled = unit.clamp(0, 1) * (side - 1)
     low = scaled.long().clamp_(0, side - 2)
     fraction = scaled - low
     share = torch.stack([1 - fraction, fraction], dim=2)
-    across, down = share.index_select(1, first), share.index_select(1, second)
-    corner = torch.add(low.index_select(1, second), low.index_select(1, first), alpha=side)
+    (across, down), (row, column) = (x.index_select(1, axes).split(3, dim=1) for x in (share, low))
+    corner = torch.add(column, row, alpha=side)
     return Footprint(
         (corner[..., None] + plane_steps).flatten(),
         (across[..., None] * down[:, :, None]).view(len(unit), 3, 4, 1),

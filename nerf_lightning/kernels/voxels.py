@@ -3,13 +3,12 @@
 Row 0 stands for all vertices that hold none: its values are constants and get no gradient.
 """
 
-import functools
-
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import fast
 
 
@@ -18,9 +17,9 @@ def side_of(index: Int[Tensor, "cells"]) -> int:
     return round(len(index) ** (1 / 3))
 
 
-@functools.lru_cache(maxsize=64)
+@constant
 def _steps(side: int, device: torch.device) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:
-    """What a step along each axis adds to a vertex's number, and each corner of a cell. Made once: each costs a copy."""
+    """What a step along each axis adds to the number of a vertex, and each corner of a cell."""
     ends = torch.arange(2, device=device)
     corners = (ends[:, None, None] * side + ends[:, None]) * side + ends
     return torch.tensor([side * side, side, 1], device=device), corners.flatten()
@@ -176,7 +175,7 @@ class _Roughness(torch.autograd.Function):
         return grad, None, None, None, None
 
 
-@functools.lru_cache(maxsize=64)
+@constant
 def _neighbours(side: int, device: torch.device) -> tuple[Int[Tensor, "6 1"], ...]:
     """Of the six directions: the stride of the axis, the way to the neighbour, and the place on the axis that has none."""
     strides = torch.tensor([side * side, side, 1], device=device).repeat(2)[:, None]

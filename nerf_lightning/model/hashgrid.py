@@ -164,7 +164,7 @@ class HashGridField(Field):
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         encoded = self.grid(self.bounds.to_unit(positions))
         raw, geometry = mlp_heads(encoded, weights(self.density_net), 1)
-        return self.activation(raw[:, 0]), geometry
+        return self.activation(raw.squeeze(1)), geometry
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         return torch.sigmoid(mlp(features, weights(self.colour_net), seen_from(directions, self.terms)))

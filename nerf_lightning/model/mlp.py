@@ -92,7 +92,7 @@ class MLPField(Field):
         h = x
         for index, layer in enumerate(self.trunk):
             h = torch.relu(layer(torch.cat([h, x], dim=1) if index == self.skip else h))
-        return self.activation(self.density_head(h)[:, 0]), h
+        return self.activation(self.density_head(h).squeeze(1)), h
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         seen = torch.cat([self.bottleneck(features), sinusoidal(directions, self.direction_frequencies)], dim=1)

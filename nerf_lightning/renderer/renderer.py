@@ -27,10 +27,15 @@ class Rendered:
     """Composited onto the background."""
     opacity: Float[Tensor, "R"]
     """In [0, 1]: how much of the background is covered."""
-    depth: Float[Tensor, "R"]
-    """Expected distance along the ray of what covers it, in the scene's unit; 0 where nothing does."""
+    distance: Float[Tensor, "R"]
+    """Along the ray to what covers it, in the scene's unit, times opacity."""
     penalty: Float[Tensor, ""] | None = None
     """What training adds to its loss, where the renderer asks for that."""
+
+    @property
+    def depth(self) -> Float[Tensor, "R"]:
+        """Expected distance along the ray of what covers it, in the scene's unit; 0 where nothing does."""
+        return self.distance / self.opacity.clamp_min(1e-6)
 
 
 class VolumeRenderer(torch.nn.Module):
@@ -93,9 +98,9 @@ class VolumeRenderer(torch.nn.Module):
         if backgrounds is None:
             backgrounds = self.backgrounds(len(rays))
         density, rgb = field(samples.positions(rays), samples.directions(rays))
-        summed, opacity, depth = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
-        colour = summed + (1 - opacity)[:, None] * backgrounds
+        summed, opacity, distance = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
+        colour = torch.addcmul(summed, (1 - opacity)[:, None], backgrounds)
         penalty = None
         if self.distortion and density.requires_grad:
             penalty = self.distortion * spread(density, samples, self.half_size)
-        return Rendered(colour, opacity, depth / opacity.clamp_min(1e-6), penalty)
+        return Rendered(colour, opacity, distance, penalty)

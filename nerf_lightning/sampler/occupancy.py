@@ -114,21 +114,22 @@ class OccupancySampler(Sampler):
         if generator is None:
             packed = self._march(rays, near, far, torch.zeros_like(near), self.occupied)
             # A picture must not depend on how its rays are cut into calls: only training looks at the mean, and drops.
-            return Samples(*keep_visible(self._ask(density, rays, packed), packed, self.transparent, 0.0))
+            return Samples(*keep_visible(self._thickness(density, rays, packed), packed, self.transparent, 0.0))
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.occupied if self.look_everywhere else self.lit
         rooms = [None, None] if self.per_ray is None else [math.ceil(ROOM * many * len(rays)) for many in self.per_ray]
         packed = self._march(rays, near, far, shift, cells, rooms[0])
-        found = self._ask(density, rays, packed)
-        thin = (found * packed[1]).mean().mul(0.5).clamp_max(-math.log1p(-self.thin)) if len(found) else 0.0
+        found = self._thickness(density, rays, packed)
+        thin = found.mean().mul(0.5).clamp_max(-math.log1p(-self.thin)) if len(found) else 0.0
         kept = keep_visible(found, packed, self.transparent, thin, rooms[1])
-        mark_cells(self.reached, self.updates, rays, self.bounds, kept[2], kept[0])
+        places = Samples(*kept).positions(rays)
+        mark_cells(self.reached, self.updates, self.bounds, places)
         if rooms[0] is not None:
             whole = (packed[3][1:] <= rooms[0]) & (kept[3][1:] <= rooms[1])
-            return Samples(*kept, whole)
+            return Samples(*kept, whole, places)
         if rays.origins.device.type != "cpu":
             self.per_ray = max(len(found), 1) / len(rays), max(len(kept[0]), 1) / len(rays)
-        return Samples(*kept)
+        return Samples(*kept, places=places)
 
     def _march(
         self,
@@ -142,10 +143,10 @@ class OccupancySampler(Sampler):
         return march(rays, self.bounds, near, far, shift, cells, self.samples, self.step_length, room)
 
     @torch.no_grad()
-    def _ask(self, density: DensityFn, rays: Rays, packed: Packed) -> Float[Tensor, "N"]:
-        """The density at the middle of intervals; mixed precision gives halves."""
-        asked = Samples(*packed).positions(rays).split(MAX_ASKED)
-        return torch.cat([density(part) for part in asked]).float()
+    def _thickness(self, density: DensityFn, rays: Rays, packed: Packed) -> Float[Tensor, "N"]:
+        """Optical thickness of intervals, by the density at their middle; mixed precision gives halves."""
+        found = [density(part).float() for part in Samples(*packed).positions(rays).split(MAX_ASKED)]
+        return (found[0].detach() if len(found) == 1 else torch.cat(found)) * packed[1]
 
     @torch.no_grad()
     def look_through(self, cameras: Cameras) -> None:

@@ -30,12 +30,16 @@ class Samples:
     whole: Bool[Tensor, "R"] | None = None
     """Which rays have all their samples, where the number of samples was settled before they were found: then some rays may
     lack some, and where there are fewer, intervals of length 0 stand at the end. None: all have."""
+    places: Float[Tensor, "N 3"] | None = None
+    """World positions of the midpoints, where somebody has worked them out already."""
 
     def __len__(self) -> int:
         return self.t.shape[0]
 
     def positions(self, rays: Rays) -> Float[Tensor, "N 3"]:
         """World positions of the midpoints."""
+        if self.places is not None:
+            return self.places
         return points(rays.origins, rays.directions, self.ray, self.t)
 
     def directions(self, rays: Rays) -> Float[Tensor, "N 3"]:

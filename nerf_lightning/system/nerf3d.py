@@ -72,8 +72,9 @@ class NeRF3D(System):
         # A ray that lacks some of its samples teaches nothing.
         rgb = rendered.rgb if samples.whole is None else torch.where(samples.whole[:, None], rendered.rgb, truth)
         loss = torch.nn.functional.mse_loss(rgb, truth)
-        opacity = rendered.opacity.detach().mean()
-        stats = StepStats(loss.detach(), len(batch.rays), len(samples), samples.whole is None, opacity)
+        stats = StepStats(
+            loss.detach(), len(batch.rays), len(samples), samples.whole is None, rendered.opacity.detach()
+        )
         for penalty in (self.field.penalty(), rendered.penalty):
             loss = loss if penalty is None else loss + penalty
         return loss, stats
@@ -105,7 +106,9 @@ class NeRF3D(System):
                 found = found.between(near, far)
             for run, samples in split(found, self.chunk):
                 parts.append(self.renderer(chunk[run], samples, self.field))
-        return Rendered(*(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "depth")))
+        return Rendered(
+            *(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "distance"))
+        )
 
     @property
     def background(self) -> list[float]:

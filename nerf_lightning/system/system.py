@@ -33,8 +33,8 @@ class StepStats:
     samples: int
     counted: bool = True
     """Whether there are so many samples; otherwise there is room for so many."""
-    opacity: Float[Tensor, ""] | None = None
-    """Mean over the rays: 0 where all is empty, 1 where nothing is seen through. Likewise."""
+    opacity: Float[Tensor, "R"] | None = None
+    """Of each ray: 0 where all is empty, 1 where nothing is seen through. Likewise."""
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ class Painter:
         finally:
             self.system.renderer.colour = colour
         rendered = Rendered(
-            *(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "depth"))
+            *(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "distance"))
         )
         depths = self.depths() if wish.channel == "depth" else (0.0, 1.0)
         painted = colours(rendered, wish.channel, Style((wish.channel,), wish.background, depths))

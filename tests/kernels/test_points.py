@@ -39,13 +39,14 @@ def test_marked_cells_are_those_that_hold_samples(unbounded: bool, box: Bounds, 
     bounds, resolution = replace(box, unbounded=unbounded), 6
     ray, t = torch.randint(0, len(rays), (60,)), 6 * torch.rand(60)  # some of them outside
     marks = torch.full((resolution**3,), 3, dtype=torch.int32)
-    mark_cells(marks, 7, rays, bounds, ray, t)
+    positions = points(rays.origins, rays.directions, ray, t)
+    mark_cells(marks, 7, bounds, positions)
     expected = torch.full_like(marks, 3)
-    for place in points(rays.origins, rays.directions, ray, t):
+    for place in positions:
         x, y, z = (int(min(max(float(u) * resolution, 0), resolution - 1)) for u in bounds.to_unit(place))
         expected[(x * resolution + y) * resolution + z] = 7
     assert torch.equal(marks, expected) and {3, 7} == set(marks.tolist())
-    mark_cells(marks, 9, rays, bounds, ray[:0], t[:0])
+    mark_cells(marks, 9, bounds, positions[:0])
     assert torch.equal(marks, expected), "no samples, no marks"
 
 

@@ -31,7 +31,7 @@ def march(x: Tensor, c: Tensor):
 
 
 def mark_cells(x: Tensor, c: Tensor):
-    k.mark_cells(torch.zeros(8, dtype=torch.int32), 1, Rays(x, c), box(c), RAY, c[:, 0])
+    k.mark_cells(torch.zeros(8, dtype=torch.int32), 1, box(c), x)
 
 
 # What to call with numbers x [4, 3] and c, the same as constants; the entry point it runs; whether that gives all gradients.

@@ -30,7 +30,7 @@ def test_what_is_seen_agrees_with_a_loop(counts: list[int], transparent: float, 
             transmittance *= math.exp(-thickness)
             i += 1
         ends.append(len(kept))
-    t, dt, ray, offsets = keep_visible(density, packed(samples), transparent, thin)
+    t, dt, ray, offsets = keep_visible(density * samples.dt, packed(samples), transparent, thin)
     assert torch.equal(t, samples.t[kept]) and torch.equal(dt, samples.dt[kept])
     assert torch.equal(ray, samples.ray[kept]) and offsets.tolist() == ends
 
@@ -43,10 +43,10 @@ def test_what_is_seen_agrees_with_the_reference(counts: list[int], thin: float):
     results = {}
     for choice in ("auto", "reference"):
         use_kernels(choice)
-        results[choice] = keep_visible(density, packed(samples), 1e-3, thin)
+        results[choice] = keep_visible(density * samples.dt, packed(samples), 1e-3, thin)
     assert all(torch.equal(a, b) for a, b in zip(*results.values(), strict=True))
     use_kernels("auto")
-    one = with_threads(lambda: keep_visible(density, packed(samples), 1e-3, thin), 1)
+    one = with_threads(lambda: keep_visible(density * samples.dt, packed(samples), 1e-3, thin), 1)
     assert all(torch.equal(a, b) for a, b in zip(one, results["auto"], strict=True))
 
 
@@ -60,7 +60,7 @@ def test_dropping_what_is_not_seen_changes_pixels_by_no_more_than_it_may():
     samples = ragged(MANY)
     density, rgb = 20 * torch.rand(len(samples)) ** 4, torch.rand(len(samples), 3)
     whole = composite(density, rgb, *packed(samples))
-    t, dt, ray, offsets = keep_visible(density, packed(samples), 1e-3, 0.0)
+    t, dt, ray, offsets = keep_visible(density * samples.dt, packed(samples), 1e-3, 0.0)
     assert 0 < len(t) < len(samples)
     place = {key: i for i, key in enumerate(zip(samples.ray.tolist(), samples.t.tolist(), strict=True))}
     index = torch.tensor([place[key] for key in zip(ray.tolist(), t.tolist(), strict=True)])
@@ -72,7 +72,7 @@ def test_a_density_that_is_not_a_number_stays(kernels: str):
     samples = ragged([3, 5, 2])
     density = torch.zeros(10)
     density[5] = float("nan")
-    t, _, ray, _ = keep_visible(density, packed(samples), 1e-4, 0.01)
+    t, _, ray, _ = keep_visible(density * samples.dt, packed(samples), 1e-4, 0.01)
     assert float(samples.t[5]) in t.tolist() and (ray == 1).any()
 
 

@@ -14,7 +14,7 @@ def seen(background: torch.Tensor) -> Rendered:
     """Three rays: nothing there, half a red thing at 2, all of it at 4."""
     opacity = torch.tensor([0.0, 0.5, 1.0])
     rgb = opacity[:, None] * RED + (1 - opacity)[:, None] * background
-    return Rendered(rgb, opacity, torch.tensor([0.0, 2.0, 4.0]))
+    return Rendered(rgb, opacity, opacity * torch.tensor([0.0, 2.0, 4.0]))
 
 
 def test_the_background_shows_through_all_channels_but_opacity():

@@ -60,7 +60,7 @@ def backward(
 
 
 @kernel
-def visible(density, dt, offsets, transparent, thin, keep, counts, workers):
+def visible(thickness, offsets, transparent, thin, keep, counts, workers):
     """Marks samples that light can reach and that hold something, and counts them a ray [R].
 
     Args:
@@ -73,7 +73,7 @@ def visible(density, dt, offsets, transparent, thin, keep, counts, workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
             optical, kept = 0.0, 0
             for n in range(offsets[ray], offsets[ray + 1]):
-                step = density[n] * dt[n]
+                step = thickness[n]
                 keep[n] = not (optical > furthest or step < thin)  # what is not a number stays, to be noticed
                 kept += keep[n]
                 optical += step

@@ -32,7 +32,7 @@ def unwarp(y, enter, leave, unit):
 @inner
 def edge(k, shift, near, far, step, samples, unbounded, low, span, enter, leave, unit):
     """Distance at which interval k begins."""
-    steps = float32(k) + shift - float32(0.5)
+    steps = (float32(k) - float32(0.5)) + shift
     if not unbounded:
         return min(near + max(steps, float32(0)) * step, far)
     return unwarp(low + span * min(max(steps / float32(samples), float32(0)), float32(1)), enter, leave, unit)
@@ -182,18 +182,10 @@ def points(origins, directions, ray, t, out, workers):
 
 
 @kernel
-def mark(origins, directions, ray, t, centre, half, unbounded, marks, resolution, value, workers):
-    """Writes a value into the cells that hold the samples. Workers may meet in a cell: they write the same there."""
-    samples = len(t)
+def mark(places, centre, half, unbounded, marks, resolution, value, workers):
+    """Writes a value into the cells that hold places [3, N]. Workers may meet in a cell: they write the same there."""
+    samples = places.shape[1]
     for worker in prange(workers):
         for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            r = ray[n]
-            u, v, w = to_unit(
-                origins[r, 0] + t[n] * directions[r, 0],
-                origins[r, 1] + t[n] * directions[r, 1],
-                origins[r, 2] + t[n] * directions[r, 2],
-                centre,
-                half,
-                unbounded,
-            )
+            u, v, w = to_unit(places[0, n], places[1, n], places[2, n], centre, half, unbounded)
             marks[(cell(u, resolution) * resolution + cell(v, resolution)) * resolution + cell(w, resolution)] = value
