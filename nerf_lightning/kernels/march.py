@@ -9,8 +9,8 @@ from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import fast
 
-MAX_CANDIDATES = 1 << 20
-"""Intervals the reference looks at together: bounds the memory of one call, whatever the number of rays."""
+MOST = 1 << 20
+"""Intervals the reference looks at together where nobody says more."""
 BLOCK = 4
 """Cells along a side of the blocks that the fast version crosses in one leap where they are empty."""
 
@@ -79,6 +79,7 @@ def march_reference(
     samples: int,
     step: float,
     room: int | None = None,
+    most: int = MOST,
 ) -> Packed:
     """`march` in plain torch, for every device."""
     resolution = round(len(occupied) ** (1 / 3))
@@ -90,7 +91,7 @@ def march_reference(
         edges = torch.minimum(near[:, None] + steps.clamp_min(0) * step, far[:, None])
     start, end = edges[:, :-1], edges[:, 1:]
     t, keep = (start + end) / 2, end > start
-    rows = max(1, MAX_CANDIDATES // (samples + 1))
+    rows = max(1, most // (samples + 1))
     for first in range(0, len(rays), rows):
         part = slice(first, first + rows)
         unit = bounds.to_unit(rays.origins[part, None] + t[part, :, None] * rays.directions[part, None])
@@ -109,6 +110,7 @@ def march(
     samples: int,
     step: float,
     room: int | None = None,
+    most: int = MOST,
 ) -> Packed:
     """Equal steps from near to far, of which those are kept whose midpoint lies in an occupied cell.
 
@@ -121,10 +123,11 @@ def march(
         step: length of a step inside bounds.
         room: entries to make, whatever is found, so that no host waits to learn how much that is. Where less is found, the
             last interval is repeated with length 0; where more is found, rays that end beyond it in `offsets` lack some.
+        most: intervals the reference looks at together: bounds the memory of one call, whatever the number of rays.
     """
     constants = not any(x.requires_grad for x in (rays.origins, rays.directions, near, far, shift))
     if room is not None or not (constants and fast(rays.origins, near, shift)):
-        return march_reference(rays, bounds, near, far, shift, occupied, samples, step, room)
+        return march_reference(rays, bounds, near, far, shift, occupied, samples, step, room, most)
     from nerf_lightning.kernels.cpu import march as cpu
     from nerf_lightning.kernels.cpu import workers
 

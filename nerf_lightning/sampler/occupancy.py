@@ -13,8 +13,8 @@ from nerf_lightning.kernels.march import Packed
 from nerf_lightning.options import Count
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
 
-MAX_ASKED = 1 << 17
-"""Positions at which the density is asked together: bounds the memory of one call."""
+ASKED, LOOKED_AT = 4, 32
+"""Positions at which the density is asked together, and steps looked at together, for each sample that is rendered so."""
 MOST_CAMERAS = 128
 """Cameras, evenly chosen, that tell which cells are in view."""
 ROOM = 1.25
@@ -140,12 +140,14 @@ class OccupancySampler(Sampler):
         cells: Bool[Tensor, "cells"],
         room: int | None = None,
     ) -> Packed:
-        return march(rays, self.bounds, near, far, shift, cells, self.samples, self.step_length, room)
+        return march(
+            rays, self.bounds, near, far, shift, cells, self.samples, self.step_length, room, LOOKED_AT * self.chunk
+        )
 
     @torch.no_grad()
     def _thickness(self, density: DensityFn, rays: Rays, packed: Packed) -> Float[Tensor, "N"]:
         """Optical thickness of intervals, by the density at their middle; mixed precision gives halves."""
-        found = [density(part).float() for part in Samples(*packed).positions(rays).split(MAX_ASKED)]
+        found = [density(part).float() for part in Samples(*packed).positions(rays).split(ASKED * self.chunk)]
         return (found[0].detach() if len(found) == 1 else torch.cat(found)) * packed[1]
 
     @torch.no_grad()
@@ -198,7 +200,10 @@ class OccupancySampler(Sampler):
         n = self.resolution
         corner = torch.stack([cells // (n * n), cells // n % n, cells % n])
         unit = ((corner + torch.rand(corner.shape, generator=generator, device=device)) / n).T
-        found = torch.cat([density(part) for part in self.bounds.to_world(unit).split(MAX_ASKED)]) * self.step_length
+        found = (
+            torch.cat([density(part) for part in self.bounds.to_world(unit).split(ASKED * self.chunk)])
+            * self.step_length
+        )
         self.thickness[cells] = torch.maximum(self.thickness[cells] * self.decay, found)
         occupied = self.allowed & (self.thickness > self.thickness.mean().mul(0.5).clamp_max(self.threshold))
         # With no density anywhere there would be no samples, hence no gradient, for ever: look everywhere again.

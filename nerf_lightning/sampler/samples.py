@@ -38,7 +38,7 @@ class Samples:
 
     def positions(self, rays: Rays) -> Float[Tensor, "N 3"]:
         """World positions of the midpoints."""
-        if self.places is not None:
+        if self.places is not None and not rays.origins.requires_grad:
             return self.places
         return points(rays.origins, rays.directions, self.ray, self.t)
 
@@ -76,6 +76,9 @@ def split(samples: Samples, most: int) -> Iterator[tuple[slice, Samples]]:
 
 class Sampler(InBounds):
     """Base of samplers. Without a generator (evaluation) the samples do not depend on chance."""
+
+    chunk = 1 << 15
+    """Samples that a device renders together: what a sampler does at once is a multiple of that."""
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         raise TypeError(f"{type(self).__name__} must define forward(rays, density, generator) -> Samples")

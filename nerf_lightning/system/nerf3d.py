@@ -42,6 +42,7 @@ class NeRF3D(System):
         super().__init__(optimizer, schedule, seed, chunk)
         self.field = field
         self.sampler = sampler
+        self.sampler.chunk = chunk
         self.renderer = renderer
 
     def take(self, smaller: System) -> None:

@@ -18,14 +18,20 @@ CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 
 
 def marched(
-    rays: Rays, bounds: Bounds, occupied: Tensor, samples: int, jittered: bool = False, step: float | None = None
+    rays: Rays,
+    bounds: Bounds,
+    occupied: Tensor,
+    samples: int,
+    jittered: bool = False,
+    step: float | None = None,
+    most: int = 1 << 20,
 ) -> Samples:
     near, far = bounds.near_far(rays)
     shift = torch.zeros_like(near)
     if jittered:
         shift = torch.rand(near.shape, generator=torch.Generator().manual_seed(3))
     step = 2 * float(bounds.half_size.norm()) / samples if step is None else step
-    return Samples(*march(rays, bounds, near, far, shift, occupied, samples, step))
+    return Samples(*march(rays, bounds, near, far, shift, occupied, samples, step, most=most))
 
 
 def everywhere(resolution: int) -> Tensor:
@@ -137,8 +143,7 @@ def test_looking_at_fewer_intervals_together_changes_nothing(candidates: int, bo
     whole = marched(rays, box, occupied, 40, jittered=True)
     module, asked = import_module("nerf_lightning.kernels.march"), []
     monkeypatch.setattr(module, "cell_index", lambda unit, n: (asked.append(len(unit)), cell_index(unit, n))[1])
-    monkeypatch.setattr(module, "MAX_CANDIDATES", candidates)
-    parts = marched(rays, box, occupied, 40, jittered=True)
+    parts = marched(rays, box, occupied, 40, jittered=True, most=candidates)
     assert len(asked) > 1 and max(asked) <= max(candidates, 41)
     for name in ("t", "dt", "ray", "offsets"):
         assert torch.equal(getattr(whole, name), getattr(parts, name))
