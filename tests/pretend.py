@@ -6,7 +6,6 @@ it passes the dispatcher, so `benchmarks.count` counts it. Random numbers come f
 live here.
 """
 
-import copy
 from typing import Any
 
 import pytest
@@ -128,8 +127,13 @@ def in_halves(function: Any) -> Any:
 class Module(backend_registration._DummyBackendModule):
     """`torch.pretend`."""
 
+    there = False
+    """Whether the device is: only for tests that ask for it, as others expect to find a CPU alone."""
     waited = 0
-    """Times that somebody waited for the device."""
+    """Times that somebody waited for it."""
+
+    def is_available(self) -> bool:
+        return Module.there
 
     def synchronize(self) -> None:
         Module.waited += 1
@@ -179,9 +183,10 @@ _kept: list[Any] = []
 """Registrations end when they are forgotten."""
 
 
-def register() -> torch.device:
-    """Makes the device known to torch and Lightning, once in a process."""
-    if not _kept:
+def register() -> None:
+    """Makes the device known to torch and Lightning, where it can be. Before anything is differentiated: autograd counts the
+    devices once."""
+    if not missing() and not _kept:
         backend_registration._setup_privateuseone_for_python_backend(NAME, backend_module=Module())
         for name, made in (("empty.memory_format", empty), ("empty_strided", empty_strided), ("_copy_from", copied)):
             torch.library.impl(f"aten::{name}", "PrivateUse1")(made)
@@ -192,7 +197,9 @@ def register() -> torch.device:
         others.fallback(torch.library.fallthrough_kernel)
         _kept.extend((halves, others))
         AcceleratorRegistry.register(NAME, PretendAccelerator)
-    return torch.device(NAME, 0)
+
+
+register()
 
 
 @pytest.fixture
@@ -201,14 +208,8 @@ def device(monkeypatch: pytest.MonkeyPatch) -> torch.device:
     why = missing()
     if why:
         pytest.skip(why)
-    found, generator, mixed = register(), torch.Generator, MixedPrecision
+    generator, mixed = torch.Generator, MixedPrecision
+    monkeypatch.setattr(Module, "there", True)
     monkeypatch.setattr(torch, "Generator", lambda device="cpu": generator("cpu" if NAME in str(device) else device))
     monkeypatch.setattr(accelerator_connector, "MixedPrecision", lambda flag, _: mixed(flag, NAME))
-    return found
-
-
-def like(value: Any) -> Any:
-    """A copy of tensors, modules and containers of them on the device."""
-    if isinstance(value, torch.nn.Module):
-        return copy.deepcopy(value).to(NAME)
-    return pytree.tree_map(lambda x: x.to(NAME) if isinstance(x, torch.Tensor) else x, value)
+    return torch.device(NAME, 0)

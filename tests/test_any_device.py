@@ -85,8 +85,16 @@ def test_the_device_keeps_to_itself(device: torch.device):
     assert torch.equal((there + torch.tensor(1.0)).cpu(), torch.full((3,), 2.0)), "a single number may come along"
 
 
+@pytest.fixture
+def without_doubles(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.device:
+    """The device as Apple's are: it knows no double precision."""
+    monkeypatch.setattr(Pretend, "doubles", False)
+    monkeypatch.setattr(sums, "WITHOUT_DOUBLE", (NAME,))
+    return device
+
+
 @pytest.mark.parametrize("name", MODELS)
-def test_a_run_ends_as_it_should(name: str, device: torch.device, tmp_path: Path):
+def test_a_run_ends_as_it_should(name: str, without_doubles: torch.device, tmp_path: Path):
     found = trained(name, tmp_path)
     assert found["device"] == NAME and found["machine"]["accelerator"] == NAME and found["steps"] == 12
     assert math.isfinite(found["psnr"]) and not found["recoveries"]
@@ -140,10 +148,9 @@ VARIANTS = {
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("kind", ["alpha", "unbounded"])
 def test_steps_come_to_what_they_come_to_on_the_cpu(
-    variant: str, kind: str, device: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    variant: str, kind: str, without_doubles: torch.device, tmp_path: Path
 ):
-    monkeypatch.setattr(Pretend, "doubles", False)  # Apple's chips have none
-    monkeypatch.setattr(sums, "WITHOUT_DOUBLE", (NAME,))
+    device = without_doubles
     use_kernels("reference")
     found = {}
     for where in (torch.device("cpu"), device):
@@ -257,7 +264,7 @@ def test_the_viewer_paints(device: torch.device, run: Path):
 
 def test_a_search_finds_the_smallest_that_is_enough(device: torch.device, tmp_path: Path):
     save_npz(toy(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
-    rungs = [{"density_components": 3, "colour_components": 3, "coarsest": 4, "finest": side} for side in (4, 8)]
+    rungs = [{"density_components": 8, "colour_components": 8, "coarsest": 4, "finest": side} for side in (4, 8)]
     ladder = {"rungs": rungs, "samplers": [{"samples": 32, "resolution": 8}]}
     (tmp_path / "ladder.yaml").write_text(yaml.safe_dump(ladder))
     given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "budget.steps=30"]
@@ -312,3 +319,36 @@ def test_a_step_of_a_picture_waits_for_nothing(name: str, device: torch.device, 
             optimizer.step()
             optimizer.zero_grad()
     assert count.waits == 0 and count.operations <= 100, count.names.most_common()
+
+
+def test_rays_that_room_was_too_small_for_teach_nothing(device: torch.device, tmp_path: Path):
+    system, data = system_of(options("hashgrid"), tmp_path)
+    assert isinstance(system, NeRF3D)
+    stepped(system.to(device), data, 2, device)
+    batch, sampler = data.draw(2).to(device), system.sampler
+    sampler.update(2, system.field.density, step_generator(0, 1, 2, device))
+    before = sampler.per_ray
+    assert before is not None, "there is room for as many as were counted"
+
+    def drawn(per_ray: tuple[float, float] | None) -> Any:
+        sampler.per_ray = per_ray
+        return sampler(batch.rays, system.field.density, step_generator(0, 1, 2, device))
+
+    with torch.no_grad():
+        counted, roomy, tight = drawn(None), drawn(before), drawn((before[0], 0.4 * before[1]))
+    assert counted.whole is None and roomy.whole.all() and len(roomy) > len(counted)
+    ends = [int(end) for end in counted.offsets.cpu()]
+    torch.testing.assert_close(roomy.t[: ends[-1]].cpu(), counted.t.cpu())
+    assert torch.equal(roomy.offsets.cpu(), counted.offsets.cpu()) and not roomy.dt[ends[-1] :].any()
+    whole = tight.whole.cpu()
+    assert whole.tolist() == [end <= len(tight) for end in ends[1:]] and 0 < int(whole.sum()) < len(whole)
+    assert torch.equal(tight.t[: ends[int(whole.sum())]].cpu(), counted.t[: ends[int(whole.sum())]].cpu())
+
+    def loss(pixels: torch.Tensor) -> float:
+        sampler.per_ray = (before[0], 0.4 * before[1])
+        changed = replace(batch, pixels=pixels)
+        return float(system.loss(changed, step_generator(0, 1, 2, device), 2)[0].detach())
+
+    others = batch.pixels.clone()
+    others[~tight.whole] = 255 - others[~tight.whole]
+    assert loss(batch.pixels) == loss(others) > 0
