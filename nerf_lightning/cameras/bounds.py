@@ -78,7 +78,7 @@ class Bounds:
     def to_unit(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """World positions -> [0, 1]^3. Bounded: outside the box leaves the unit cube. Unbounded: never leaves it."""
         if not self.unbounded:
-            return (positions - self._low) / self._size
+            return (positions - self._low).div_(self._size)
         local = (positions - self.centre) / self.half_size
         norm = local.abs().amax(-1, keepdim=True).clamp_min(1.0)
         return (2.0 - 1.0 / norm) * (local / norm) * 0.25 + 0.5

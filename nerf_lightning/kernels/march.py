@@ -94,8 +94,8 @@ def march_reference(
     rows = max(1, most // (samples + 1))
     for first in range(0, len(rays), rows):
         part = slice(first, first + rows)
-        unit = bounds.to_unit(rays.origins[part, None] + t[part, :, None] * rays.directions[part, None])
-        cells = cell_index(unit, resolution)
+        places = (t[part, :, None] * rays.directions[part, None]).add_(rays.origins[part, None])
+        cells = cell_index(bounds.to_unit(places), resolution)
         keep[part].logical_and_(occupied.index_select(0, cells.flatten()).view(cells.shape))
     return _pack(t, end - start, keep, room)
 

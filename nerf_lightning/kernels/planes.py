@@ -17,18 +17,18 @@ class Footprint(NamedTuple):
     """What positions read: rows of all planes and of all lines, one mode after the other, and their shares."""
 
     plane_rows: Int[Tensor, "twelveN"]
-    plane_shares: Float[Tensor, "N 3 4 1"]
+    plane_shares: Float[Tensor, "4 N 3 1"]
     line_rows: Int[Tensor, "sixN"]
-    line_shares: Float[Tensor, "N 3 2 1"]
+    line_shares: Float[Tensor, "2 N 3 1"]
 
 
 @constant
 def _axes_and_steps(side: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """The first axes of all planes, then the second ones; and what modes, corners and ends add to a row."""
     axes = torch.tensor(PLANE_AXES, device=device).T.flatten()
-    mode, end = torch.arange(3, device=device)[:, None], torch.arange(2, device=device)
+    mode, end = torch.arange(3, device=device), torch.arange(2, device=device)
     corner = (end[:, None] * side + end).flatten()
-    return axes, mode * side * side + corner, mode * side + end
+    return axes, mode * side * side + corner[:, None, None], mode * side + end[:, None, None]
 
 
 def footprint(unit: Float[Tensor, "N 3"], side: int) -> Footprint:
@@ -37,23 +37,22 @@ def footprint(unit: Float[Tensor, "N 3"], side: int) -> Footprint:
     scaled = unit.clamp(0, 1) * (side - 1)
     low = scaled.long().clamp_(0, side - 2)
     fraction = scaled - low
-    share = torch.stack([1 - fraction, fraction], dim=2)
-    (across, down), (row, column) = (x.index_select(1, axes).split(3, dim=1) for x in (share, low))
-    corner = torch.add(column, row, alpha=side)
+    share = torch.stack([1 - fraction, fraction])
+    (across, down), (row, column) = (x.index_select(-1, axes).split(3, dim=-1) for x in (share, low))
     return Footprint(
-        (corner[..., None] + plane_steps).flatten(),
-        (across[..., None] * down[:, :, None]).view(len(unit), 3, 4, 1),
-        (low[..., None] + line_steps).flatten(),
+        (torch.add(column, row, alpha=side) + plane_steps).flatten(),
+        (across[:, None] * down).view(4, len(unit), 3, 1),
+        (low + line_steps).flatten(),
         share[..., None],
     )
 
 
 def _products(planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], at: Footprint) -> Float[Tensor, "N 3 C"]:
     """One gather for all planes and one for all lines: on a GPU the number of operations is what counts."""
-    shape, channels = at.plane_shares.shape[:3], lines.shape[2]
-    corners = planes.flatten(0, 2).index_select(0, at.plane_rows).view(*shape, channels)
-    ends = lines.flatten(0, 1).index_select(0, at.line_rows).view(*shape[:2], 2, channels)
-    return (corners * at.plane_shares).sum(2) * (ends * at.line_shares).sum(2)
+    channels = lines.shape[2]
+    corners = planes.flatten(0, 2).index_select(0, at.plane_rows).view(*at.plane_shares.shape[:3], channels)
+    ends = lines.flatten(0, 1).index_select(0, at.line_rows).view(*at.line_shares.shape[:3], channels)
+    return (corners * at.plane_shares).sum(0) * (ends * at.line_shares).sum(0)
 
 
 def plane_line_products_reference(
