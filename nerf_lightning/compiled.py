@@ -26,7 +26,9 @@ VARIANTS = 64
 def _prepare() -> None:
     """What kernels keep for a device are constants rather than something to compile."""
     torch._dynamo.config.recompile_limit = VARIANTS
-    warnings.filterwarnings("ignore", ".*`functools.lru_cache`-wrapped function.*")  # of just these
+    # Of just these functions, and of what one part hands to the next.
+    for message in (".*`functools.lru_cache`-wrapped function.*", ".*a Tensor that is not a leaf Tensor.*"):
+        warnings.filterwarnings("ignore", message)
     for module in (harmonics, hashgrid, planes, voxels):
         for kept in vars(module).values():
             if hasattr(kept, "cache_info"):
@@ -44,9 +46,9 @@ def _constant(kept: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _settled(given: Any) -> Any:
-    """What is given to a compiled part, as it would not have to be compiled anew for."""
+    """What is given to a compiled part, always of one kind: views of other tensors would have it compiled anew."""
     if isinstance(given, torch.Tensor):
-        return given.contiguous()
+        return given.contiguous() if given._base is None else given.clone(memory_format=torch.contiguous_format)
     if isinstance(given, InBounds):
         given.bounds.settle()
     return given
@@ -64,8 +66,8 @@ def _compiled(function: Callable[..., Any], backend: str) -> Callable[..., Any]:
     return call
 
 
-def part(method: Callable[..., Any], backend: str | None) -> Callable[..., Any]:
-    """A module's method: compiled where there is a backend, taking arguments in their order alone; else as it is."""
+def part(method: Any, backend: str | None) -> Callable[..., Any]:
+    """A module's bound method: compiled where there is a backend, taking arguments in their order alone; else as it is."""
     if backend is None:
         return method
     return functools.partial(_compiled(method.__func__, backend), method.__self__)
@@ -82,7 +84,8 @@ def check_compiler(device: torch.device, backend: str) -> None:
         return 2 * x
 
     try:
-        with torch._inductor.config.patch(force_disable_caches=True):
+        with warnings.catch_warnings(), torch._inductor.config.patch(force_disable_caches=True):
+            warnings.simplefilter("ignore")  # of what is missing without caches
             torch.compile(double, backend=backend)(torch.ones(3, device=device))
     except RuntimeError as error:
         needed = "a C++ compiler" if device.type == "cpu" else f"what torch.compile needs for {device.type}"
