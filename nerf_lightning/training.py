@@ -26,7 +26,8 @@ from nerf_lightning.build import (
 )
 from nerf_lightning.callbacks import Results
 from nerf_lightning.callbacks.attached import attached
-from nerf_lightning.dataset import PixelDataModule, RayDataModule, draw_rays
+from nerf_lightning.compiled import BACKEND, check_compiler
+from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, draw_rays
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
@@ -42,7 +43,7 @@ from nerf_lightning.system import NeRF2D, NeRF3D, System
 SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
 """What stands beside the options in TensorBoard's HParams tab."""
 log = logging.getLogger(__name__)
-LATER = {"device": "auto", "limits": {"batch": None, "chunk": None}}
+LATER = {"device": "auto", "compile": False, "limits": {"batch": None, "chunk": None}}
 """What runs of earlier versions do not have, and may be given when they are resumed."""
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
@@ -64,9 +65,11 @@ def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None =
         cfg, checkpoint = resume(cfg, folder)
     device = device_of(cfg)
     quiet()
-    settings = {"seed": cfg.seed, "threads": cfg.threads, "kernels": cfg.kernels}
+    settings = {"seed": cfg.seed, "threads": cfg.threads, "kernels": cfg.kernels, "compile": cfg.compile}
     check_options("", prepare_process, settings)
     prepare_process(**settings)
+    if cfg.compile:
+        check_compiler(device, BACKEND)
     if resumed:
         data = data_again(cfg, load_scene(folder)[0], cfg.dataset.get("path"))
     else:
@@ -76,6 +79,7 @@ def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None =
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt)
     system = build_system(cfg, frame_of(data), device)
+    system.backend = BACKEND if cfg.compile else None
     if system.field.sizing:
         log.info("model: %s", system.field.sizing)
     check_background(cfg, data, system)
@@ -85,7 +89,8 @@ def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None =
     if trainer.is_global_zero:
         save_config(cfg, folder)
         save_scene(data, folder)
-    warm_up(system, data, trainer.strategy.root_device)
+    with trainer.precision_plugin.train_step_context():
+        warm_up(system, data, trainer.strategy.root_device)
     trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(system, data, verbose=False)
     results = results_of(trainer).summary
@@ -114,11 +119,13 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     return saved, checkpoint
 
 
-def prepare_process(seed: Annotated[int, AtLeast(0)], threads: Count | None, kernels: str) -> None:
+def prepare_process(
+    seed: Annotated[int, AtLeast(0)], threads: Count | None, kernels: str, compile: bool = False
+) -> None:
     """What a run sets for its whole process."""
     if threads is not None:
         torch.set_num_threads(threads)
-    use_kernels(kernels)
+    use_kernels("reference" if compile else kernels)
     keep_freed_memory()
     torch.set_flush_denormal(True)  # dying weights otherwise slow the CPU down many times over
     L.seed_everything(seed, verbose=False)
@@ -154,8 +161,12 @@ def check_processes(trainer: L.Trainer, system: System) -> None:
 
 
 def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch.device) -> None:
-    """Runs a small step on a copy, so that kernels are ready before the clock starts: a CPU's are compiled the first time."""
-    told = " (the first time they are compiled: half a minute)" if device.type == "cpu" else ""
+    """Runs a small step on a copy, so that kernels are ready before the clock starts.
+
+    A CPU's are compiled the first time, those of `compile` in every process.
+    """
+    compiled = device.type == "cpu" or system.backend is not None
+    told = " (the first time they are compiled: half a minute)" if compiled else ""
     with Console().status(f"getting the kernels ready{told}"):
         trial = copy.deepcopy(system).to(device)
         if isinstance(trial, NeRF3D):
@@ -165,7 +176,8 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
                 0
             ].backward()  # step 1: without a look at the whole grid
         elif isinstance(trial, NeRF2D):
-            trial.field(torch.rand(64, 2, generator=step_generator(0, 0, 0)).to(device)).sum().backward()
+            uv, rgb = torch.rand(64, 5, generator=step_generator(0, 0, 0)).to(device).split([2, 3], dim=1)
+            trial.loss(PixelBatch(uv, rgb)).backward()
 
 
 def results_of(trainer: L.Trainer) -> Results:

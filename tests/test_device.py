@@ -93,7 +93,7 @@ def test_a_resumed_run_may_go_on_elsewhere(inside, small_run: Path, plain_torch:
     run = tmp_path / "run"
     shutil.copytree(small_run, run)
     config = yaml.safe_load((run / "config.yaml").read_text())
-    del config["device"], config["limits"]
+    del config["device"], config["limits"], config["compile"]
     config["trainer"]["accelerator"] = "auto"
     (run / "config.yaml").write_text(yaml.safe_dump(config))
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}

@@ -72,6 +72,10 @@ class Bounds:
         # The contraction leaves the middle half of the unit cube to the box.
         return (4 if self.unbounded else 2) * self.longest / self.pixel
 
+    def settle(self) -> None:
+        """Works out at once what else would be worked out when it is first asked for."""
+        _ = self.centre, self.half_size, self._low, self._size, self.longest
+
     def to(self, device: torch.device | str) -> "Bounds":
         return replace(self, aabb=self.aabb.to(device))
 

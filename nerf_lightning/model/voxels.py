@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds
@@ -132,11 +132,17 @@ class VoxelField(Field):
         self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
         rows, weights = locate(self.index, self.bounds.to_unit(positions))
-        if torch.is_grad_enabled():
-            mark_rows(self.seen, rows, self.steps)
         basis = seen_from(directions, 1 + self.terms)[:, 1:]
         raw, rgb = read_voxels(self.log_density, self.colours, self.views, rows, weights, basis)
-        return self.per_length(raw), torch.sigmoid(rgb)
+        found = self.per_length(raw), torch.sigmoid(rgb)
+        if torch.is_grad_enabled():
+            self.mark(rows)
+        return found
+
+    @torch.compiler.disable  # else each step would be compiled anew
+    def mark(self, rows: Int[Tensor, "N 8"]) -> None:
+        """Notes that these rows were read."""
+        mark_rows(self.seen, rows, self.steps)
 
     def penalty(self) -> Float[Tensor, ""] | None:
         """The roughness of the log-densities, in each step that of another piece of the table."""

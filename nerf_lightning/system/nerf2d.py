@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.compiled import part
 from nerf_lightning.dataset import PictureBatch, PixelBatch
 from nerf_lightning.model import PictureField
 from nerf_lightning.system.metrics import psnr
@@ -39,8 +40,12 @@ class NeRF2D(System):
             group["initial_lr"] = group["lr"] = group["lr"] * self.field.rate
         return optimizer
 
+    def loss(self, batch: PixelBatch) -> Float[Tensor, ""]:
+        """What a step minimises."""
+        return torch.nn.functional.mse_loss(part(self.field.forward, self.backend)(batch.uv), batch.rgb)
+
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
-        loss = torch.nn.functional.mse_loss(self.field(batch.uv), batch.rgb)
+        loss = self.loss(batch)
         self.stats = StepStats(loss.detach(), len(batch.uv), len(batch.uv))
         return loss
 

@@ -1,11 +1,13 @@
 """NeRF3D: fit a radiance field to rays."""
 
+import copy
 import math
 
 import torch
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
+from nerf_lightning.compiled import part
 from nerf_lightning.dataset import RayBatch, ViewBatch
 from nerf_lightning.model import Field
 from nerf_lightning.renderer import Rendered, VolumeRenderer
@@ -61,14 +63,27 @@ class NeRF3D(System):
             assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one
             for parameter in replaced:
                 optimizer.state.pop(parameter, None)
+            if self.backend is not None:
+                self.rehearse(batch)
+
+    def rehearse(self, batch: RayBatch) -> None:
+        """Runs a step on a copy with the clock stopped: what it compiles for the sizes at hand is not training."""
+        from nerf_lightning.callbacks import Budget  # which needs systems itself
+
+        field, sampler = copy.deepcopy(self.field), copy.deepcopy(self.sampler)
+        trial = NeRF3D(field, sampler, self.renderer, self.make_optimizer, self.schedule, self.seed, self.chunk)
+        trial.backend = self.backend
+        with Budget.of(self.trainer).paused(), self.trainer.precision_plugin.train_step_context():
+            trial.loss(batch, step_generator(self.seed, 1, self.global_step, self.device), 1)[0].backward()
 
     def loss(self, batch: RayBatch, generator: torch.Generator, step: int) -> tuple[Tensor, StepStats]:
         """What a step minimises, and what it did; `generator` is all its chance."""
         with torch.no_grad():
-            self.sampler.update(step, self.field.density, generator)
-            samples = self.sampler(batch.rays, self.field.density, generator)
+            density = part(self.field.density, self.backend)
+            self.sampler.update(step, density, generator)
+            samples = self.sampler(batch.rays, density, generator)
         backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
-        rendered = self.renderer(batch.rays, samples, self.field, backgrounds)
+        rendered = part(self.renderer.forward, self.backend)(batch.rays, samples, self.field, backgrounds)
         truth = batch.target(backgrounds)
         # A ray that lacks some of its samples teaches nothing.
         rgb = rendered.rgb if samples.whole is None else torch.where(samples.whole[:, None], rendered.rgb, truth)

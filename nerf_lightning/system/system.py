@@ -73,6 +73,8 @@ class System(L.LightningModule):
         """Fraction of the budget done; the Budget callback keeps it."""
         self.rate = 1.0
         """Factor on the learning rate beside the schedule's; the Guard callback lowers it where training broke down."""
+        self.backend: str | None = None
+        """What compiles the parts of a training step, see `compiled.part`; None leaves them as they are."""
         self.stats = StepStats(torch.tensor(math.nan), 0, 0)
 
     def take(self, smaller: "System") -> None:

@@ -1,0 +1,68 @@
+"""Training with torch.compile: the same values, gradients and quality, and one line where it cannot be had."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from once import once
+
+from nerf_lightning.compiled import BACKEND, check_compiler, part
+from nerf_lightning.device import CPU
+from nerf_lightning.errors import InputError
+from nerf_lightning.model import SirenField
+
+ROOT = Path(__file__).resolve().parents[1]
+FIELDS = ("mlp", "hashgrid", "tensorf", "voxels")
+RUN = ("+experiment=smoke_2d", "device=cpu")
+
+
+@pytest.fixture(scope="session")
+def found(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> dict:
+    """What compiling.py found."""
+
+    def make(folder: Path) -> dict:
+        line = [sys.executable, str(ROOT / "tests" / "compiling.py"), str(folder)]
+        paths = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(folder / "kernels")}
+        done = subprocess.run(line, env={**os.environ, **paths}, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout.splitlines()[-1])
+
+    return once(tmp_path_factory, "compiled", make)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_compiled_field_gives_the_same_values_and_gradients_also_after_growing(name: str, found: dict):
+    assert found[name]["worst"] < 1e-4 and found[name]["compiled"] >= 2
+    assert found[name]["again"] == 0, "a copy of it, or a batch of another size, was compiled anew"
+
+
+def test_a_compiled_training_is_as_good(found: dict):
+    compiled, plain = found["trained"]
+    assert compiled == pytest.approx(plain, abs=0.05)
+
+
+def test_without_a_backend_nothing_is_compiled():
+    field = SirenField((8, 8), width=8)
+    assert part(field.forward, None) == field.forward
+
+
+@pytest.fixture
+def no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch._inductor.config.cpp, "cxx", ("no_such_compiler",))
+
+
+def test_a_missing_compiler_is_one_line_and_nothing_is_written(no_compiler: None, inside, tmp_path: Path):
+    with pytest.raises(InputError, match="config: compile: found true, but .*expected a C.. compiler.*compile=false"):
+        check_compiler(CPU, BACKEND)
+    code, _, err = inside(*RUN, "compile=true")
+    assert code == 2 and err.count("\n") == 1 and "compile: found true, but" in err, err
+    assert not list(tmp_path.rglob("*"))
+
+
+def test_another_value_is_refused(inside, tmp_path: Path):
+    code, _, err = inside(*RUN, "compile=fast")
+    assert code == 2 and "compile: found 'fast', expected true or false" in err, err
