@@ -14,7 +14,7 @@ from torch.utils._pytree import tree_map_only
 
 from nerf_lightning.cameras import InBounds
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import harmonics, hashgrid, planes, voxels
+from nerf_lightning.kernels.constants import KEPT
 
 BACKEND = "inductor"
 """What a run compiles with."""
@@ -29,10 +29,8 @@ def _prepare() -> None:
     # Of just these functions, and of what one part hands to the next.
     for message in (".*`functools.lru_cache`-wrapped function.*", ".*a Tensor that is not a leaf Tensor.*"):
         warnings.filterwarnings("ignore", message)
-    for module in (harmonics, hashgrid, planes, voxels):
-        for kept in vars(module).values():
-            if hasattr(kept, "cache_info"):
-                kept.__wrapped__ = _constant(kept)  # what is compiled in place of a function that keeps its results
+    for kept in KEPT:
+        kept.__wrapped__ = _constant(kept)  # type: ignore[attr-defined]  # what is compiled in its place
 
 
 def _constant(kept: Callable[..., Any]) -> Callable[..., Any]:

@@ -2,11 +2,14 @@
 
 import functools
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
 Made = TypeVar("Made")
+
+KEPT: list[Callable[..., Any]] = []
+"""All functions whose results are kept."""
 
 
 def constant(make: Callable[..., Made]) -> Callable[..., Made]:
@@ -18,4 +21,5 @@ def constant(make: Callable[..., Made]) -> Callable[..., Made]:
         with torch.inference_mode(False):
             return make(*arguments)
 
+    KEPT.append(made)
     return made
