@@ -37,8 +37,11 @@ def _constant(kept: Callable[..., Any]) -> Callable[..., Any]:
     """The same function, as one whose results are constants: parameters have a fixed size, where other tensors have any."""
 
     @torch._dynamo.assume_constant_result
+    def boxed(*given: Any) -> list[Any]:  # in a list, as one graph takes no two single tensors under the same name
+        return [tree_map_only(torch.Tensor, lambda x: torch.nn.Parameter(x.clone(), requires_grad=False), kept(*given))]
+
     def made(*given: Any) -> Any:
-        return tree_map_only(torch.Tensor, lambda x: torch.nn.Parameter(x.clone(), requires_grad=False), kept(*given))
+        return boxed(*given)[0]
 
     return made
 

@@ -6,10 +6,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.kernels.constants import constant
+
 
 def sinusoidal(x: Float[Tensor, "*batch D"], frequencies: int) -> Float[Tensor, "*batch E"]:
     """[x, sin(2^0 pi x), cos(2^0 pi x), ..., sin(2^(L-1) pi x), cos(2^(L-1) pi x)], E = D (1 + 2 L)  (NeRF, eq. 4)."""
-    octaves = math.pi * 2.0 ** torch.arange(frequencies, device=x.device, dtype=x.dtype)
-    angles = x[..., None, :] * octaves[:, None]
+    angles = x[..., None, :] * _octaves(frequencies, x.dtype, x.device)
     waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=-2)
     return torch.cat([x, waves.flatten(-3)], dim=-1)
+
+
+@constant
+def _octaves(frequencies: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "L 1"]:
+    return math.pi * 2.0 ** torch.arange(frequencies, device=device, dtype=dtype)[:, None]
