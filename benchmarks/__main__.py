@@ -15,10 +15,10 @@ import torch
 
 import nerf_lightning
 from benchmarks import capture, device, growth, kernels, methods, overhead, pictures, shapes, sizes
-from nerf_lightning.device import the_device
 from nerf_lightning.errors import InputError
-from nerf_lightning.files import write_json
-from nerf_lightning.machine import describe_machine
+from nerf_lightning.utils.device import the_device
+from nerf_lightning.utils.files import write_json
+from nerf_lightning.utils.machine import describe_machine
 
 PARTS = ("methods", "kernels", "growth", "overhead", "capture", "pictures", "sizes", "shapes")
 ALONE = ("device",)

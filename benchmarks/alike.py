@@ -14,7 +14,7 @@ from torch import Tensor
 
 from benchmarks.cases import Case, cases, versions
 from benchmarks.kernels import case_milliseconds, random_like
-from nerf_lightning.device import CPU
+from nerf_lightning.utils.device import CPU
 
 APART = 1e-4
 """Largest difference of floating numbers that counts as equal, as a share of the largest of them."""

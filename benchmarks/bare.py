@@ -5,9 +5,9 @@ import time
 import torch
 
 from nerf_lightning.dataset import RayDataModule
-from nerf_lightning.device import synchronize
-from nerf_lightning.seeding import step_generator
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.device import synchronize
+from nerf_lightning.utils.seeding import step_generator
 
 
 def bare_step(

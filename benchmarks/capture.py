@@ -8,18 +8,18 @@ import torch
 
 from benchmarks.methods import train
 from nerf_lightning.cameras import look_at
-from nerf_lightning.capture.detect import Mark
-from nerf_lightning.capture.geometry import angle_between, inverse, project
-from nerf_lightning.capture.layout import TagLayout, flat_pose
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.pack import pack
-from nerf_lightning.capture.pose import mark_poses
+from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
+from nerf_lightning.capture.poses.pose import mark_poses
+from nerf_lightning.capture.poses.solve import Solved
+from nerf_lightning.capture.poses.walk import choose
 from nerf_lightning.capture.run import Capture, capture
-from nerf_lightning.capture.solve import Solved
 from nerf_lightning.capture.synthetic import Flaws, Truth, write_capture
-from nerf_lightning.capture.walk import choose
+from nerf_lightning.capture.tags.detect import Mark
+from nerf_lightning.capture.tags.layout import TagLayout, flat_pose
+from nerf_lightning.dataset.formats.npz import save_npz
 from nerf_lightning.dataset.lens import Lens
-from nerf_lightning.dataset.npz import save_npz
 
 LENS = Lens(1024, 768, 900.0, 900.0, 520.0, 380.0, (-0.2, 0.05, 0.0, 0.0, 0.0))
 SIZE = 0.06

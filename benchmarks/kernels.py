@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.cases import Case, cases, versions
-from nerf_lightning.device import CPU, synchronize
+from nerf_lightning.utils.device import CPU, synchronize
 
 ROUNDS = 15
 

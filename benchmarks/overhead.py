@@ -11,7 +11,7 @@ import torch
 
 from benchmarks.bare import bare_step
 from benchmarks.setup import built
-from nerf_lightning.build import build_trainer, device_of
+from nerf_lightning.config.build import build_trainer, device_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.system import NeRF3D
 

@@ -5,13 +5,14 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.build import build_data, build_system, frame_of
-from nerf_lightning.compose import composed
+from nerf_lightning.config.build import build_data, build_system, frame_of
+from nerf_lightning.config.compose import composed
+from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import RayDataModule
-from nerf_lightning.device import CPU
-from nerf_lightning.limits import limits_of
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.training import prepare_process, quiet
+from nerf_lightning.training.train import prepare_process
+from nerf_lightning.utils.device import CPU
+from nerf_lightning.utils.quiet import quiet
 
 METHODS = ("tensorf", "hashgrid", "voxels", "mlp")
 """In 3D; the recipe of each in its usual size ends in _medium."""

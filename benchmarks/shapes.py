@@ -11,18 +11,18 @@ import trimesh
 
 from benchmarks.capture import FLAWS, LENS, SHEETS, SIZE, home
 from benchmarks.methods import train
-from nerf_lightning.capture.layout import TagLayout
 from nerf_lightning.capture.outputs import Packing
+from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.run import capture
-from nerf_lightning.capture.solve import Solved
 from nerf_lightning.capture.synthetic import write_capture
 from nerf_lightning.capture.tabletop import Tabletop
-from nerf_lightning.dataset.brickmodel import bulldozer
-from nerf_lightning.device import the_device
+from nerf_lightning.capture.tags.layout import TagLayout
+from nerf_lightning.dataset.bricks.model import bulldozer
 from nerf_lightning.export.mesh import mesh_file
 from nerf_lightning.export.verb import views_of
 from nerf_lightning.export.volume import volume_of
-from nerf_lightning.open_run import SceneRun, open_scene_run
+from nerf_lightning.runs.open import SceneRun, open_scene_run
+from nerf_lightning.utils.device import the_device
 
 Rows = list[dict[str, Any]]
 PHOTOS, VIEWS = 20, 40

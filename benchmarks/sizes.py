@@ -9,18 +9,18 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from nerf_lightning import cli
-from nerf_lightning.build import build_data
-from nerf_lightning.callbacks.panels import write_png
-from nerf_lightning.compose import composed
+from nerf_lightning.config import cli
+from nerf_lightning.config.build import build_data
+from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, Views, save_npz
-from nerf_lightning.evenly import evenly
-from nerf_lightning.ink import pixels_of
+from nerf_lightning.drawing.ink import pixels_of
+from nerf_lightning.drawing.panels import write_png
 from nerf_lightning.rightsize.choose import Target
 from nerf_lightning.rightsize.ladder import read_ladder
 from nerf_lightning.rightsize.report import chart
 from nerf_lightning.rightsize.search import Found, Full, search, train_in_full
 from nerf_lightning.stability.toys import Ball, Block, Body, toy
+from nerf_lightning.utils.evenly import evenly
 
 SIZE, VIEWS, HELD_OUT = 200, 100, 10
 """As of bricks and Lego, so that scenes differ in what they show alone."""

@@ -12,9 +12,9 @@ import torch
 from benchmarks.alike import FAILURES, Rows, told
 from benchmarks.cases import versions
 from benchmarks.setup import METHODS, on_device
-from nerf_lightning.compose import composed
-from nerf_lightning.device import CPU
-from nerf_lightning.training import train
+from nerf_lightning.config.compose import composed
+from nerf_lightning.training.train import train
+from nerf_lightning.utils.device import CPU
 
 PICTURE_FIELDS = ("hashgrid2d", "picture_mlp", "fourier", "siren")
 STEPS = 400

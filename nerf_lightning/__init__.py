@@ -9,18 +9,17 @@ The tree is the data flow, seven stages in order:
     cameras/    Cameras (K, c2w, size) turn pixel coordinates into Rays; Bounds say where the content is
     sampler/    Rays become Samples: where along each ray the field is asked
     model/      fields: position, direction -> density, rgb; encodings; 2D fields
+    kernels/    the hot loops of all of these: a plain reference beside a fast version for CPUs
     renderer/   Samples with density and rgb become colour, opacity, depth
     system/     NeRF2D and NeRF3D: LightningModules that hold step, loss, metrics, optimiser
     callbacks/  budget, guard, held-out PSNR, snapshots, orbit, checkpoints, progress, results.json
-    build.py    config -> objects, the only place that instantiates
-    device.py   which device does the work; limits.py what it takes at once
-    view.py     a scene, or a trained run, in the browser: viewer/
-    render/     films and pictures of a run; evaluate/ its figures, view by view; export/ files for other programs
-    sweep.py    many runs from one command line; gallery.py draws what they made
-    stability/  methods tried where they are known to fail
-    chart/      speed against accuracy: which method is worth its time
-    rightsize/  the smallest model that is good enough
-    __main__.py the command line: compose -> build -> fit -> test -> results.json
+    config/     command line -> configuration -> objects; build.py is the only place that instantiates
+    training/   one run, from a configuration to the files in its folder; sweeps: many runs from one command line
+    runs/       run folders and compact files: found, read without trusting them, opened
+
+The verbs, each a folder with `__main__.py` (its options) and `verb.py` (its work): capture/, render/, evaluate/, export/,
+view/, gallery/, chart/ (speed against accuracy), rightsize/ (the smallest model that is good enough), stability/ (methods
+where they are known to fail). What they all paint with is in drawing/; what knows nothing of fields is in utils/.
 
 Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples
 (or points), L levels or frequencies, F features. Cameras follow OpenCV: x right, y down, z forward; `c2w` maps camera

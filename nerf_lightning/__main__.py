@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
-from nerf_lightning import cli
+from nerf_lightning.config import cli
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 def train(cfg: "DictConfig") -> float | None:
     """One run. Returns the held-out PSNR in dB, which is what a sweep optimises; None for a sweep's job that failed."""
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        from nerf_lightning.sweep import job
+        from nerf_lightning.training.sweep import job
 
         return job(cfg)
-    from nerf_lightning.training import train
+    from nerf_lightning.training.train import train
 
     return train(cfg)
 

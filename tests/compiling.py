@@ -17,14 +17,14 @@ from every_model import MODELS
 from torch._dynamo.utils import counters
 from torch.nn.functional import normalize
 
-from nerf_lightning import training
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.compiled import part
-from nerf_lightning.compose import composed
+from nerf_lightning.config.compose import composed
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import Samples
+from nerf_lightning.system.compiled import part
+from nerf_lightning.training import train as training
 
 TRACED, DIFFERENTIATED = "eager", "aot_eager"  # as inductor has it up to its kernels, in a tenth of the time
 BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))

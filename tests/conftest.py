@@ -111,8 +111,8 @@ def inside(verb):
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
     """The folder of a finished run on the built-in scene, seconds long."""
-    from nerf_lightning.compose import composed
-    from nerf_lightning.training import train
+    from nerf_lightning.config.compose import composed
+    from nerf_lightning.training.train import train
 
     folder = tmp_path_factory.mktemp("run")
     train(composed(["+experiment=smoke_3d", "dataset.size=16", "budget.steps=10", "callbacks.orbit.frames=0"], folder))

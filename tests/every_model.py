@@ -12,8 +12,8 @@ from typing import Any
 import torch
 
 from nerf_lightning.callbacks import Checkpoints
-from nerf_lightning.compose import composed
-from nerf_lightning.training import train
+from nerf_lightning.config.compose import composed
+from nerf_lightning.training.train import train
 
 SCENE = [
     *("dataset=bricks", "dataset.size=16", "dataset.train_views=12", "dataset.val_views=1", "dataset.rays=256"),

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from nerf_lightning.runs import Run
+from nerf_lightning.runs.index import Run
 
 MakeRun = Callable[..., Run]
 

@@ -17,21 +17,22 @@ from once import once
 from pretend import NAME, Module, Pretend
 
 from benchmarks.count import Count
-from nerf_lightning import cli
-from nerf_lightning.build import build_data, build_system, build_trainer, frame_of
-from nerf_lightning.compose import composed
+from nerf_lightning.config import cli
+from nerf_lightning.config.build import build_data, build_system, build_trainer, frame_of
+from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.evaluate.__main__ import task as evaluate
 from nerf_lightning.export.__main__ import task as export
 from nerf_lightning.kernels import sums, use_kernels
-from nerf_lightning.open_run import open_scene_run
 from nerf_lightning.render.__main__ import task as render
 from nerf_lightning.rightsize.__main__ import task as rightsize
-from nerf_lightning.seeding import step_generator
+from nerf_lightning.runs.open import open_scene_run
 from nerf_lightning.stability.toys import PILE, toy
 from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.training import quiet, train
-from nerf_lightning.viewer.painter import Painter, Wish
+from nerf_lightning.training.train import train
+from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.view.painter import Painter, Wish
 
 SCENES = ("hashgrid", "voxels", "tensorf", "mlp")
 ON_IT = ("device=pretend", "+trainer.inference_mode=false", "~logger")

@@ -12,7 +12,7 @@ from benchmarks import __main__ as command
 from benchmarks import alike, capture, cases, device, growth, methods, overhead, steps, trainings
 from benchmarks import kernels as timing
 from nerf_lightning import kernels
-from nerf_lightning.device import CPU
+from nerf_lightning.utils.device import CPU
 
 CURVE = [[2.0, 100, 20.0], [8.0, 400, 24.5], [10.5, 500, 26.0], [30.0, 1500, 29.0]]
 

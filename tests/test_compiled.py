@@ -10,10 +10,10 @@ import pytest
 import torch
 from once import once
 
-from nerf_lightning.compiled import BACKEND, check_compiler, part
-from nerf_lightning.device import CPU
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import SirenField
+from nerf_lightning.system.compiled import BACKEND, check_compiler, part
+from nerf_lightning.utils.device import CPU
 
 ROOT = Path(__file__).resolve().parents[1]
 FIELDS = ("mlp", "hashgrid", "tensorf", "voxels")

@@ -64,8 +64,8 @@ def commands(page: Path) -> list[str]:
 @pytest.fixture
 def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], int]]:
     """Runs a command line in this process, in an empty folder; returns its exit code."""
-    from nerf_lightning.viewer.field_page import FieldPage
-    from nerf_lightning.viewer.scene_page import ScenePage
+    from nerf_lightning.view.field_page import FieldPage
+    from nerf_lightning.view.scene_page import ScenePage
 
     def leave(*_: Any) -> None:
         raise KeyboardInterrupt

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from nerf_lightning import cli
-from nerf_lightning.compose import composed
+from nerf_lightning.config import cli
+from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Scene, save_npz
-from nerf_lightning.dataset.bricks import bricks
-from nerf_lightning.training import train
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.training.train import train
 
 EXPERIMENTS = sorted(path.stem for path in (cli.conf_dir() / "experiment").glob("*.yaml"))
 GROUPS = ("model", "sampler", "optimizer", "schedule")
@@ -136,7 +136,7 @@ def test_what_a_run_leaves(tmp_path: Path):
 def test_a_run_folder_alone_is_enough_to_render(tmp_path: Path):
     import torch
 
-    from nerf_lightning.run_folder import load_run
+    from nerf_lightning.runs.folder import load_run
 
     train(composed(["+experiment=smoke_3d", "budget.steps=20", "callbacks.orbit.frames=0"], tmp_path / "a"))
     (tmp_path / "a").rename(tmp_path / "moved")

@@ -7,8 +7,8 @@ import imageio.v3 as imageio
 import pytest
 from PIL import Image
 
-from nerf_lightning.compose import composed
-from nerf_lightning.training import train
+from nerf_lightning.config.compose import composed
+from nerf_lightning.training.train import train
 
 SMALL = ["+experiment=picture", "dataset.max_side=24", "budget.steps=20", "render.scale=2"]
 STEPS = [1, 2, 5, 10, 20]

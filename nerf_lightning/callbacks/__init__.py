@@ -1,6 +1,5 @@
 """What happens around the training steps: budget, measurement, pictures, checkpoints, progress, results."""
 
-from nerf_lightning.callbacks.baselines import Baselines
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.checkpoints import Checkpoints
 from nerf_lightning.callbacks.enlarge import Enlarge
@@ -8,12 +7,13 @@ from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.live import Live
 from nerf_lightning.callbacks.orbit import Orbit
-from nerf_lightning.callbacks.picture_charts import PictureCharts
+from nerf_lightning.callbacks.picture.baselines import Baselines
+from nerf_lightning.callbacks.picture.charts import PictureCharts
+from nerf_lightning.callbacks.picture.training_gif import TrainingGif
 from nerf_lightning.callbacks.progress import Progress
 from nerf_lightning.callbacks.results import Results
 from nerf_lightning.callbacks.snapshots import Snapshots
 from nerf_lightning.callbacks.throughput import Throughput
-from nerf_lightning.callbacks.training_gif import TrainingGif
 
 __all__ = [
     "Baselines",

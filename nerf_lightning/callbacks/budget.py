@@ -10,11 +10,11 @@ import lightning as L
 
 from nerf_lightning.callbacks.attached import agreed, attached, data_of
 from nerf_lightning.callbacks.plateau import HALF_AGAIN, Plateau
-from nerf_lightning.device import CPU, synchronize
 from nerf_lightning.errors import InputError
-from nerf_lightning.evenly import evenly
-from nerf_lightning.machine import Load
 from nerf_lightning.system import System
+from nerf_lightning.utils.device import CPU, synchronize
+from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.machine import Load
 
 LOOK_AT = 3
 """Held-out views that are looked at for a plateau."""
@@ -86,6 +86,11 @@ class Budget(L.Callback):
         start, reached, slope = self._line
         return min(1.0, max(spent, reached + slope * (spent - start)))
 
+    def drawing_seconds(self, step: int) -> float:
+        """Seconds that pictures and measurements may take where nobody asks for more: as long as training, as far as can be
+        told after `step` steps, and at least half a minute."""
+        return max(30.0, self.seconds / max(self.progress(step), 1e-3))
+
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Stops the clock for work that is not training."""
@@ -113,7 +118,7 @@ class Budget(L.Callback):
         return progress if self.limit_seconds is None else agreed(trainer, progress)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        self._device = pl_module.device
+        self._device, pl_module.paused = pl_module.device, self.paused
         trainer.should_stop = self.shared_progress(trainer) >= 1.0  # a finished run resumed has nothing left
         self._start()
 

@@ -12,9 +12,9 @@ from nerf_lightning.callbacks.attached import agreed, attached
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.errors import InputError
-from nerf_lightning.evenly import evenly
-from nerf_lightning.files import atomic
 from nerf_lightning.system import System
+from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.files import atomic
 
 
 class Checkpoints(L.Callback):

@@ -7,12 +7,12 @@ import lightning as L
 import numpy as np
 
 from nerf_lightning.callbacks.attached import picture_of
-from nerf_lightning.callbacks.baselines import quality_of, words
-from nerf_lightning.callbacks.panels import panel, to_bytes, write_png
+from nerf_lightning.callbacks.picture.baselines import quality_of, words
 from nerf_lightning.dataset import pixel_grid
+from nerf_lightning.drawing.panels import panel, to_bytes, write_png
 from nerf_lightning.errors import InputError
-from nerf_lightning.files import write_json
 from nerf_lightning.system import NeRF2D
+from nerf_lightning.utils.files import write_json
 
 
 class Enlarge(L.Callback):

@@ -15,9 +15,9 @@ from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.watch import Breakdown, Watch
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, ViewBatch, draw_rays
 from nerf_lightning.model import Rectifier
-from nerf_lightning.options import AtLeast, Count
-from nerf_lightning.seeding import step_generator
 from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.utils.options import AtLeast, Count
+from nerf_lightning.utils.seeding import step_generator
 
 LOWER, MUCH_LOWER = 0.3, 0.2
 """Factors on the learning rate where it is what is to blame: after something was learned, and where nothing was."""

@@ -8,8 +8,8 @@ import lightning as L
 from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.errors import InputError
-from nerf_lightning.evenly import evenly
 from nerf_lightning.system import System, ViewResult
+from nerf_lightning.utils.evenly import evenly
 
 
 class HeldOut(L.Callback):
@@ -19,7 +19,8 @@ class HeldOut(L.Callback):
 
     Args:
         at: fractions of the budget, ascending, in (0, 1).
-        views: how many held-out views, evenly chosen; None takes all.
+        views: how many held-out views, evenly chosen. None takes all, or fewer where all measurements would take longer than
+            training, and longer than half a minute. The last point is of all views in any case.
 
     Raises:
         InputError: for fractions outside (0, 1) or less than one view.
@@ -45,7 +46,14 @@ class HeldOut(L.Callback):
     def planned(self, trainer: L.Trainer) -> int:
         """Views still to be rendered in measurements during training."""
         total = data_of(trainer).held_out_views
-        return (len(self.at) - len(self.curve)) * len(evenly(total, self.views))
+        return (len(self.at) - len(self.curve)) * len(evenly(total, self.count(trainer)))
+
+    def count(self, trainer: L.Trainer) -> int | None:
+        """How many views a measurement takes; None for all."""
+        if self.views is not None or not self.view_seconds:
+            return self.views
+        allowed = Budget.of(trainer).drawing_seconds(trainer.global_step) / len(self.at)
+        return max(1, int(allowed / self.view_seconds))
 
     def record(self, trainer: L.Trainer, results: list[ViewResult]) -> None:
         """Adds a point to the curve and to the log."""
@@ -64,7 +72,14 @@ class HeldOut(L.Callback):
             return
         with Budget.of(trainer).paused():
             data = data_of(trainer)
-            chosen = evenly(data.held_out_views, self.views)
+            if self.views is None and self.view_seconds is None:  # nobody knows yet how many views there is time for
+                self.view_seconds = pl_module.evaluate(data.held_out(0)).seconds
+            chosen = evenly(data.held_out_views, self.count(trainer))
+            if self.views is None and len(chosen) < data.held_out_views and not self.curve:
+                print(
+                    f"{len(chosen)} of {data.held_out_views} held-out views are measured while training, as one takes "
+                    f"{self.view_seconds:.1f} s; callbacks.heldout.views={data.held_out_views} takes all"
+                )
             results = [pl_module.evaluate(data.held_out(view)) for view in chosen]
             while len(self.curve) < due:  # a step may pass several marks at once: one measurement serves them all
                 self.record(trainer, results)

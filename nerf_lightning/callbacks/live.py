@@ -10,10 +10,10 @@ from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.dataset import Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.viewer.serve import announcement, find_port, require_viser
+from nerf_lightning.view.serve import announcement, find_port, require_viser
 
 if TYPE_CHECKING:
-    from nerf_lightning.viewer.field_page import FieldPage
+    from nerf_lightning.view.field_page import FieldPage
 
 SAVED = 0.2
 """Seconds of painting that may be saved up while nobody wants a picture."""
@@ -61,7 +61,7 @@ class Live(L.Callback):
         require_viser()
         address, free = find_port(self.host, self.port)
 
-        from nerf_lightning.viewer.field_page import FieldPage
+        from nerf_lightning.view.field_page import FieldPage
 
         self.page = FieldPage(scene.name, pl_module, scene.orbit, scene, self.host, free, self.photo_side, self.side)
         line = announcement(scene.name, self.host, address, self.port, self.page.port)

@@ -1,19 +1,26 @@
 """Orbit: a turn around the subject as an animated GIF."""
 
+import math
+import time
 from pathlib import Path
 
 import imageio.v3 as imageio
 import lightning as L
 import numpy as np
+from jaxtyping import UInt8
 
 from nerf_lightning.callbacks.attached import attached, data_of
-from nerf_lightning.callbacks.panels import panel, to_bytes
+from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.progress import Progress
 from nerf_lightning.dataset import Scene
+from nerf_lightning.drawing.panels import panel, to_bytes
 from nerf_lightning.errors import InputError
-from nerf_lightning.evenly import evenly
-from nerf_lightning.files import atomic
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.files import atomic
+
+MOST, FEWEST, SMALLEST = 60, 12, 0.25
+"""Frames of an orbit where nobody says how many, and how small they may become."""
 
 
 class Orbit(L.Callback):
@@ -21,15 +28,16 @@ class Orbit(L.Callback):
 
     Args:
         path: the GIF, below the run folder.
-        frames: how many of the orbit's views, evenly chosen; 0 makes no GIF.
+        frames: how many of the orbit's views, evenly chosen; 0 makes no GIF. None takes 60, or fewer and smaller ones where
+            drawing them would take longer than training has, and longer than half a minute.
         fps: frames a second.
 
     Raises:
         InputError: where frames < 0 or fps <= 0.
     """
 
-    def __init__(self, path: str = "orbit.gif", frames: int = 60, fps: float = 20):
-        if frames < 0:
+    def __init__(self, path: str = "orbit.gif", frames: int | None = None, fps: float = 20):
+        if frames is not None and frames < 0:
             raise InputError("callbacks.orbit.frames", "", str(frames), "0 (no orbit) or more")
         if fps <= 0:
             raise InputError("callbacks.orbit.fps", "", str(fps), "more than 0")
@@ -40,7 +48,7 @@ class Orbit(L.Callback):
     def setup(self, trainer: L.Trainer, pl_module: NeRF3D, stage: str) -> None:
         progress = attached(trainer, Progress)
         if progress is not None and stage == "fit":
-            progress.later_views += self.frames
+            progress.later_views += MOST if self.frames is None else self.frames
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF3D) -> None:
         if self.frames == 0 or not trainer.is_global_zero:
@@ -49,12 +57,40 @@ class Orbit(L.Callback):
         assert isinstance(scene, Scene)  # NeRF3D trains on nothing else
         cameras = scene.orbit.to(pl_module.device)
         progress = attached(trainer, Progress)
-        pictures = []
-        for view in evenly(len(cameras), self.frames):
+
+        def picture(view: int) -> UInt8[np.ndarray, "H W 3"]:
             rgb = pl_module.render(cameras.view_rays(view)).rgb
             image = to_bytes(rgb.view(cameras.height, cameras.width, 3).cpu())
-            pictures.append(panel([image], f"{scene.name}, step {trainer.global_step}"))
+            return panel([image], f"{scene.name}, step {trainer.global_step}")
+
+        count, start = MOST if self.frames is None else self.frames, time.perf_counter()
+        pictures = [picture(evenly(len(cameras), count)[0])]
+        if self.frames is None:
+            one = time.perf_counter() - start
+            allowed = Budget.of(trainer).drawing_seconds(trainer.global_step)
+            fitting, shrink = affordable(min(count, len(cameras)), one, allowed)
+            if (fitting, shrink) != (min(count, len(cameras)), 1.0):
+                width, height = (max(1, round(side * shrink)) for side in (cameras.width, cameras.height))
+                print(
+                    f"{self.path}: {fitting} frames of {width}x{height}, as one of {cameras.width}x{cameras.height} takes "
+                    f"{one:.1f} s; callbacks.orbit.frames={count} draws all"
+                )
+                count, cameras, pictures = fitting, cameras.resized(width, height), []
+        for view in evenly(len(cameras), count)[len(pictures) :]:
+            pictures.append(picture(view))
             if progress is not None:
-                progress.frame(len(pictures), self.frames)
+                progress.frame(len(pictures), count)
         with atomic(Path(trainer.default_root_dir) / self.path) as temporary:
             imageio.imwrite(temporary, np.stack(pictures), duration=1000 / self.fps, loop=0)
+
+
+def affordable(frames: int, seconds: float, allowed: float) -> tuple[int, float]:
+    """How many frames to draw, and by what factor smaller, so that all take no longer than allowed.
+
+    Args:
+        frames: at most so many.
+        seconds: that one takes at its full size; they go with its pixels.
+        allowed: seconds for all of them.
+    """
+    count = min(frames, max(int(allowed / seconds), FEWEST))
+    return count, min(1.0, max(SMALLEST, math.sqrt(allowed / (count * seconds))))

@@ -19,9 +19,9 @@ from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
 from nerf_lightning.dataset import PictureBatch, PixelDataModule, RayDataModule
-from nerf_lightning.files import write_json
-from nerf_lightning.machine import describe_machine
 from nerf_lightning.system import NeRF2D, System, decibels, psnr
+from nerf_lightning.utils.files import write_json
+from nerf_lightning.utils.machine import describe_machine
 
 try:
     import resource

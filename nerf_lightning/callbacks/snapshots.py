@@ -7,7 +7,7 @@ import lightning as L
 
 from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.panels import narrowed, result_panel, to_bytes, write_png
+from nerf_lightning.drawing.panels import narrowed, result_panel, to_bytes, write_png
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nerf_lightning.capture.detect import Mark, Sighting
 from nerf_lightning.capture.photos import natural
+from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.run import Capture
-from nerf_lightning.capture.solve import Solved
+from nerf_lightning.capture.tags.detect import Mark, Sighting
 
 
 @dataclass(frozen=True)

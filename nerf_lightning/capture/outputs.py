@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf_lightning.capture.pack import pack
+from nerf_lightning.dataset.formats.npz import save_npz
 from nerf_lightning.dataset.lens import Lens
-from nerf_lightning.dataset.npz import save_npz
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
-from nerf_lightning.files import write_json
+from nerf_lightning.utils.files import write_json
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float, UInt8
 
 from nerf_lightning.cameras import Bounds, Cameras, focus_point, orbit_around
-from nerf_lightning.dataset.decode import read_pixels
 from nerf_lightning.dataset.extent import viewing_distance, visible_cube
+from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.dataset.lens import Lens, Rectification, rectify
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.scene import Scene, Views

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from nerf_lightning.capture.board import Board, board_detector
-from nerf_lightning.capture.calibrate import Calibration, calibrate, off_by, without
-from nerf_lightning.capture.detect import Sighting, guess_family, sight, tag_detector
-from nerf_lightning.capture.geometry import inverse
-from nerf_lightning.capture.layout import read_layout
 from nerf_lightning.capture.outputs import Packing, Placed, lens_entry, write_scene
 from nerf_lightning.capture.photos import find_photos, of_one_size
-from nerf_lightning.capture.solve import Solved, misfits, solve
+from nerf_lightning.capture.poses.calibrate import Calibration, calibrate, off_by, without
+from nerf_lightning.capture.poses.geometry import inverse
+from nerf_lightning.capture.poses.solve import Solved, misfits, solve
+from nerf_lightning.capture.tags.board import Board, board_detector
+from nerf_lightning.capture.tags.detect import Sighting, guess_family, sight, tag_detector
+from nerf_lightning.capture.tags.layout import read_layout
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
-from nerf_lightning.files import atomic
+from nerf_lightning.utils.files import atomic
 
 log = logging.getLogger(__name__)
 

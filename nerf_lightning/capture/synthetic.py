@@ -11,13 +11,13 @@ import imageio.v3 as imageio
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from nerf_lightning.capture.geometry import normalised
-from nerf_lightning.capture.layout import TagLayout
+from nerf_lightning.capture.poses.geometry import normalised
 from nerf_lightning.capture.tabletop import Tabletop
+from nerf_lightning.capture.tags.layout import TagLayout
 from nerf_lightning.capture.viewpoints import object_cameras, sheet_cameras
-from nerf_lightning.dataset.bricktrace import shadow
+from nerf_lightning.dataset.bricks.trace import shadow
 from nerf_lightning.dataset.lens import Lens
-from nerf_lightning.files import atomic
+from nerf_lightning.utils.files import atomic
 
 SUPERSAMPLING = 3
 """Samples a pixel along each side."""

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nerf_lightning.capture.detect import family
-from nerf_lightning.capture.layout import TagLayout
-from nerf_lightning.dataset.brickmodel import bulldozer
-from nerf_lightning.dataset.brickshade import shade
-from nerf_lightning.dataset.bricksolids import Solids
-from nerf_lightning.dataset.bricktrace import nearest, shadow
+from nerf_lightning.capture.tags.detect import family
+from nerf_lightning.capture.tags.layout import TagLayout
+from nerf_lightning.dataset.bricks.model import bulldozer
+from nerf_lightning.dataset.bricks.shading import shade
+from nerf_lightning.dataset.bricks.solids import Solids
+from nerf_lightning.dataset.bricks.trace import nearest, shadow
 from nerf_lightning.errors import InputError
 
 INK, PAPER, WALL = 0.09, 0.90, 0.75

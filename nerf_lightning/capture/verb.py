@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.options import AtLeast, Count, check_options
+from nerf_lightning.utils.options import AtLeast, Count, check_options
 
 if TYPE_CHECKING:
-    from nerf_lightning.capture.board import Board
     from nerf_lightning.capture.outputs import Placed
+    from nerf_lightning.capture.tags.board import Board
 
 NEEDED = {
     "tags": {"calibration": "FOLDER", "photos": "FOLDER", "tags.size": "0.06"},
@@ -71,9 +71,9 @@ def capture_from(cfg: DictConfig) -> None:
                 raise InputError("config", f"tags.board.{key}", "nothing", "a value", "count the board's squares")
 
     from nerf_lightning.capture.outputs import Packing
-    from nerf_lightning.capture.report import draw_cameras, write_report
+    from nerf_lightning.capture.poses.structure import capture_without_tags
+    from nerf_lightning.capture.report.write import draw_cameras, write_report
     from nerf_lightning.capture.run import capture
-    from nerf_lightning.capture.structure import capture_without_tags
 
     packing = Packing(Path(given["output"]), given["resize"], given["holdout"], given["orbit"], given["name"])
     photos, report = Path(given["photos"]), packing.output.with_name(packing.output.stem + "_report")
@@ -98,8 +98,8 @@ def capture_from(cfg: DictConfig) -> None:
 
 def _print(tags: dict[str, Any], file: Path) -> None:
     """Writes the page of a known sheet."""
-    from nerf_lightning.capture.layout import read_layout
-    from nerf_lightning.capture.printout import write_page
+    from nerf_lightning.capture.tags.layout import read_layout
+    from nerf_lightning.capture.tags.printout import write_page
 
     sheet = PRINTED if tags["layout"] == "auto" else tags["layout"]
     family = PRINTED_FAMILY if tags["dictionary"] == "auto" else tags["dictionary"]
@@ -108,7 +108,7 @@ def _print(tags: dict[str, Any], file: Path) -> None:
 
 def _board(tags: dict[str, Any]) -> "Board | None":
     """The ChArUco board, where one is meant."""
-    from nerf_lightning.capture.board import Board
+    from nerf_lightning.capture.tags.board import Board
 
     if tags["layout"] != "charuco":
         return None

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 
 from nerf_lightning.cameras import look_at
-from nerf_lightning.capture.geometry import inverse, move, normalised, project
-from nerf_lightning.capture.layout import TagLayout
+from nerf_lightning.capture.poses.geometry import inverse, move, normalised, project
 from nerf_lightning.capture.tabletop import Tabletop
+from nerf_lightning.capture.tags.layout import TagLayout
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.errors import InputError
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from nerf_lightning import cli
+from nerf_lightning.config import cli
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -9,7 +9,7 @@ from nerf_lightning.chart.notes import remarks
 from nerf_lightning.chart.points import Point, points_of
 from nerf_lightning.chart.references import Reference, matching, provenance
 from nerf_lightning.chart.setting import Setting
-from nerf_lightning.runs import Run
+from nerf_lightning.runs.index import Run
 
 
 @dataclass(frozen=True)

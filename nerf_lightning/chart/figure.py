@@ -14,7 +14,7 @@ from nerf_lightning.chart.comparison import COSTS, Comparison, Cost
 from nerf_lightning.chart.placement import add_name, place_names
 from nerf_lightning.chart.points import Point
 from nerf_lightning.chart.references import Reference
-from nerf_lightning.ink import BLUE, DPI, GREEN, GREY, MAUVE, ORANGE, SKY, VERMILLION, readable, shortened
+from nerf_lightning.drawing.ink import BLUE, DPI, GREEN, GREY, MAUVE, ORANGE, SKY, VERMILLION, readable, shortened
 
 INKS = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (MAUVE, "D"), (SKY, "v"), ("#000000", "P"), ("#B8A000", "X"))
 """Colour and shape of each method; more methods begin again."""

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nerf_lightning.chart.points import Point
-from nerf_lightning.machine import CROWDED, crowding
-from nerf_lightning.runs import Run
+from nerf_lightning.runs.index import Run
+from nerf_lightning.utils.machine import CROWDED, crowding
 
 SEEDS = 3
 """Runs below which a point on the frontier may be luck."""

@@ -8,7 +8,7 @@ from nerf_lightning.chart.advice import in_bytes
 from nerf_lightning.chart.comparison import COSTS, Comparison
 from nerf_lightning.chart.points import Point
 from nerf_lightning.chart.references import Reference
-from nerf_lightning.machine import crowding
+from nerf_lightning.utils.machine import crowding
 
 TEMPLATE = """<!DOCTYPE html>
 <html lang="en">

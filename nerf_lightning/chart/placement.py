@@ -7,7 +7,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox, BboxBase
 
-from nerf_lightning.ink import readable
+from nerf_lightning.drawing.ink import readable
 
 CORNERS = ((-1, 1), (1, -1), (1, 1), (-1, -1))
 """Above left first: along a frontier that rises there is room."""

@@ -7,7 +7,7 @@ from statistics import median
 from typing import Any
 
 from nerf_lightning.chart.setting import Setting, setting_of
-from nerf_lightning.runs import Run, flat
+from nerf_lightning.runs.index import Run, flat
 
 ELSEWHERE = ("callbacks", "logger", "resume", "name", "method", "recipe", "threads", "device")
 """Options that do not change what is trained, or that are told by others."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from nerf_lightning.chart.setting import Setting
 from nerf_lightning.errors import InputError
-from nerf_lightning.options import check_options
+from nerf_lightning.utils.options import check_options
 
 
 @dataclass(frozen=True)

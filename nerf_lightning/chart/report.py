@@ -7,16 +7,16 @@ from pathlib import Path
 import matplotlib
 from matplotlib.figure import Figure
 
-from nerf_lightning.callbacks.panels import write_png
 from nerf_lightning.chart.comparison import compare
 from nerf_lightning.chart.figure import chart_figure
 from nerf_lightning.chart.notes import troubles
 from nerf_lightning.chart.page import chart_page
 from nerf_lightning.chart.references import Reference
 from nerf_lightning.chart.table import print_tables, write_csv, write_hparams
-from nerf_lightning.files import atomic
-from nerf_lightning.ink import pixels_of
-from nerf_lightning.runs import Run
+from nerf_lightning.drawing.ink import pixels_of
+from nerf_lightning.drawing.panels import write_png
+from nerf_lightning.runs.index import Run
+from nerf_lightning.utils.files import atomic
 
 
 def write_report(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from nerf_lightning.runs import Run
+from nerf_lightning.runs.index import Run
 
 NAMED: dict[tuple[float, ...], str] = {(0.0, 0.0, 0.0): "black background", (1.0, 1.0, 1.0): "white background"}
 

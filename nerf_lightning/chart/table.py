@@ -12,9 +12,9 @@ from rich.table import Table
 
 from nerf_lightning.chart.advice import in_bytes
 from nerf_lightning.chart.comparison import Comparison
-from nerf_lightning.files import atomic, atomic_folder
-from nerf_lightning.names import slug
-from nerf_lightning.runs import Run
+from nerf_lightning.config.resolvers import slug
+from nerf_lightning.runs.index import Run
+from nerf_lightning.utils.files import atomic, atomic_folder
 
 FIGURES = ("psnr", "psnr_worst_seed", "psnr_best_seed", "train_seconds", "render_seconds_per_view", "artifact_bytes")
 CAPTION = "train, view: seconds; runs -n: n of them lost; best: on the frontier of T(raining) or R(endering)"

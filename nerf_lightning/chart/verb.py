@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.options import AtLeast, check_options
+from nerf_lightning.utils.options import AtLeast, check_options
 
 if TYPE_CHECKING:
-    from nerf_lightning.runs import Run
+    from nerf_lightning.runs.index import Run
 
 
 def options(
@@ -39,7 +39,7 @@ def chart_from(cfg: DictConfig) -> None:
 
     from nerf_lightning.chart.references import read_references
     from nerf_lightning.chart.report import write_report
-    from nerf_lightning.runs import find_runs
+    from nerf_lightning.runs.index import find_runs
 
     references = read_references(given.get("references") or {})
     found: dict[Path, Run] = {run.folder.resolve(): run for folder in folders for run in find_runs(folder)}

@@ -1,9 +1,9 @@
 """Stage 2, dataset: photos and poses become a Scene, whatever format they come in."""
 
-from nerf_lightning.dataset.blender import load_blender
 from nerf_lightning.dataset.extent import estimate_bounds
-from nerf_lightning.dataset.nerfstudio import load_nerfstudio
-from nerf_lightning.dataset.npz import load_npz, save_npz
+from nerf_lightning.dataset.formats.blender import load_blender
+from nerf_lightning.dataset.formats.nerfstudio import load_nerfstudio
+from nerf_lightning.dataset.formats.npz import load_npz, save_npz
 from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PictureBatch, PixelBatch, PixelDataModule, pixel_grid

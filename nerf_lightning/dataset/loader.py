@@ -6,7 +6,7 @@ from typing import TypeVar
 import lightning as L
 import torch
 
-from nerf_lightning.device import CPU, fits
+from nerf_lightning.utils.device import CPU, fits
 
 Batch = TypeVar("Batch")
 

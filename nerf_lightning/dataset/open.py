@@ -3,10 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
-from nerf_lightning.dataset import checks
-from nerf_lightning.dataset.blender import load_blender
-from nerf_lightning.dataset.nerfstudio import load_nerfstudio
-from nerf_lightning.dataset.npz import load_npz
+from nerf_lightning.dataset.formats import checks
+from nerf_lightning.dataset.formats.blender import load_blender
+from nerf_lightning.dataset.formats.nerfstudio import load_nerfstudio
+from nerf_lightning.dataset.formats.npz import load_npz
 from nerf_lightning.dataset.resize import resize_scene
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError

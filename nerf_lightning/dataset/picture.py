@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.dataset.decode import read_pixels
+from nerf_lightning.dataset.formats.decode import read_pixels
 
 SUN = (0.66, 0.30)
 """Where the built-in picture's sun stands, as a share of its width and height."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader, drawn_on, share
 from nerf_lightning.errors import InputError
-from nerf_lightning.seeding import step_generator
+from nerf_lightning.utils.seeding import step_generator
 
 
 def unknown(width: int, height: int) -> None:

@@ -11,15 +11,15 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from nerf_lightning.dataset.bricks import bricks
+from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PixelDataModule
 from nerf_lightning.dataset.rays import RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
-from nerf_lightning.files import atomic
-from nerf_lightning.options import Count
+from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.options import Count
 
 log = logging.getLogger(__name__)
 

@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from nerf_lightning import cli
-from nerf_lightning.options import Count, check_options
+from nerf_lightning.config import cli
+from nerf_lightning.utils.options import Count, check_options
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -10,15 +10,15 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from nerf_lightning.callbacks.panels import result_panel, write_png
-from nerf_lightning.device import the_device
+from nerf_lightning.drawing.panels import result_panel, write_png
 from nerf_lightning.evaluate.perceptual import perceptual_distance
-from nerf_lightning.files import write_json
-from nerf_lightning.machine import describe_machine, device_in_words
-from nerf_lightning.open_run import beside, open_run
-from nerf_lightning.progress import tracked
-from nerf_lightning.run_data import data_again
+from nerf_lightning.runs.data import data_again
+from nerf_lightning.runs.open import beside, open_run
 from nerf_lightning.system import ViewResult
+from nerf_lightning.utils.device import the_device
+from nerf_lightning.utils.files import write_json
+from nerf_lightning.utils.machine import describe_machine, device_in_words
+from nerf_lightning.utils.progress import tracked
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from nerf_lightning.cameras import Cameras
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.surface import Surface, find_surface, lit_cells
 from nerf_lightning.export.volume import PLACES, Volume
-from nerf_lightning.open_run import SceneRun
+from nerf_lightning.runs.open import SceneRun
 from nerf_lightning.system import NeRF3D
 
 if TYPE_CHECKING:

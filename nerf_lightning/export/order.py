@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from nerf_lightning.options import AtLeast, Count
+from nerf_lightning.utils.options import AtLeast, Count
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.model.pruning import widened
+from nerf_lightning.model.layers.pruning import widened
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D, System
 

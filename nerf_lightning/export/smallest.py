@@ -11,12 +11,12 @@ import torch
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.evenly import evenly
-from nerf_lightning.export.compact import decode, encode
 from nerf_lightning.export.reach import Cells, confine, occupied_cells, seen_cells
-from nerf_lightning.progress import tracked
-from nerf_lightning.run_folder import scene_content
+from nerf_lightning.runs.compact import decode, encode
+from nerf_lightning.runs.folder import scene_content
 from nerf_lightning.system import System
+from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.progress import tracked
 
 MOST_VIEWS = 60
 """Training views whose light is followed to learn which cells matter."""

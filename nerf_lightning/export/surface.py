@@ -11,8 +11,8 @@ from scipy import ndimage
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.volume import PIXELS, Volume
-from nerf_lightning.progress import tracked
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.progress import tracked
 
 BINS = 128
 EMPTY = 0.02

@@ -8,18 +8,18 @@ import torch
 
 from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.dataset import RayDataModule
-from nerf_lightning.device import the_device
 from nerf_lightning.errors import InputError
-from nerf_lightning.evenly import evenly
 from nerf_lightning.export.mesh import mesh_file, points_file, require_mesh, voxels_file
 from nerf_lightning.export.order import Order
 from nerf_lightning.export.smallest import MOST_VIEWS, PRECISIONS, smallest, some_cameras
 from nerf_lightning.export.volume import volume_of
-from nerf_lightning.files import atomic
-from nerf_lightning.machine import device_in_words
-from nerf_lightning.open_run import SceneRun, beside, open_run, open_scene_run
-from nerf_lightning.run_data import data_again
-from nerf_lightning.run_folder import plain_config
+from nerf_lightning.runs.data import data_again
+from nerf_lightning.runs.folder import plain_config
+from nerf_lightning.runs.open import SceneRun, beside, open_run, open_scene_run
+from nerf_lightning.utils.device import the_device
+from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.machine import device_in_words
 
 NAMES = {
     ("compact", "mesh"): "compact.npz",

@@ -10,9 +10,9 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, transform
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.reach import occupied_cells
-from nerf_lightning.open_run import SceneRun
-from nerf_lightning.progress import tracked
+from nerf_lightning.runs.open import SceneRun
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.progress import tracked
 
 COARSEST, FINEST = 64, 256
 """Cells along the longest side, where nobody says how many."""

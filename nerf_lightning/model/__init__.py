@@ -1,10 +1,10 @@
 """Stage 4, fields: position and direction -> density and rgb; and pictures as fields of two coordinates."""
 
-from nerf_lightning.model.activation import Rectifier, density_activation, truncated_exp
-from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import Field, PictureField
 from nerf_lightning.model.hashgrid import HashGrid, HashGridField
 from nerf_lightning.model.hashgrid2d import HashGrid2DField
+from nerf_lightning.model.layers.activation import Rectifier, density_activation, truncated_exp
+from nerf_lightning.model.layers.encoding import sinusoidal
 from nerf_lightning.model.mlp import MLPField
 from nerf_lightning.model.picture import FourierField, PictureMLP, SirenField
 from nerf_lightning.model.tensorf import TensoRFField, VectorMatrix

@@ -10,12 +10,12 @@ from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import hash_interpolate, mlp, mlp_heads
 from nerf_lightning.kernels.hashgrid import entry_of
-from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field
-from nerf_lightning.model.pruning import vertices_in
-from nerf_lightning.model.view_dependence import harmonics_up_to, seen_from
-from nerf_lightning.model.widening import widen_all
-from nerf_lightning.options import Count
+from nerf_lightning.model.layers.activation import density_activation
+from nerf_lightning.model.layers.pruning import vertices_in
+from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
+from nerf_lightning.model.layers.widening import widen_all
+from nerf_lightning.utils.options import Count
 
 
 def level_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:

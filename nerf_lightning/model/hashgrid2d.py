@@ -8,8 +8,8 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import hash_interpolate_2d, mlp
 from nerf_lightning.model.field import PictureField
 from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
-from nerf_lightning.model.widening import widen_all
-from nerf_lightning.options import Count
+from nerf_lightning.model.layers.widening import widen_all
+from nerf_lightning.utils.options import Count
 
 SHARE = 0.5
 """Numbers of the grids for each number of the picture, unless the table size is given."""

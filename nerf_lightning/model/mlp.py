@@ -6,11 +6,11 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
-from nerf_lightning.model.activation import density_activation
-from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import Field
-from nerf_lightning.model.widening import widen, widen_all
-from nerf_lightning.options import Count
+from nerf_lightning.model.layers.activation import density_activation
+from nerf_lightning.model.layers.encoding import sinusoidal
+from nerf_lightning.model.layers.widening import widen, widen_all
+from nerf_lightning.utils.options import Count
 
 
 class MLPField(Field):

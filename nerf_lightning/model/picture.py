@@ -7,11 +7,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.model.encoding import sinusoidal
 from nerf_lightning.model.field import PictureField
 from nerf_lightning.model.hashgrid import layers
-from nerf_lightning.model.widening import widen_all
-from nerf_lightning.options import Count
+from nerf_lightning.model.layers.encoding import sinusoidal
+from nerf_lightning.model.layers.widening import widen_all
+from nerf_lightning.utils.options import Count
 
 
 def rectified(sizes: list[int]) -> torch.nn.Sequential:

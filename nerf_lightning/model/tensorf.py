@@ -11,13 +11,13 @@ from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import mlp, plane_line_sum, plane_line_sum_and_products
 from nerf_lightning.kernels.planes import PLANE_AXES
-from nerf_lightning.model.activation import density_activation
 from nerf_lightning.model.field import Field, replace_data
 from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
-from nerf_lightning.model.pruning import vertices_in
-from nerf_lightning.model.view_dependence import harmonics_up_to, seen_from
-from nerf_lightning.model.widening import widen_all
-from nerf_lightning.options import Count
+from nerf_lightning.model.layers.activation import density_activation
+from nerf_lightning.model.layers.pruning import vertices_in
+from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
+from nerf_lightning.model.layers.widening import widen_all
+from nerf_lightning.utils.options import Count
 
 
 class VectorMatrix(torch.nn.Module):

@@ -17,11 +17,11 @@ from nerf_lightning.kernels import (
     roughness,
     voxel_value,
 )
-from nerf_lightning.model.activation import truncated_exp
 from nerf_lightning.model.field import Field, replace_data
-from nerf_lightning.model.pruning import vertices_in, widened
-from nerf_lightning.model.view_dependence import harmonics_up_to, seen_from
-from nerf_lightning.options import Count
+from nerf_lightning.model.layers.activation import truncated_exp
+from nerf_lightning.model.layers.pruning import vertices_in, widened
+from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
+from nerf_lightning.utils.options import Count
 
 EMPTY = -8.0
 """Logarithm of the density (in 1 / half-size) where no vertex is kept: nothing that a ray would notice."""

@@ -3,9 +3,9 @@
 import sys
 from typing import TYPE_CHECKING
 
-from nerf_lightning import cli
-from nerf_lightning.options import check_options
+from nerf_lightning.config import cli
 from nerf_lightning.render.order import Order
+from nerf_lightning.utils.options import check_options
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

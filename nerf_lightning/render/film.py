@@ -13,8 +13,8 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.files import atomic, write_json
-from nerf_lightning.progress import tracked
+from nerf_lightning.utils.files import atomic, write_json
+from nerf_lightning.utils.progress import tracked
 
 Picture = UInt8[ndarray, "H W C"]
 PLAN = "frames.json"

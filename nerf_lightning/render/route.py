@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.errors import InputError
-from nerf_lightning.evenly import evenly
+from nerf_lightning.utils.evenly import evenly
 
 WORDS = ("orbit", "spiral", "test", "train")
 WITH_PHOTOS = {"test": "val", "train": "train"}

@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerf_lightning.callbacks.panels import panel
 from nerf_lightning.dataset import RayDataModule
-from nerf_lightning.device import synchronize, the_device
+from nerf_lightning.drawing.frame import CHANNELS, ERROR_TIMES, Style, depth_range, draw, error_picture
+from nerf_lightning.drawing.panels import panel
 from nerf_lightning.errors import InputError
-from nerf_lightning.machine import device_in_words
-from nerf_lightning.open_run import SceneRun, beside, open_scene_run
 from nerf_lightning.render.film import Picture, check_output, make_film
-from nerf_lightning.render.frame import CHANNELS, ERROR_TIMES, Style, depth_range, draw, error_picture
 from nerf_lightning.render.order import Order
 from nerf_lightning.render.route import WITH_PHOTOS, Route, find_route
 from nerf_lightning.renderer.renderer import NAMED
-from nerf_lightning.run_data import data_again
+from nerf_lightning.runs.data import data_again
+from nerf_lightning.runs.open import SceneRun, beside, open_scene_run
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.device import synchronize, the_device
+from nerf_lightning.utils.machine import device_in_words
 
 BLACK = (0.0, 0.0, 0.0)
 

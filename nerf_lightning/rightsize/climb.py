@@ -9,19 +9,19 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.build import budget_options, build_system, build_trainer, device_of, frame_of, resolved
 from nerf_lightning.callbacks import Budget
+from nerf_lightning.config.build import budget_options, build_system, build_trainer, device_of, frame_of, resolved
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
-from nerf_lightning.evenly import evenly
-from nerf_lightning.export.compact import encode
 from nerf_lightning.export.reach import seen_cells
 from nerf_lightning.export.smallest import confined_to, held_out_psnr, some_cameras
 from nerf_lightning.rightsize.choose import Measured
 from nerf_lightning.rightsize.ladder import Options
-from nerf_lightning.run_folder import plain_config, scene_content
-from nerf_lightning.seeding import step_generator
+from nerf_lightning.runs.compact import encode
+from nerf_lightning.runs.folder import plain_config, scene_content
 from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.training import prepare_process, warm_up
+from nerf_lightning.training.train import prepare_process, warm_up
+from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.seeding import step_generator
 
 Data = RayDataModule | PixelDataModule
 SEARCH = 0.75

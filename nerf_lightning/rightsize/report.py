@@ -7,15 +7,15 @@ import yaml
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
-from nerf_lightning.callbacks.panels import write_png
-from nerf_lightning.files import atomic, write_json
-from nerf_lightning.ink import BLUE, DPI, GREY, ORANGE, VERMILLION, pixels_of
-from nerf_lightning.machine import describe_machine
+from nerf_lightning.drawing.ink import BLUE, DPI, GREY, ORANGE, VERMILLION, pixels_of
+from nerf_lightning.drawing.panels import write_png
 from nerf_lightning.rightsize.choose import knee
 from nerf_lightning.rightsize.climb import Rung, set_options
 from nerf_lightning.rightsize.ladder import overrides
 from nerf_lightning.rightsize.search import Found, Full, figures
-from nerf_lightning.run_folder import plain_config
+from nerf_lightning.runs.folder import plain_config
+from nerf_lightning.utils.files import atomic, write_json
+from nerf_lightning.utils.machine import describe_machine
 
 CHOSEN_FROM = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "callbacks", "logger", "trainer")
 """Groups whose option best.yaml names ..."""

@@ -9,19 +9,20 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.build import build_data, device_of
+from nerf_lightning.config.build import build_data, device_of
+from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.export.smallest import Compact, smallest
-from nerf_lightning.files import atomic
 from nerf_lightning.kernels import use_kernels
-from nerf_lightning.limits import limits_of
 from nerf_lightning.rightsize.choose import Target, best_of, candidate, chosen, climbed_enough, expected, next_to_train
 from nerf_lightning.rightsize.climb import Rung, climb, coarsest_sampler, compact_bytes, set_options, spread
 from nerf_lightning.rightsize.ladder import Ladder, Options
-from nerf_lightning.run_folder import load_run, plain_config
-from nerf_lightning.runs import read_run
-from nerf_lightning.training import quiet, train
+from nerf_lightning.runs.folder import load_run, plain_config
+from nerf_lightning.runs.index import read_run
+from nerf_lightning.training.train import train
+from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.quiet import quiet
 
 MOST_FULL = 2
 """Trainings in full: the candidate, and what it is held against."""

@@ -5,9 +5,9 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.options import Count
 from nerf_lightning.sampler.samples import DensityFn, Samples, pack
 from nerf_lightning.sampler.uniform import UniformSampler
+from nerf_lightning.utils.options import Count
 
 
 def inverse_cdf(

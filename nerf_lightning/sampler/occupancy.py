@@ -10,8 +10,8 @@ from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import keep_visible, march, mark_cells
 from nerf_lightning.kernels.march import Packed
-from nerf_lightning.options import Count
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
+from nerf_lightning.utils.options import Count
 
 ASKED, LOOKED_AT = 4, 32
 """Positions at which the density is asked together, and steps looked at together, for each sample that is rendered so."""

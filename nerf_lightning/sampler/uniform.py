@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.options import Count
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack
+from nerf_lightning.utils.options import Count
 
 
 def stratified_edges(edges: Float[Tensor, "R S_plus_1"], generator: Generator) -> Float[Tensor, "R S_plus_1"]:

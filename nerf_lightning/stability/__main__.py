@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nerf_lightning import cli
+from nerf_lightning.config import cli
 from nerf_lightning.errors import InputError
-from nerf_lightning.options import Count, check_options
+from nerf_lightning.utils.options import Count, check_options
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -30,11 +30,11 @@ def stability(
     Raises:
         InputError: for a suite or a method that is not known.
     """
-    from nerf_lightning.progress import tracked
     from nerf_lightning.stability.conditions import CONDITIONS
     from nerf_lightning.stability.methods import METHODS
     from nerf_lightning.stability.report import write_report
     from nerf_lightning.stability.suite import QUICK, cells_of, run_all
+    from nerf_lightning.utils.progress import tracked
 
     every = [condition.name for condition in CONDITIONS]
     if suite not in ("quick", "full"):

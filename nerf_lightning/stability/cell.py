@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.config.resolvers import slug
 from nerf_lightning.errors import InputError
-from nerf_lightning.files import write_json
-from nerf_lightning.names import slug
 from nerf_lightning.stability.conditions import CONDITIONS, LARGER, Condition
 from nerf_lightning.stability.methods import METHODS, Method
+from nerf_lightning.utils.files import write_json
 
 OUTCOME = "cell.json"
 
@@ -99,10 +99,10 @@ def _to(log: Any) -> Iterator[None]:
 
 
 def _train(cell: Cell, folder: Path) -> Outcome:
-    from nerf_lightning.callbacks.panels import write_png
-    from nerf_lightning.compose import composed
+    from nerf_lightning.config.compose import composed
     from nerf_lightning.dataset import Scene, save_npz
-    from nerf_lightning.training import train
+    from nerf_lightning.drawing.panels import write_png
+    from nerf_lightning.training.train import train
 
     condition, method = cell.parts
     made = condition.scene(cell.seed)

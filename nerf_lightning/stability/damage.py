@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset.scene import Scene, Views
-from nerf_lightning.seeding import step_generator
+from nerf_lightning.utils.seeding import step_generator
 
 Poses = Callable[[Float[Tensor, "V 4 4"]], Float[Tensor, "V 4 4"]]
 Photos = Callable[[Float[Tensor, "V H W C"]], Float[Tensor, "V H W C"]]

@@ -7,7 +7,7 @@ import matplotlib.patches
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from nerf_lightning.ink import DPI, GREY, VERMILLION, readable
+from nerf_lightning.drawing.ink import DPI, GREY, VERMILLION, readable
 from nerf_lightning.stability.verdict import Square
 
 LOW, HIGH = 8.0, 34.0

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from nerf_lightning.callbacks.panels import write_png
-from nerf_lightning.files import atomic, write_json
-from nerf_lightning.ink import pixels_of
+from nerf_lightning.drawing.ink import pixels_of
+from nerf_lightning.drawing.panels import write_png
 from nerf_lightning.stability.cell import Outcome, folder_of
 from nerf_lightning.stability.heatmap import heatmap
 from nerf_lightning.stability.verdict import NEAR, Rescue, Square, rescues, squares
 from nerf_lightning.stability.worst import worst_page
+from nerf_lightning.utils.files import atomic, write_json
 
 
 def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> None:

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
-from nerf_lightning.machine import cores
 from nerf_lightning.stability.cell import Cell, Outcome, run
 from nerf_lightning.stability.conditions import CONDITIONS
 from nerf_lightning.stability.methods import METHODS
+from nerf_lightning.utils.machine import cores
 
 QUICK = (
     *("clean", "white, small object", "rate x10", "wrong background flag", "OpenGL poses", "shuffled poses"),

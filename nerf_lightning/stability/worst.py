@@ -7,7 +7,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 from matplotlib.figure import Figure
 
-from nerf_lightning.ink import DPI, VERMILLION, readable
+from nerf_lightning.drawing.ink import DPI, VERMILLION, readable
 from nerf_lightning.stability.cell import Outcome
 from nerf_lightning.stability.verdict import Square
 

@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.compiled import part
 from nerf_lightning.dataset import PictureBatch, PixelBatch
 from nerf_lightning.model import PictureField
+from nerf_lightning.system.compiled import part
 from nerf_lightning.system.metrics import psnr
 from nerf_lightning.system.system import CHUNK, MakeOptimizer, Schedule, StepStats, System
 

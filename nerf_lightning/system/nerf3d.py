@@ -2,18 +2,19 @@
 
 import copy
 import math
+from contextlib import nullcontext
 
 import torch
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.compiled import part
 from nerf_lightning.dataset import RayBatch, ViewBatch
 from nerf_lightning.model import Field
 from nerf_lightning.renderer import Rendered, VolumeRenderer
 from nerf_lightning.sampler import Sampler, split
-from nerf_lightning.seeding import step_generator
+from nerf_lightning.system.compiled import part
 from nerf_lightning.system.system import CHUNK, MakeOptimizer, Schedule, StepStats, System
+from nerf_lightning.utils.seeding import step_generator
 
 RAYS = 8
 """One ray is sampled for so many samples that are rendered together."""
@@ -68,12 +69,10 @@ class NeRF3D(System):
 
     def rehearse(self, batch: RayBatch) -> None:
         """Runs a step on a copy with the clock stopped: what it compiles for the sizes at hand is not training."""
-        from nerf_lightning.callbacks import Budget  # which needs systems itself
-
         field, sampler = copy.deepcopy(self.field), copy.deepcopy(self.sampler)
         trial = NeRF3D(field, sampler, self.renderer, self.make_optimizer, self.schedule, self.seed, self.chunk)
         trial.backend = self.backend
-        with Budget.of(self.trainer).paused(), self.trainer.precision_plugin.train_step_context():
+        with self.paused() if self.paused else nullcontext(), self.trainer.precision_plugin.train_step_context():
             trial.loss(batch, step_generator(self.seed, 1, self.global_step, self.device), 1)[0].backward()
 
     def loss(self, batch: RayBatch, generator: torch.Generator, step: int) -> tuple[Tensor, StepStats]:

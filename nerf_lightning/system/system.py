@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.device import synchronize
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system.metrics import psnr, ssim
+from nerf_lightning.utils.device import synchronize
 
 MakeOptimizer = Callable[[Iterable[torch.nn.Parameter]], torch.optim.Optimizer]
 Schedule = Callable[[float], float]
@@ -70,7 +71,9 @@ class System(L.LightningModule):
         self.seed = seed
         self.chunk = chunk
         self.progress = 0.0
-        """Fraction of the budget done; the Budget callback keeps it."""
+        """Fraction of the training done: the Budget callback keeps it; without one, the share of the trainer's max_steps."""
+        self.paused: Callable[[], AbstractContextManager[None]] | None = None
+        """Stops the clock of the Budget callback, which sets it; None without one."""
         self.rate = 1.0
         """Factor on the learning rate beside the schedule's; the Guard callback lowers it where training broke down."""
         self.backend: str | None = None
@@ -89,6 +92,8 @@ class System(L.LightningModule):
         return optimizer
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        if self.paused is None and self.trainer.max_steps > 0:
+            self.progress = self.global_step / self.trainer.max_steps
         factor = self.schedule(self.progress) * self.rate
         for group in self.parameter_groups:
             group["lr"] = group["initial_lr"] * factor

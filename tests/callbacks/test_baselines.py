@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from nerf_lightning.callbacks import Baselines, Results
-from nerf_lightning.callbacks.baselines import SAMPLINGS, best_jpeg, jpeg, jpeg_as_good, quality_of, shrunk, words
+from nerf_lightning.callbacks.picture.baselines import (
+    SAMPLINGS,
+    best_jpeg,
+    jpeg,
+    jpeg_as_good,
+    quality_of,
+    shrunk,
+    words,
+)
 from nerf_lightning.dataset.picture import builtin_picture
 from nerf_lightning.dataset.sources import from_picture
 

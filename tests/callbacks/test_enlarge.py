@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerf_lightning.callbacks import Enlarge
-from nerf_lightning.callbacks.baselines import quality_of
+from nerf_lightning.callbacks.picture.baselines import quality_of
 from nerf_lightning.dataset import Picture, PixelDataModule
 from nerf_lightning.dataset.picture import builtin_picture
 from nerf_lightning.dataset.sources import from_picture

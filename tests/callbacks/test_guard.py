@@ -13,14 +13,15 @@ from nerf_lightning.callbacks import Budget, Guard
 from nerf_lightning.callbacks.guard import COOL, LOWER, MUCH_LOWER, plain_error, started_anew
 from nerf_lightning.callbacks.watch import AS_PLAIN
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.compose import composed
+from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Picture, PixelDataModule, save_npz
 from nerf_lightning.model import HashGridField, PictureField, SirenField
-from nerf_lightning.run_folder import load_run
+from nerf_lightning.runs.folder import load_run
 from nerf_lightning.stability.methods import METHODS
 from nerf_lightning.stability.toys import MARBLE, toy
 from nerf_lightning.system import NeRF2D, StepStats, constant
-from nerf_lightning.training import quiet, train
+from nerf_lightning.training.train import train
+from nerf_lightning.utils.quiet import quiet
 
 
 class Blob(PictureField):

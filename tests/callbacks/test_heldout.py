@@ -2,7 +2,7 @@ import pytest
 
 from nerf_lightning.callbacks import Budget, HeldOut
 from nerf_lightning.errors import InputError
-from nerf_lightning.evenly import evenly
+from nerf_lightning.utils.evenly import evenly
 
 
 @pytest.mark.parametrize(
@@ -57,6 +57,21 @@ def test_a_step_that_passes_several_marks_measures_once(clock, system, trainer_w
     resumed.load_state_dict(held_out.state_dict())
     resumed.on_train_batch_end(trainer, system, None, None, 0)
     assert len(resumed.curve) == 2, "what was measured before the pause is not measured again"
+
+
+@pytest.mark.parametrize(("seconds_a_step", "views"), [(1, 1), (100, 4), (1000, 10)])
+def test_measurements_take_no_longer_than_training(clock, system, trainer_with, seconds_a_step, views, capsys):
+    """A view takes 50 s, and there are two measurements: of ten views as many as fit."""
+    budget, held_out = Budget(steps=4), HeldOut([0.3, 0.7])
+    trainer = trainer_with(budget, held_out)
+    budget.on_train_start(trainer, system)
+    for step in range(1, 4):
+        clock.wait(seconds_a_step)
+        trainer.global_step = step
+        budget.on_train_batch_end(trainer, system, None, None, 0)
+        held_out.on_train_batch_end(trainer, system, None, None, 0)
+    assert len(system.asked) == 1 + 2 * views
+    assert ("callbacks.heldout.views=10 takes all" in capsys.readouterr().out) == (views < 10)
 
 
 def test_the_end_is_left_to_the_test(clock, system, trainer_with):

@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 
 from nerf_lightning.callbacks import Budget, PictureCharts, Results, Snapshots, TrainingGif
-from nerf_lightning.callbacks.panels import narrowed, to_bytes
-from nerf_lightning.callbacks.picture_charts import curve_chart, error_chart
+from nerf_lightning.callbacks.picture.charts import curve_chart, error_chart
 from nerf_lightning.callbacks.snapshots import LOGGED_WIDTH
+from nerf_lightning.drawing.panels import narrowed, to_bytes
 from nerf_lightning.errors import InputError
 
 CURVE = [[0.5, 10, 20.0], [1.5, 100, 25.0], [4.0, 300, 31.0]]

@@ -8,11 +8,11 @@ import pytest
 
 from nerf_lightning.callbacks import Budget
 from nerf_lightning.callbacks.plateau import FIRST, SPACING, Plateau
-from nerf_lightning.compose import composed
+from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.stability.toys import PILE, toy
-from nerf_lightning.training import train
+from nerf_lightning.training.train import train
 
 
 def measured(plateau: Plateau, quality, until: float = 1.0) -> float | None:

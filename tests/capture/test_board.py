@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from capture.views import camera
 
-from nerf_lightning.capture.board import Board, board_detector
-from nerf_lightning.capture.calibrate import calibrate
-from nerf_lightning.capture.detect import Sighting
-from nerf_lightning.capture.geometry import angle_between, inverse, project
+from nerf_lightning.capture.poses.calibrate import calibrate
+from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
+from nerf_lightning.capture.tags.board import Board, board_detector
+from nerf_lightning.capture.tags.detect import Sighting
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.errors import InputError
 

@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 from capture.views import LENS, ONE, SIX, SIZE, camera, cameras, sightings
 
-from nerf_lightning.capture.detect import Mark
-from nerf_lightning.capture.geometry import (
+from nerf_lightning.capture.poses.geometry import (
     angle_between,
     folds,
     inverse,
@@ -13,9 +12,10 @@ from nerf_lightning.capture.geometry import (
     to_matrix,
     to_vector,
 )
-from nerf_lightning.capture.layout import SQUARE
-from nerf_lightning.capture.pose import mark_poses, photo_poses
-from nerf_lightning.capture.walk import choose
+from nerf_lightning.capture.poses.pose import mark_poses, photo_poses
+from nerf_lightning.capture.poses.walk import choose
+from nerf_lightning.capture.tags.detect import Mark
+from nerf_lightning.capture.tags.layout import SQUARE
 
 
 def test_motions_go_to_numbers_and_back():

@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from nerf_lightning.capture.calibrate import calibrate
-from nerf_lightning.capture.camera_map import frustum, tag_corners
-from nerf_lightning.capture.contact_sheet import MOST, annotated, contact_sheet, heading
-from nerf_lightning.capture.coverage_chart import displacement, parameters
-from nerf_lightning.capture.detect import Mark, Sighting
-from nerf_lightning.capture.error_chart import cell_means, corners_and_residuals, error_chart
-from nerf_lightning.capture.geometry import inverse, project
-from nerf_lightning.capture.layout import SQUARE, TagLayout, flat_pose
 from nerf_lightning.capture.outcome import Outcome, calibration_outcomes, photo_outcomes, thinned
 from nerf_lightning.capture.pack import pack
-from nerf_lightning.capture.report import write_report
+from nerf_lightning.capture.poses.calibrate import calibrate
+from nerf_lightning.capture.poses.geometry import inverse, project
+from nerf_lightning.capture.poses.solve import solve
+from nerf_lightning.capture.report.camera_map import frustum, tag_corners
+from nerf_lightning.capture.report.contact_sheet import MOST, annotated, contact_sheet, heading
+from nerf_lightning.capture.report.coverage_chart import displacement, parameters
+from nerf_lightning.capture.report.error_chart import cell_means, corners_and_residuals, error_chart
+from nerf_lightning.capture.report.write import write_report
 from nerf_lightning.capture.run import Capture, Placed
-from nerf_lightning.capture.solve import solve
+from nerf_lightning.capture.tags.detect import Mark, Sighting
+from nerf_lightning.capture.tags.layout import SQUARE, TagLayout, flat_pose
 from nerf_lightning.capture.viewpoints import in_frame, object_cameras, sheet_cameras
 from nerf_lightning.dataset.lens import Lens
-from nerf_lightning.ink import ORANGE, SKY, magnification, pixels_of, readable, rgb, shortened
+from nerf_lightning.drawing.ink import ORANGE, SKY, magnification, pixels_of, readable, rgb, shortened
 
 SHEET = TagLayout("DICT_4X4_50", 0.06, {3 * r + c: flat_pose(0.09 * c, -0.09 * r) for r in range(2) for c in range(3)})
 LENS = Lens(320, 240, 290.0, 290.0, 160.0, 120.0, (-0.2, 0.0, 0.0, 0.0, 0.0))

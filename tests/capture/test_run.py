@@ -12,16 +12,16 @@ from capture.views import LENS, SIX, SIZE, SMALL
 from once import once
 
 from nerf_lightning.cameras import transform
-from nerf_lightning.capture.calibrate import calibrate
-from nerf_lightning.capture.detect import guess_family, sight, tag_detector
-from nerf_lightning.capture.geometry import angle_between, inverse, project
-from nerf_lightning.capture.layout import TagLayout, flat_pose, read_layout
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.pack import pack
 from nerf_lightning.capture.photos import find_photos
+from nerf_lightning.capture.poses.calibrate import calibrate
+from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
 from nerf_lightning.capture.run import Capture, capture
 from nerf_lightning.capture.synthetic import Truth
 from nerf_lightning.capture.tabletop import Tabletop
+from nerf_lightning.capture.tags.detect import guess_family, sight, tag_detector
+from nerf_lightning.capture.tags.layout import TagLayout, flat_pose, read_layout
 from nerf_lightning.dataset import open_scene
 from nerf_lightning.dataset.lens import rectify
 from nerf_lightning.errors import InputError

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from capture.views import LENS, ONE, SIX, SIZE, cameras, sightings
 
-from nerf_lightning.capture.calibrate import calibrate
-from nerf_lightning.capture.detect import Mark
-from nerf_lightning.capture.geometry import angle_between, inverse
-from nerf_lightning.capture.layout import SQUARE
-from nerf_lightning.capture.solve import arrange, solve
+from nerf_lightning.capture.poses.calibrate import calibrate
+from nerf_lightning.capture.poses.geometry import angle_between, inverse
+from nerf_lightning.capture.poses.solve import arrange, solve
+from nerf_lightning.capture.tags.detect import Mark
+from nerf_lightning.capture.tags.layout import SQUARE
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.errors import InputError
 

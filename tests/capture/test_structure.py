@@ -8,9 +8,9 @@ import pytest
 import yaml
 from capture.views import SIX, SMALL, camera
 
-from nerf_lightning.capture.geometry import to_matrix
 from nerf_lightning.capture.outputs import Packing
-from nerf_lightning.capture.structure import capture_without_tags, upright
+from nerf_lightning.capture.poses.geometry import to_matrix
+from nerf_lightning.capture.poses.structure import capture_without_tags, upright
 from nerf_lightning.capture.synthetic import Flaws, render_photo
 from nerf_lightning.capture.viewpoints import object_cameras
 from nerf_lightning.dataset import open_scene

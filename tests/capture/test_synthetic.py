@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.capture.geometry import inverse, normalised, project
-from nerf_lightning.capture.layout import TagLayout, flat_pose
+from nerf_lightning.capture.poses.geometry import inverse, normalised, project
 from nerf_lightning.capture.synthetic import Flaws, object_cameras, render_photo, sheet_cameras, write_capture
 from nerf_lightning.capture.tabletop import INK, PAPER, SHADE, WALL, Tabletop
+from nerf_lightning.capture.tags.layout import TagLayout, flat_pose
 from nerf_lightning.capture.viewpoints import ELEVATIONS, in_frame, tags_in_view
-from nerf_lightning.dataset.bricktrace import trace
+from nerf_lightning.dataset.bricks.trace import trace
 from nerf_lightning.dataset.lens import Lens, rectify
 from nerf_lightning.errors import InputError
 

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from nerf_lightning.cameras import look_at
-from nerf_lightning.capture.detect import Mark, Sighting
-from nerf_lightning.capture.geometry import inverse, project
-from nerf_lightning.capture.layout import SQUARE, TagLayout, flat_pose
+from nerf_lightning.capture.poses.geometry import inverse, project
+from nerf_lightning.capture.tags.detect import Mark, Sighting
+from nerf_lightning.capture.tags.layout import SQUARE, TagLayout, flat_pose
 from nerf_lightning.dataset.lens import Lens
 
 SIZE = 0.06

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from made_runs import MakeRun, results
 
-from nerf_lightning.runs import Run, read_run
+from nerf_lightning.runs.index import Run, read_run
 
 
 @pytest.fixture

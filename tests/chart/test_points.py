@@ -7,7 +7,7 @@ from made_runs import MakeRun
 
 from nerf_lightning.chart.points import budget_of, points_of
 from nerf_lightning.chart.setting import setting_of
-from nerf_lightning.runs import read_run
+from nerf_lightning.runs.index import read_run
 
 
 def test_seeds_of_one_configuration_are_one_point(make_run: MakeRun):

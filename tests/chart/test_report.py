@@ -17,7 +17,7 @@ from nerf_lightning.chart.figure import BEYOND, MOST_ROWS, MOST_TROUBLES, chart_
 from nerf_lightning.chart.notes import troubles
 from nerf_lightning.chart.references import Reference
 from nerf_lightning.chart.report import as_svg, write_report
-from nerf_lightning.runs import Run, find_runs
+from nerf_lightning.runs.index import Run, find_runs
 
 LIMITS = (0.5, 15, 1.0)
 PUBLISHED = [

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.dataset import bricks as module
-from nerf_lightning.dataset.brickmodel import bulldozer
-from nerf_lightning.dataset.bricks import bricks
-from nerf_lightning.dataset.brickshade import LIGHT
-from nerf_lightning.dataset.bricksolids import Builder, Material
-from nerf_lightning.dataset.bricktrace import nearest, shadow, trace, visible
+from nerf_lightning.dataset.bricks import scene as module
+from nerf_lightning.dataset.bricks.model import bulldozer
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.dataset.bricks.shading import LIGHT
+from nerf_lightning.dataset.bricks.solids import Builder, Material
+from nerf_lightning.dataset.bricks.trace import nearest, shadow, trace, visible
 from nerf_lightning.errors import InputError
 
 SMALL = {"size": 40, "train_views": 4, "val_views": 2, "orbit_views": 3}

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerf_lightning.dataset import builtin_picture, from_picture, load_picture
-from nerf_lightning.dataset.decode import read_pixels
+from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.errors import InputError
 
 RED, BLUE = (255, 0, 0), (0, 0, 255)

@@ -8,7 +8,7 @@ from nerf_lightning.dataset import RayBatch, RayDataModule, Scene, Views
 from nerf_lightning.dataset.loader import StepLoader
 from nerf_lightning.dataset.rays import draw_rays
 from nerf_lightning.errors import InputError
-from nerf_lightning.seeding import step_generator
+from nerf_lightning.utils.seeding import step_generator
 
 VIEWS, HEIGHT, WIDTH = 3, 4, 6
 

@@ -9,14 +9,14 @@ import imageio.v3 as imageio
 import pytest
 import torch
 
-from nerf_lightning.compose import composed
+from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.dataset.bricks import bricks
+from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.evaluate import perceptual
 from nerf_lightning.evaluate.__main__ import task
 from nerf_lightning.evaluate.perceptual import perceptual_distance
 from nerf_lightning.evaluate.verb import Judged, averages
-from nerf_lightning.training import train
+from nerf_lightning.training.train import train
 
 
 @pytest.fixture

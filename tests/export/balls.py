@@ -5,11 +5,11 @@ from pathlib import Path
 import torch
 from omegaconf import OmegaConf
 
-from nerf_lightning.build import SceneFrame, build_system
 from nerf_lightning.cameras import Bounds, Cameras, orbit_around
-from nerf_lightning.compose import composed
+from nerf_lightning.config.build import SceneFrame, build_system
+from nerf_lightning.config.compose import composed
 from nerf_lightning.model import Field
-from nerf_lightning.open_run import SceneRun
+from nerf_lightning.runs.open import SceneRun
 from nerf_lightning.system import NeRF3D
 
 DENSE = 80.0

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from nerf_lightning import kernels as k
-from nerf_lightning import training
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.compose import composed
+from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
+from nerf_lightning.training import train as training
 
 RAY, OFFSETS = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 2, 4])
 

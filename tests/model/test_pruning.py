@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import normalize
 
 from nerf_lightning.model import Field, HashGridField, VoxelField
-from nerf_lightning.model.pruning import vertices_in, widened
+from nerf_lightning.model.layers.pruning import vertices_in, widened
 from tests.model.test_take import BOX, hashgrid, mlp, tensorf, voxels
 
 FIELDS = pytest.mark.parametrize("make", [hashgrid, tensorf, voxels, mlp])

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.compose import composed
+from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, HashGrid2DField, HashGridField, PictureMLP, TensoRFField, VoxelField
-from nerf_lightning.run_folder import load_run
+from nerf_lightning.runs.folder import load_run
 from nerf_lightning.stability.toys import MARBLE, around, toy
-from nerf_lightning.training import train
+from nerf_lightning.training.train import train
 
 BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 1.0]])
 

@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import HashGridField, TensoRFField
-from nerf_lightning.model.view_dependence import harmonics_up_to, seen_from
+from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
 
 BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 

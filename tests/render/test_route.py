@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nerf_lightning.cameras import Cameras, orbit_around, spiral_like
-from nerf_lightning.dataset.bricks import bricks
+from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.route import along, find_route, read_path
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning import cli
+from nerf_lightning.config import cli
 from nerf_lightning.render.__main__ import task
-from nerf_lightning.run_folder import load_run
+from nerf_lightning.runs.folder import load_run
 from nerf_lightning.system import NeRF3D
 
 Render = Callable[..., tuple[int, str, str]]
@@ -69,7 +69,7 @@ def test_photos_stand_beside_their_renders(render: Render, tmp_path: Path):
     assert len(frames) == 2
     frame = imageio.imread(frames[0])
     assert frame.shape[1] == 4 * 160 and frame.shape[0] > 160, "truth, render, error, depth, magnified, and a caption"
-    from nerf_lightning.build import build_data
+    from nerf_lightning.config.build import build_data
 
     data = build_data(load_run(tmp_path / "run").cfg)
     truth = data.held_out(0).target(torch.zeros(256, 3)).view(16, 16, 3).numpy()
@@ -77,7 +77,7 @@ def test_photos_stand_beside_their_renders(render: Render, tmp_path: Path):
 
 
 def test_compact_files_too_and_the_same_command_does_nothing_twice(render: Render, tmp_path: Path):
-    from nerf_lightning.compose import composed
+    from nerf_lightning.config.compose import composed
     from nerf_lightning.export.__main__ import task as export
 
     export(composed(["run=run", "loss=9"], tmp_path, "export"))
@@ -132,8 +132,8 @@ def test_half_written_runs_are_told(render: Render, tmp_path: Path):
 
 
 def test_pictures_have_no_paths(render: Render, tmp_path: Path):
-    from nerf_lightning.compose import composed
-    from nerf_lightning.training import train
+    from nerf_lightning.config.compose import composed
+    from nerf_lightning.training.train import train
 
     given = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=2", "~logger"]
     train(

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerf_lightning import cli
-from nerf_lightning.build import PictureFrame, SceneFrame, build_system
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.compose import composed
+from nerf_lightning.config import cli
+from nerf_lightning.config.build import PictureFrame, SceneFrame, build_system
+from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
 from nerf_lightning.rightsize.climb import set_options, share_of_budget
 from nerf_lightning.rightsize.ladder import overrides, read_ladder

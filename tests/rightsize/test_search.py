@@ -8,11 +8,11 @@ import pytest
 import torch
 import yaml
 
-from nerf_lightning import cli
-from nerf_lightning.compose import composed
+from nerf_lightning.config import cli
+from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.export.compact import load_compact
 from nerf_lightning.rightsize.__main__ import task
+from nerf_lightning.runs.compact import load_compact
 from nerf_lightning.stability.toys import PILE, toy
 
 RUNGS = [

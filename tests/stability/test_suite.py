@@ -7,7 +7,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 import pytest
 
-from nerf_lightning.compose import composed
+from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
 from nerf_lightning.stability.__main__ import stability
 from nerf_lightning.stability.cell import Cell, Outcome, folder_of, run

@@ -1,0 +1,70 @@
+"""PictureCharts: what a 2D run is looked at by, once it is done."""
+
+from pathlib import Path
+
+import lightning as L
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from nerf_lightning.callbacks.attached import attached, data_of
+from nerf_lightning.callbacks.results import Results
+from nerf_lightning.drawing.ink import BLUE, DPI, pixels_of
+from nerf_lightning.drawing.panels import write_png
+from nerf_lightning.drawing.spectra import spectrum_chart
+from nerf_lightning.system import System
+
+
+def error_chart(rgb: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], title: str) -> Figure:
+    """The error of every pixel, mean over the colours, with its scale."""
+    error = (rgb - truth).abs().mean(-1).numpy() * 255
+    height, width = error.shape
+    figure = Figure(figsize=(8, 1 + 7 * min(max(height / width, 0.2), 3)), dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    # The brightest hundredth of a percent would darken all others.
+    top = max(float(np.percentile(error, 99.9)), 1e-3)
+    shown = axes.imshow(error, vmin=0, vmax=top, cmap="inferno")
+    axes.set(title=title, xlabel="column, pixels", ylabel="row, pixels")
+    figure.colorbar(shown, ax=axes, label="absolute error, mean over colours, 1/255", shrink=0.8)
+    return figure
+
+
+def curve_chart(curve: list[list[float]], title: str) -> Figure:
+    """PSNR over training seconds and over steps."""
+    figure = Figure(figsize=(12, 4.5), dpi=DPI, layout="constrained")
+    for axes, column, label in zip(figure.subplots(1, 2), (0, 1), ("training seconds", "step"), strict=True):
+        points = [(p[column], p[2]) for p in curve if p[column] > 0]  # on a logarithmic axis
+        if points:
+            axes.plot(*zip(*points, strict=True), "o-", color=BLUE, markersize=4)
+            axes.set_xscale("log")
+        axes.set(xlabel=label, ylabel="PSNR, dB")
+        axes.grid(alpha=0.3, which="both")
+    figure.suptitle(title)
+    return figure
+
+
+class PictureCharts(L.Callback):
+    """Writes error.png, spectrum.png and curve.png after the test.
+
+    Args:
+        folder: where they go, below the run folder.
+    """
+
+    def __init__(self, folder: str = "."):
+        self.folder = folder
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        if not trainer.is_global_zero:
+            return
+        data, results = data_of(trainer), attached(trainer, Results)
+        result = pl_module.evaluate(data.held_out(0))
+        title = f"{data.scene.name}, step {trainer.global_step}, {result.psnr:.2f} dB"
+        charts = {
+            "error": error_chart(result.rgb, result.truth, title),
+            "spectrum": spectrum_chart(result.truth.numpy(), result.rgb.numpy(), title),
+        }
+        if results is not None and results.summary.get("curve"):
+            charts["curve"] = curve_chart(results.summary["curve"], title)
+        for name, figure in charts.items():
+            write_png(Path(trainer.default_root_dir) / self.folder / f"{name}.png", pixels_of(figure))

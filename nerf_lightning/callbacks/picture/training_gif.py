@@ -1,0 +1,47 @@
+"""TrainingGif: the snapshots one after the other, as they came into being."""
+
+from pathlib import Path
+
+import imageio.v3 as imageio
+import lightning as L
+import numpy as np
+
+from nerf_lightning.callbacks.attached import attached
+from nerf_lightning.callbacks.snapshots import Snapshots
+from nerf_lightning.drawing.panels import narrowed
+from nerf_lightning.errors import InputError
+from nerf_lightning.system import System
+from nerf_lightning.utils.files import atomic
+
+
+class TrainingGif(L.Callback):
+    """Makes a GIF of the snapshots after training.
+
+    Args:
+        path: the GIF, below the run folder.
+        fps: frames a second; the last one stays three times as long.
+        width: in pixels, of snapshots that are wider.
+
+    Raises:
+        InputError: where fps <= 0 or width < 1.
+    """
+
+    def __init__(self, path: str = "training.gif", fps: float = 3, width: int = 640):
+        if not fps > 0:
+            raise InputError("callbacks.training_gif.fps", "", str(fps), "more than 0")
+        if width < 1:
+            raise InputError("callbacks.training_gif.width", "", str(width), "at least 1")
+        self.path = path
+        self.fps = fps
+        self.width = width
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        snapshots = attached(trainer, Snapshots)
+        if snapshots is None or not trainer.is_global_zero:
+            return
+        files = sorted((Path(trainer.default_root_dir) / snapshots.folder).glob("step_*.png"))
+        frames = [narrowed(imageio.imread(file), self.width) for file in files]
+        if not frames:
+            return
+        with atomic(Path(trainer.default_root_dir) / self.path) as temporary:
+            imageio.imwrite(temporary, np.stack([*frames, frames[-1], frames[-1]]), duration=1000 / self.fps, loop=0)

@@ -1,0 +1,1 @@
+"""From corners in photos to the camera and where it stood."""

@@ -1,0 +1,215 @@
+"""The lens of a camera from photos of tags: focal length, principal point, distortion, and how sure they are."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS
+from nerf_lightning.capture.poses.solve import Pose, Solved, misfits, packed, settle, solve
+from nerf_lightning.capture.tags.detect import Mark, Sighting
+from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.errors import InputError
+
+log = logging.getLogger(__name__)
+
+FEWEST = 3
+"""Photos below which nothing can be calibrated."""
+MODELS: tuple[tuple[int, tuple[str, ...]], ...] = (
+    (3, ("focal",)),
+    (4, ("focal", "k1")),
+    (6, ("focal", "k1", "k2")),
+    (8, ("focal", "cx", "cy", "k1")),
+    (8, ("focal", "cx", "cy", "k1", "k2")),
+    (10, ("focal", "cx", "cy", "k1", "k2", "p1", "p2")),
+    (15, ("focal", "cx", "cy", "k1", "k2", "p1", "p2", "k3")),
+    (15, LENS_PARAMETERS),
+)
+"""Photos needed, and what they may set free; the criterion of Schwarz (BIC) decides among those allowed.
+
+With few photos the principal point soaks up what bent paper does, and takes the focal length along: it stays in the middle.
+"""
+ROUNDS = 3
+"""Solutions of the poses before the lens model is chosen."""
+FIRST_FOCAL = (0.7, 1.0, 1.5, 2.2)
+"""First guesses of the focal length, in longest sides of the photo."""
+UNSURE, HOPELESS = 0.01, 0.05
+"""Standard deviation of the focal length, as a share of it, beyond which a warning, an error is due."""
+PLAUSIBLE = 0.35, 12.0
+"""Focal lengths in longest sides of the photo: from a very wide angle to a long telephoto lens."""
+COVERED = 0.4
+"""Share of the picture that corners should span."""
+FRONTAL, TILTED = np.radians(8.0), np.radians(20.0)
+"""How far tags must, and should, be tilted in some photo."""
+TILT = "tilt the camera by 20 to 45 degrees in several photos, in different directions"
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibrated lens, and what it rests on."""
+
+    lens: Lens
+    deviations: dict[str, float]
+    """Standard deviations of what was set free; the other parameters kept their plain values."""
+    rms: float
+    """Root mean square reprojection error, pixels."""
+    solved: Solved
+    used: list[Sighting]
+    """In the order of `solved.placed`."""
+    dropped: dict[str, str]
+    """Photos left out, and why."""
+    coverage: float
+    """Share of the picture within the hull of all corners."""
+    tilt: float
+    """How far off the frontal view a tag was seen at most, radians."""
+    warnings: list[str]
+
+
+def first_lens(sightings: Sequence[Sighting]) -> Lens:
+    """A focal length to start from, each mark taken as a target of its own (Zhang 2000, as OpenCV does it)."""
+    width, height = sightings[0].width, sightings[0].height
+    marks = [mark for sighting in sightings for mark in sighting.marks.values()]
+    points = [mark.points.astype(np.float32) for mark in marks]
+    pixels = [mark.pixels.astype(np.float32)[:, None] for mark in marks]
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
+    flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    found: list[tuple[float, float]] = []
+    for guess in FIRST_FOCAL:
+        focal = guess * max(width, height)
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        try:
+            error, K, *_ = cv2.calibrateCamera(points, pixels, (width, height), K, np.zeros(5), flags=flags)
+        except cv2.error as problem:
+            log.debug("no start from a focal length of %g: %s", focal, problem)
+            continue
+        if np.isfinite(K).all() and 0.2 < K[0, 0] / max(width, height) < 20:
+            found.append((error, float(K[0, 0])))
+    focal = min(found)[1] if found else 1.2 * max(width, height)
+    return Lens(width, height, focal, focal, width / 2, height / 2)
+
+
+def calibrate(folder: Path, sightings: Sequence[Sighting], layout: dict[int, Pose] | None) -> Calibration:
+    """Fits the lens.
+
+    Photos without tags are dropped by name, so are photos that the rest cannot explain.
+
+    Args:
+        folder: where the photos are, for messages.
+        sightings: all photos of one size.
+        layout: tag to world, or None where it is to be solved from these photos.
+
+    Raises:
+        InputError: too few photos with tags, or photos that cannot tell the focal length.
+    """
+    dropped = {s.name: "no tag found" for s in sightings if not s.marks}
+    used = [s for s in sightings if s.marks]
+    if len(used) < FEWEST:
+        raise InputError(
+            folder,
+            "",
+            f"{len(used)} photos with tags of {len(sightings)}",
+            f"at least {FEWEST}",
+            "take more photos of the tags, sharp, from different angles; check tags.dictionary",
+        )
+    tilt = _tilt(used)
+    if tilt < FRONTAL:
+        raise InputError(
+            folder,
+            "",
+            f"photos that all look straight at the tags (tilted by {np.degrees(tilt):.0f} degrees at most)",
+            "tags seen from different angles",
+            TILT,
+        )
+    lens = first_lens(used)
+    while True:
+        solved = _fit(folder, lens, used, layout)
+        lens = solved.lens
+        off = misfits(solved)
+        lost = {i for i in range(len(used)) if i not in solved.w2c}
+        left = [without(s, off.marks.get(i)) for i, s in enumerate(used) if i not in lost | set(off.photos)]
+        if not (off.photos or off.marks or lost) or len(left) < FEWEST:
+            break
+        dropped |= {used[i].name: off_by(error, off.usual) for i, error in off.photos.items()}
+        dropped |= {used[i].name: "its tags could not be placed" for i in lost}
+        used = left
+    refined = solved.refined
+    coverage = _coverage(used)
+    share = refined.deviations.get("focal", 0.0) / solved.lens.fx
+    field = solved.lens.fx / max(solved.lens.width, solved.lens.height)
+    if not share < HOPELESS or not PLAUSIBLE[0] < field < PLAUSIBLE[1]:
+        found = f"a focal length of {solved.lens.fx:.0f} pixels, open by {100 * share:.0f} %"
+        raise InputError(folder, "", found, "tags seen from different angles", TILT)
+    warnings = []
+    if share > UNSURE:
+        warnings.append(f"the focal length is known to {100 * share:.1f} % only: take more photos from other angles")
+    if tilt < TILTED:
+        warnings.append(f"the tags are tilted by {np.degrees(tilt):.0f} degrees at most: {TILT}")
+    if coverage < COVERED:
+        warnings.append(
+            f"the tags cover {100 * coverage:.0f} % of the picture: bring them near its borders in some photos, else "
+            "distortion there is a guess"
+        )
+    return Calibration(
+        solved.lens,
+        refined.deviations,
+        refined.total_rms,
+        solved,
+        used,
+        dropped,
+        coverage,
+        tilt,
+        warnings,
+    )
+
+
+def without(sighting: Sighting, tag: int | None) -> Sighting:
+    """A sighting less one tag that is half hidden, bent, or mistaken for another."""
+    if tag is None:
+        return sighting
+    log.warning(
+        "%s: tag %d is ignored: it lies elsewhere than in the other photos, or is half hidden", sighting.name, tag
+    )
+    return replace(sighting, marks={t: mark for t, mark in sighting.marks.items() if t != tag})
+
+
+def off_by(error: float, usual: float) -> str:
+    """Why a photo is left out."""
+    return f"its tag is {error:.1f} pixels off, where {usual:.2f} are usual"
+
+
+def _fit(folder: Path, lens: Lens, used: list[Sighting], layout: dict[int, Pose] | None) -> Solved:
+    """Poses and layout from the first guess, then the lens model that the photos can carry."""
+    marks: list[dict[int, Mark]] = [s.marks for s in used]
+    rough = MODELS[1][1] if len(used) >= MODELS[1][0] else MODELS[0][1]
+    # Without distortion a tag's flipped pose can look the better one; with the first estimate of it, solutions are told anew.
+    solved = None
+    for _ in range(ROUNDS):
+        solved = solve(lens if solved is None else solved.lens, marks, layout, rough)
+        if solved is None:
+            raise InputError(folder, "", "tags that no camera could have seen so", "photos of flat, undamaged tags")
+    assert solved is not None  # ROUNDS is at least 1
+    models = [free for needed, free in MODELS if len(solved.placed) >= needed]
+    refined = settle(solved.refined.bundle, models, solved.fixed)
+    return packed(refined, list(solved.tags), solved.placed, solved.fixed)
+
+
+def _coverage(used: Sequence[Sighting]) -> float:
+    corners = np.concatenate([mark.pixels for s in used for mark in s.marks.values()]).astype(np.float32)
+    return float(cv2.contourArea(cv2.convexHull(corners))) / (used[0].width * used[0].height)
+
+
+def _tilt(used: Sequence[Sighting]) -> float:
+    """The largest angle off the frontal view, from how much marks are foreshortened: whatever the focal length, a frontal
+    square stays one. Of each photo the mark nearest to the middle is looked at, where distortion does the same least."""
+    angles = []
+    for s in used:
+        middle = np.array([s.width / 2, s.height / 2])
+        mark = min(s.marks.values(), key=lambda m: float(np.linalg.norm(m.pixels.mean(0) - middle)))
+        flat = np.c_[mark.points[:, :2], np.ones(len(mark.points))]
+        affine = np.linalg.lstsq(flat, mark.pixels, rcond=None)[0][:2]
+        long, short = np.linalg.svd(affine, compute_uv=False)
+        angles.append(float(np.arccos(np.clip(short / long, 0, 1))))
+    return max(angles)

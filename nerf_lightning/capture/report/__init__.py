@@ -1,0 +1,1 @@
+"""The pictures that tell how a capture went."""

@@ -1,0 +1,80 @@
+"""What a calibration rests on and what it found: where in the picture corners were seen, and the lens's distortion."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS, lens_vector
+from nerf_lightning.capture.poses.calibrate import Calibration
+from nerf_lightning.capture.poses.geometry import project
+from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.drawing.ink import BLUE, DPI, GREY, SKY, as_picture, magnification
+
+UNITS = {"focal": "px", "cx": "px", "cy": "px"}
+
+
+def coverage_chart(found: Calibration) -> Figure:
+    """Where in the picture the calibration saw corners, and how the lens it found bends straight lines."""
+    figure = Figure(figsize=(18, 7.5), dpi=DPI, layout="constrained")
+    left, right = figure.subplots(1, 2)
+    lens = found.lens
+    as_picture(left, lens.width, lens.height)
+    marks = [mark for sighting in found.used for mark in sighting.marks.values()]
+    corners = np.concatenate([mark.pixels for mark in marks])
+    hull = cv2.convexHull(corners.astype(np.float32)).reshape(-1, 2)
+    left.add_patch(Polygon(hull, facecolor=SKY, alpha=0.25, edgecolor="none"))
+    left.add_patch(Polygon(hull, facecolor="none", edgecolor=BLUE, linewidth=1.5))
+    left.plot(*corners.T, ".", color=BLUE, markersize=5)
+    left.set_title(
+        f"{len(corners)} corners in {len(found.used)} photos; their hull covers {found.coverage:.0%} of the picture"
+    )
+    _distortion(figure, right, lens)
+    figure.supxlabel(parameters(found), fontsize=12)
+    return figure
+
+
+def parameters(found: Calibration) -> str:
+    """The lens in numbers, each with its standard deviation if it was set free."""
+    values = dict(zip(LENS_PARAMETERS, lens_vector(found.lens), strict=True))
+    free = [
+        f"{name} {values[name]:.{_decimals(spread)}f} ± {spread:.{_decimals(spread)}f} {UNITS.get(name, '')}".strip()
+        for name, spread in found.deviations.items()
+    ]
+    fixed = [name for name in LENS_PARAMETERS if name not in found.deviations]
+    return "set free:  " + ",   ".join(free) + (f";   kept plain: {', '.join(fixed)}" if fixed else "")
+
+
+def _decimals(spread: float) -> int:
+    """Decimals that show two digits of a standard deviation."""
+    return int(np.clip(1 - np.floor(np.log10(max(spread, 1e-9))), 0, 6))
+
+
+def displacement(lens: Lens, pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
+    """How far the distortion moves what a pinhole camera would show at these pixels."""
+    rays = (pixels - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
+    return project(lens, np.eye(4), np.column_stack([rays, np.ones(len(rays))])) - pixels
+
+
+def _distortion(figure: Figure, axes: Axes, lens: Lens) -> None:
+    """A straight grid, and what the lens makes of it."""
+    as_picture(axes, lens.width, lens.height)
+    x, y = np.meshgrid(np.linspace(0, lens.width, 97), np.linspace(0, lens.height, 73))
+    moved = displacement(lens, np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(*x.shape, 2)
+    lengths = np.linalg.norm(moved, axis=-1)
+    largest = float(lengths.max())
+    larger = magnification(largest, 0.04 * max(lens.width, lens.height))
+    shades = axes.pcolormesh(
+        x, y, lengths, cmap="cividis", vmin=0, vmax=max(largest, 1e-3), shading="gouraud", alpha=0.55
+    )
+    figure.colorbar(shades, ax=axes, label="displacement by the lens, pixels", shrink=0.8)
+    bent_x, bent_y = x + larger * moved[..., 0], y + larger * moved[..., 1]
+    for lines_x, lines_y, style in ((x, y, {"color": GREY, "linewidth": 0.7}), (bent_x, bent_y, {"color": "black"})):
+        axes.plot(lines_x[::9].T, lines_y[::9].T, **style)
+        axes.plot(lines_x[:, ::8], lines_y[:, ::8], **style)
+    axes.set_title(
+        f"distortion moves points by up to {largest:.1f} pixels; black: a straight grid (grey)\nas the lens bends it"
+        + (f", {larger:g} times as much" if larger > 1 else "")
+    )

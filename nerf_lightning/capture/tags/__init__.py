@@ -1,0 +1,1 @@
+"""Printed tags: sheets, boards, and where photos show them."""

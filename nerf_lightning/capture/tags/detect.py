@@ -1,0 +1,154 @@
+"""Tags in photos: ids and corners, to a fraction of a pixel."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from nerf_lightning.capture.tags.layout import SQUARE
+from nerf_lightning.dataset.formats.decode import read_pixels
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.progress import tracked
+
+COMMON = (
+    "DICT_4X4_50",
+    "DICT_5X5_50",
+    "DICT_6X6_50",
+    "DICT_7X7_50",
+    "DICT_4X4_1000",
+    "DICT_5X5_1000",
+    "DICT_6X6_1000",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_36h11",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_16h5",
+)
+"""What `auto` tries, small families first: the small one of a kind holds the first patterns of the large one."""
+QUICK_SIDE = 1600
+"""Longest side in pixels at which `auto` looks for a family."""
+THREADS = 2
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Known points of one tag (or board) and where a photo shows them."""
+
+    points: Float[np.ndarray, "M 3"]
+    """In the tag's own frame, metres."""
+    pixels: Float[np.ndarray, "M 2"]
+    """In the photo, pixel centres at +0.5."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What one photo shows."""
+
+    path: Path
+    width: int
+    height: int
+    marks: dict[int, Mark]
+    """By the tag's id."""
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+
+Detector = Callable[[UInt8[np.ndarray, "H W"]], dict[int, Mark]]
+"""Finds marks in a grey photo."""
+
+
+def family(name: str) -> "cv2.aruco.Dictionary":
+    """The predefined dictionary of this name.
+
+    Raises:
+        InputError: on a name that OpenCV does not know.
+    """
+    number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
+    if number is None:
+        raise InputError("config", "tags.dictionary", name, f"auto, or a name such as {', '.join(COMMON[:4])}")
+    return cv2.aruco.getPredefinedDictionary(number)
+
+
+def tag_detector(dictionary: str, size: float) -> Detector:
+    """A detector of single square tags.
+
+    Corners are refined by `cornerSubPix` within the tag's own neighbourhood. OpenCV puts pixel centres at integers, so half a
+    pixel is added.
+
+    Args:
+        dictionary: OpenCV's name of the family.
+        size: side of the black square, metres.
+    """
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.cornerRefinementWinSize = 30  # OpenCV takes 0.3 modules where that is less: sharp photos are large
+    parameters.cornerRefinementMinAccuracy = 0.005
+    parameters.cornerRefinementMaxIterations = 100
+    detector = cv2.aruco.ArucoDetector(family(dictionary), parameters)
+
+    def detect(grey: UInt8[np.ndarray, "H W"]) -> dict[int, Mark]:
+        corners, ids, _ = detector.detectMarkers(grey)
+        found = [] if ids is None else [int(i) for i in np.asarray(ids).reshape(-1)]
+        twice = {tag for tag, count in Counter(found).items() if count > 1}
+        # A pattern seen twice is a reflection, a second print or a mistake: nobody can tell which one is meant.
+        return {
+            tag: Mark(size * SQUARE, np.asarray(four, np.float64).reshape(4, 2) + 0.5)
+            for tag, four in zip(found, corners, strict=True)
+            if tag not in twice
+        }
+
+    return detect
+
+
+def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
+    """A photo, upright, in shades of grey."""
+    return cv2.cvtColor(read_pixels(path, upright=True)[..., :3], cv2.COLOR_RGB2GRAY)
+
+
+def sight(paths: Sequence[Path], detector: Detector) -> list[Sighting]:
+    """Looks for marks in photos, in the order given."""
+
+    def look(path: Path) -> Sighting:
+        grey = read_grey(path)
+        return Sighting(path, grey.shape[1], grey.shape[0], detector(grey))
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(tracked(pool.map(look, paths), len(paths), "looking for tags"))
+
+
+def guess_family(paths: Sequence[Path], photos: int = 4) -> str:
+    """The family of which most tags are found in a few of the photos.
+
+    Raises:
+        InputError: where none of the common families is found.
+    """
+    chosen = [paths[i] for i in np.linspace(0, len(paths) - 1, min(photos, len(paths))).round().astype(int)]
+    small = []
+    for path in chosen:
+        grey = read_grey(path)
+        scale = min(1.0, QUICK_SIDE / max(grey.shape))
+        small.append(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey)
+    counts = {}
+    for name in COMMON:
+        # Without error correction: a few wrong bits turn clutter into tags of the larger families.
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.errorCorrectionRate = 0.0
+        detector = cv2.aruco.ArucoDetector(family(name), parameters)
+        counts[name] = sum(len(detector.detectMarkers(grey)[0]) for grey in small)
+    best = max(COMMON, key=lambda name: counts[name])
+    if not counts[best]:
+        raise InputError(
+            paths[0].parent,
+            "",
+            f"no tag of a common family in {len(chosen)} of {len(paths)} photos",
+            "sharp photos of printed ArUco tags with a white rim",
+            "name the family with tags.dictionary=DICT_... if it is an unusual one",
+        )
+    return best

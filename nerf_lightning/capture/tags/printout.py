@@ -1,0 +1,75 @@
+"""A page of tags to print."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from nerf_lightning.capture.tags.detect import family
+from nerf_lightning.capture.tags.layout import TagLayout
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import atomic
+
+A4 = 0.210, 0.297
+"""Metres."""
+RULER = 0.1
+"""Length of the line that tells whether the printer kept the size, metres."""
+INCH = 0.0254
+
+
+def write_page(layout: TagLayout, file: Path) -> None:
+    """Writes a flat sheet of tags as a PDF of its true size.
+
+    Raises:
+        InputError: no PDF is asked for, or the tags do not fit on the page.
+    """
+    if file.suffix.lower() != ".pdf":
+        raise InputError("config", "print", str(file), "a file name that ends in .pdf")
+    figure = page(layout)
+    with atomic(file) as temporary:
+        FigureCanvasPdf(figure).print_pdf(temporary)
+
+
+def page(layout: TagLayout) -> Figure:
+    """A flat sheet of tags in the middle of an A4 page.
+
+    Raises:
+        InputError: the tags do not fit on the page.
+    """
+    corners = np.concatenate([layout.corners(tag)[:, :2] for tag in layout.poses])
+    low, high = corners.min(0), corners.max(0)
+    rim = layout.size / 6
+    if (high - low + 2 * rim > A4).any():
+        found = f"{1000 * (high - low)[0]:.0f} x {1000 * (high - low)[1]:.0f} mm of tags"
+        raise InputError("config", "tags.size", found, "no more than an A4 page with a white rim holds", "give less")
+    figure = Figure(figsize=(A4[0] / INCH, A4[1] / INCH))
+    axes = figure.add_axes((0, 0, 1, 1))
+    centre = (low + high) / 2
+    axes.set(xlim=centre[0] + np.array([-0.5, 0.5]) * A4[0], ylim=centre[1] + np.array([-0.5, 0.5]) * A4[1])
+    axes.set_axis_off()
+    side = family(layout.dictionary).markerSize + 2
+    module = layout.size / side
+    for tag, pose in layout.poses.items():
+        black = cv2.aruco.generateImageMarker(family(layout.dictionary), tag, side) < 128
+        turn = float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0])))
+        for row, first, last in _runs(black):
+            own = np.array([first * module, (side - 1 - row) * module, 0]) - [layout.size / 2, layout.size / 2, 0]
+            x, y, _ = pose[:3, :3] @ own + pose[:3, 3]
+            axes.add_patch(Rectangle((x, y), (last - first) * module, module, angle=turn, color="black", linewidth=0.2))
+    words = f"{layout.dictionary}, tags of {100 * layout.size:g} cm. Print without scaling: this line is 10 cm long."
+    bottom = centre[1] - A4[1] / 2 + 0.009
+    axes.plot(centre[0] + np.array([-0.5, 0.5]) * RULER, [bottom, bottom], color="black", linewidth=0.8)
+    axes.text(centre[0], bottom + 0.002, words, ha="center", va="bottom", fontsize=7)
+    return figure
+
+
+def _runs(black: np.ndarray) -> list[tuple[int, int, int]]:
+    """Row, first column and end of each run of black modules."""
+    out = []
+    for row, modules in enumerate(black):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], modules.astype(int), [0]])))
+        out += [(row, int(first), int(last)) for first, last in edges.reshape(-1, 2)]
+    return out

@@ -1,0 +1,198 @@
+"""From configuration to objects. Nothing else in the package instantiates from a config."""
+
+import copy
+import inspect
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import hydra
+import lightning as L
+import torch
+from lightning.pytorch.loggers import Logger
+from lightning.pytorch.strategies import SingleDeviceStrategy
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError
+
+from nerf_lightning.callbacks import Budget, Results
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.config.limits import limits_of
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.errors import InputError
+from nerf_lightning.model import Field, PictureField
+from nerf_lightning.system import NeRF2D, NeRF3D, System
+from nerf_lightning.utils.device import CPU, the_device
+from nerf_lightning.utils.options import check_options
+
+KNOWN = ("cpu", "cuda", "mps")
+"""Devices that Lightning finds by itself; for any other it would take the CPU."""
+
+
+def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
+    """Instantiates what stands at `path`, passing `extra`; the reasons it cannot be are told in terms of the config.
+
+    Raises:
+        InputError: where the key is missing, or its target refuses or does not know an option.
+    """
+    target, node = target_of(cfg, path), OmegaConf.select(cfg, path)
+    missing = sorted(OmegaConf.missing_keys(node))
+    if missing:
+        raise InputError("config", missing[0], "nothing", "a value", f"give {missing[0]}=...")
+    late = bool(node.get("_partial_"))
+    options = {key: value for key, value in resolved(node).items() if key not in ("_target_", "_partial_")}
+    check_options(path, target, options, extra, complete=not late)
+    # Hydra would turn dataclasses among `extra` into configs: it only binds the options, the call is ours.
+    bound = hydra.utils.instantiate(node, _partial_=True, _convert_="all")
+    if late:
+        return partial(bound, **extra)
+    try:
+        return bound(**extra)
+    except (ValueError, TypeError, MisconfigurationException) as error:
+        if isinstance(error, InputError) or target.__module__.split(".")[0] == "nerf_lightning":
+            raise  # our own targets tell bad options apart from defects; libraries do not
+        raise InputError("config", path, str(error), f"options that {target.__name__} takes") from error
+
+
+def target_of(cfg: DictConfig, path: str) -> Any:
+    """The class or function that the node at `path` names.
+
+    Raises:
+        InputError: where it names none, or none that can be imported.
+    """
+    node = OmegaConf.select(cfg, path)
+    if not isinstance(node, DictConfig):
+        found = "nothing" if node is None else repr(node)
+        raise InputError("config", path, found, f"one of the options of the group {path}", f"give {path}=NAME")
+    try:
+        return hydra.utils.get_object(node["_target_"])
+    except (ImportError, AttributeError, ValueError, ConfigKeyError) as error:
+        raise InputError("config", f"{path}._target_", str(error), "an importable class or function") from error
+
+
+def resolved(cfg: DictConfig) -> dict[str, Any]:
+    """A configuration as plain containers, interpolations filled in."""
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(plain, dict)  # a DictConfig gives nothing else
+    return {str(key): value for key, value in plain.items()}
+
+
+def device_of(cfg: DictConfig) -> torch.device:
+    """The device that a run asks for, by its trainer.
+
+    Raises:
+        InputError: where it is not there.
+    """
+    return the_device(str(OmegaConf.select(cfg, "trainer.accelerator", default="auto")))
+
+
+def build_data(cfg: DictConfig, path: str | None = None) -> RayDataModule | PixelDataModule:
+    """The data module, its scene loaded; from other photos than the configuration names, where a path is given."""
+    if path is None:
+        return make(cfg, "dataset")
+    elsewhere = copy.deepcopy(cfg)
+    if "path" in inspect.signature(target_of(cfg, "dataset")).parameters:
+        elsewhere.dataset.path = path
+    else:  # a built-in scene
+        elsewhere.dataset = {"_target_": "nerf_lightning.dataset.from_photos", "path": path}
+    return make(elsewhere, "dataset")
+
+
+def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> Any:
+    """The field, if it has as many dimensions as the data."""
+    found = target_of(cfg, "model") if cfg.get("model") is not None else None
+    if not (inspect.isclass(found) and issubclass(found, kind)):
+        name = getattr(found, "__name__", "nothing")
+        advice = "model=hashgrid or model=mlp" if kind is Field else "model=hashgrid2d or model=picture_mlp"
+        raise InputError("config", "model", name, f"a field of {dimensions} for this dataset", f"choose {advice}")
+    return make(cfg, "model", **extra)
+
+
+def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) -> System:
+    """The LightningModule: NeRF3D for a scene's frame, NeRF2D for a picture's. On the CPU, with the limits of a device."""
+    optimizer = make(cfg, "optimizer")
+    try:
+        optimizer([torch.zeros(1)])  # a rate below zero is told now, not when training starts
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
+    chunk = limits_of(cfg, device).chunk
+    common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
+    if isinstance(frame, PictureFrame):
+        return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
+    field = build_field(cfg, Field, "three coordinates", bounds=frame.bounds)
+    sampler = make(cfg, "sampler", bounds=frame.bounds)
+    half_size = float(frame.bounds.half_size.min())
+    renderer = make(cfg, "renderer", scene_background=frame.background, half_size=half_size)
+    return NeRF3D(field, sampler, renderer, **common)
+
+
+@dataclass(frozen=True)
+class SceneFrame:
+    """What a 3D system takes from its scene: where it is, and the colour behind it."""
+
+    bounds: Bounds
+    background: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class PictureFrame:
+    """What a 2D system takes from its picture: pixels along each side."""
+
+    width: int
+    height: int
+
+
+Frame = SceneFrame | PictureFrame
+
+
+def frame_of(data: RayDataModule | PixelDataModule) -> Frame:
+    """What a system takes from the data."""
+    if isinstance(data, PixelDataModule):
+        return PictureFrame(*data.scene.size)
+    bounds = data.scene.bounds
+    pixel = data.scene.train.cameras.pixel_width(bounds.centre)
+    return SceneFrame(replace(bounds, pixel=pixel or None), data.scene.background)
+
+
+def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, system: System) -> None:
+    """Photos without alpha stand on one colour; asking for another would teach the field a wall of the first."""
+    if isinstance(data, PixelDataModule) or data.scene.train.images.shape[-1] == 4:
+        return
+    assert isinstance(system, NeRF3D)  # what build_system makes for rays
+    wanted = "random" if system.renderer.random else system.background
+    if wanted != [round(c, 3) for c in data.scene.background]:
+        raise InputError(
+            "config: renderer.background",
+            "",
+            str(cfg.renderer.background),
+            f"scene: the photos of {data.scene.name} have no alpha and stand on {list(data.scene.background)}",
+        )
+
+
+def budget_options(cfg: DictConfig) -> dict[str, Any]:
+    """The user's limits, or the experiment's own where the user gives none."""
+    budget = resolved(cfg.budget)
+    default = budget.pop("default")
+    return budget if any(budget[key] is not None for key in default) else {**budget, **default}
+
+
+def build_budget(cfg: DictConfig) -> Budget:
+    """How long to train."""
+    limits = budget_options(cfg)
+    check_options("budget", Budget, limits)
+    return Budget(**limits)
+
+
+def build_trainer(cfg: DictConfig, folder: Path, device: torch.device) -> L.Trainer:
+    """The Trainer with its callbacks, on a device, writing into `folder`."""
+    logger: Logger | bool = make(cfg, "logger", save_dir=folder) if cfg.get("logger") is not None else False
+    chosen = [name for name, node in (cfg.get("callbacks") or {}).items() if node is not None]
+    callbacks = [make(cfg, f"callbacks.{name}") for name in chosen]
+    results = Results("results.json", cfg.method, cfg.seed)
+    # The budget goes first: the others read its clock. Results go before the orbit: figures should not wait for a GIF.
+    callbacks = [build_budget(cfg), results, *callbacks]
+    where: dict[str, Any] = {"accelerator": device.type}
+    if device.type not in KNOWN:
+        where["strategy"] = SingleDeviceStrategy(device)
+    return make(cfg, "trainer", callbacks=callbacks, logger=logger, default_root_dir=folder, **where)

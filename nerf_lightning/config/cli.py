@@ -1,0 +1,122 @@
+"""What every command line of the package shares: where conf/ is, and errors as one line. Imports nothing heavy."""
+
+import functools
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NoReturn
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from nerf_lightning.config import resolvers  # noqa: F401  (conf/ uses its resolvers)
+from nerf_lightning.errors import InputError
+
+TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
+"""Environment variable: set to 1, errors come with the full traceback."""
+
+
+def conf_dir() -> Path:
+    """The shipped configuration: inside the package in an installed wheel, beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
+
+
+def by_path(arguments: Sequence[str], folder: Path) -> list[str]:
+    """A command line whose +experiment=PATH.yaml Hydra finds: as a name relative to its own experiments.
+
+    Args:
+        arguments: of the command line.
+        folder: where conf/ is.
+    """
+    found = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        path = Path(value).expanduser()
+        if key == "+experiment" and path.suffix == ".yaml" and path.is_file():
+            argument = f"{key}={os.path.relpath(path.with_suffix(''), folder / 'experiment')}"
+        found.append(argument)
+    return found
+
+
+def quoted(arguments: Sequence[str], keys: Sequence[str]) -> list[str]:
+    """A command line in which Hydra reads the values of some keys as texts, whatever is in them.
+
+    Args:
+        arguments: of the command line.
+        keys: whose values are texts; what is quoted or in brackets already stays as it is.
+    """
+    found = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key in keys and value and value[0] not in "'\"[" and value != "null":
+            escaped = value.replace("'", "\\'")
+            argument = f"{key}='{escaped}'"
+        found.append(argument)
+    return found
+
+
+def given_of(cfg: DictConfig) -> dict[str, Any]:
+    """The keys of a verb on a run, as plain values: those that have one, and `dataset.path` as `photos`."""
+    given = {str(key): cfg[key] for key in cfg if key != "dataset" and not OmegaConf.is_missing(cfg, key)}
+    given |= {key: OmegaConf.to_container(value) for key, value in given.items() if OmegaConf.is_config(value)}
+    return {**given, "photos": cfg.dataset.path}
+
+
+def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] = ()) -> None:
+    """Composes `conf/<config>.yaml` with the command line and calls `task`; exits with 2 on bad input.
+
+    The values of the keys in `texts` may hold commas and whatever else means something to Hydra.
+
+    Bad input is anything the user can mend: it gets one line. Everything else is a defect and keeps its traceback.
+    """
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
+
+    sys.argv[1:] = quoted(by_path(sys.argv[1:], conf_dir()), texts)
+    started = False
+
+    @functools.wraps(task)
+    def job(cfg: DictConfig) -> object:
+        nonlocal started
+        started = True
+        try:
+            return task(cfg)
+        except InputError as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise  # the sweep decides what becomes of the other jobs
+            folder, here = Path(HydraConfig.get().runtime.output_dir).resolve(), Path.cwd()
+            with suppress(OSError):  # a folder in which something stands stays
+                while folder != here:  # where a verb writes nothing of its own
+                    folder.rmdir()
+                    folder = folder.parent if here in folder.parents else here
+            give_up(error)
+
+    try:
+        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
+    except Exception as error:
+        # Before the task starts there is only Hydra at work on the command line: whatever it stumbles over is input.
+        if started and not isinstance(error, InputError | HydraException | OmegaConfBaseException):
+            raise
+        give_up(error)
+
+
+def give_up(error: Exception) -> NoReturn:
+    """Prints the error as one line, or whole where the environment asks for it, and exits with 2."""
+    if os.environ.get(TRACEBACK) == "1":
+        traceback.print_exception(error)
+    line = " ".join(str(error).split("Config search path")[0].split())
+    unknown = re.match(r"Could not override '([^']+)'", line)
+    if unknown:
+        line = f"command line: found {unknown[1]}, expected a key or group that --cfg job or --help lists"
+    if re.search(r"hydra/(launcher|sweeper)", line):
+        line += "; joblib, submitit_local, submitit_slurm and optuna come with pip install 'nerf_lightning[sweeps]'"
+    print(f"nerf_lightning: {line} ({TRACEBACK}=1 shows the traceback)", file=sys.stderr)
+    sys.exit(2)

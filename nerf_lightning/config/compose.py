@@ -1,0 +1,19 @@
+"""Configurations composed as the command line would, for code that runs without one: tests, benchmarks."""
+
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from nerf_lightning.config import cli
+
+
+def composed(overrides: list[str], folder: Path, config: str = "config") -> DictConfig:
+    """The configuration a command line would give to the verb of that primary config, with `folder` as the run's."""
+    with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
+        cfg = compose(config, overrides, return_hydra_config=True)
+    with open_dict(cfg):
+        cfg.hydra.runtime.output_dir = str(folder)
+    HydraConfig.instance().set_config(cfg)
+    return OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])

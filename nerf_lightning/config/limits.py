@@ -1,0 +1,38 @@
+"""What a device takes at once: a default for each kind of device, in conf/devices, which a run may override."""
+
+from dataclasses import dataclass
+
+import torch
+import yaml
+from omegaconf import DictConfig
+
+from nerf_lightning.config.cli import conf_dir
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.options import Count, check_options
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The keys of conf/devices/*.yaml, and of a run's `limits`."""
+
+    batch: Count
+    """Times as many rays and samples a training step as the dataset asks for."""
+    chunk: Count
+    """Samples rendered together."""
+
+
+def limits_of(cfg: DictConfig, device: torch.device) -> Limits:
+    """What a run says, else what its device takes. Runs of earlier versions say nothing.
+
+    Raises:
+        InputError: for an unknown limit, or one below 1.
+    """
+    folder = conf_dir() / "devices"
+    own = folder / f"{device.type}.yaml"
+    limits = yaml.safe_load((own if own.exists() else folder / "cpu.yaml").read_text())
+    given = cfg.get("limits", {})
+    if not isinstance(given, DictConfig | dict):
+        raise InputError("config", "limits", repr(given), "batch and chunk, each a number or null")
+    limits |= {str(key): value for key, value in given.items() if value is not None}
+    check_options("limits", Limits, limits)
+    return Limits(**limits)

@@ -1,0 +1,1 @@
+"""The built-in scene: a model of bricks, traced ray by ray."""

@@ -1,0 +1,74 @@
+"""The Blender format of the original NeRF scenes: transforms_{train,val,test}.json beside RGBA renders."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nerf_lightning.cameras import Cameras, orbit_like
+from nerf_lightning.dataset.extent import estimate_bounds
+from nerf_lightning.dataset.formats import checks
+from nerf_lightning.dataset.formats.conventions import opengl_to_opencv
+from nerf_lightning.dataset.formats.decode import find_image, read_images
+from nerf_lightning.dataset.resize import area_resize, fit_size
+from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.errors import InputError
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+def load_blender(folder: Path, name: str | None = None, resize: int | None = None) -> Scene:
+    """Reads a Blender scene: OpenGL camera-to-world poses, converted to OpenCV here.
+
+    Held out is the val split, or test where there is no val. Renders keep their alpha; the background they are shown on
+    is white by convention.
+
+    Args:
+        folder: holds transforms_train.json and transforms_val.json or transforms_test.json.
+        name: defaults to the folder's name.
+        resize: longest side in pixels after averaging, if smaller than the renders.
+
+    Raises:
+        InputError: anything missing, malformed or of unequal size.
+    """
+    held_out = "val" if (folder / "transforms_val.json").is_file() else "test"
+    if not (folder / f"transforms_{held_out}.json").is_file():
+        raise InputError(folder, "", "no transforms_val.json or transforms_test.json", "held-out views in one of them")
+    train, val = (_load_split(folder / f"transforms_{split}.json", resize) for split in ("train", held_out))
+    checks.image_size(
+        folder / f"transforms_{held_out}.json", "frames", val.images.numpy(), tuple(train.images.shape[1:])
+    )
+    return Scene(
+        name=name or folder.resolve().name.lower(),
+        source=str(folder),
+        train=train,
+        val=val,
+        orbit=orbit_like(train.cameras),
+        bounds=estimate_bounds(train, WHITE),
+        background=WHITE,
+    )
+
+
+def _load_split(path: Path, resize: int | None) -> Views:
+    content = checks.read_json(path)
+    checks.require_keys(path, content, ["camera_angle_x", "frames"])
+    angle = checks.positive(path, "camera_angle_x", content["camera_angle_x"], "radians")
+    if angle >= math.pi:
+        raise InputError(path, "camera_angle_x", f"{angle:g}", "radians below pi")
+    names, poses = checks.json_frames(path, content)
+    files = []
+    for i, file_path in enumerate(names):
+        if (file := find_image(path.parent, file_path)) is None:
+            raise InputError(path, f"frames[{i}].file_path", f"{file_path!r}, which is not there", "an image file")
+        files.append(file)
+
+    def shrink(index: int, image: np.ndarray) -> np.ndarray:
+        return area_resize(image, *fit_size(image.shape[1], image.shape[0], resize))
+
+    images = read_images(files, shrink)
+    height, width = images.shape[1:3]
+    focal = 0.5 * width / math.tan(0.5 * angle)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
+    c2w = torch.from_numpy(opengl_to_opencv(poses)).float()
+    return Views(torch.from_numpy(images), Cameras(K.repeat(len(c2w), 1, 1), c2w, width, height))

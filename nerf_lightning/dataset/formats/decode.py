@@ -1,0 +1,101 @@
+"""Image files to arrays: any depth and channel count becomes 8-bit RGB or RGBA."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Shaped, UInt8
+
+from nerf_lightning.dataset.formats.checks import existing_file, image_size
+from nerf_lightning.errors import InputError
+
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+THREADS = 4
+
+
+def find_image(folder: Path, file_path: str) -> Path | None:
+    """The file that `file_path` means; its extension may be missing, as Blender exports leave it."""
+    for extension in ("", *EXTENSIONS):
+        if (candidate := folder / (file_path + extension)).is_file():
+            return candidate
+    return None
+
+
+def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]:
+    """Decodes one image: RGB, or RGBA with straight alpha; 16 bits become 8, grey becomes RGB.
+
+    Args:
+        path: PNG, JPEG, TIFF or whatever else OpenCV reads.
+        upright: apply the EXIF rotation (photos; files with alpha carry none). Off for posed photos: poses and
+            intrinsics speak of the stored pixels.
+
+    Raises:
+        InputError: missing, truncated, not an image, or of floating-point pixels.
+    """
+    existing_file(path)
+    try:
+        data = path.read_bytes()
+        if _cut_short(data):
+            raise InputError(path, "", "a truncated image", "a whole PNG, JPEG or TIFF", "copy it again")
+        # UNCHANGED keeps alpha and 16 bits, and leaves the EXIF rotation alone.
+        raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        if raw is not None and upright and (raw.ndim == 2 or raw.shape[2] < 4):
+            raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    except (cv2.error, OSError) as error:
+        raise InputError(path, "", f"an unreadable image ({error})", "a PNG, JPEG or TIFF") from error
+    if raw is None:
+        raise InputError(path, "", f"{len(data)} bytes that are no image", "a PNG, JPEG or TIFF", "copy it again")
+    return _rgb8(path, raw)
+
+
+def read_images(
+    paths: Sequence[Path], process: Callable[[int, UInt8[np.ndarray, "H W C"]], UInt8[np.ndarray, "h w C"]]
+) -> UInt8[np.ndarray, "V h w C"]:
+    """Decodes posed photos, hands each to `process(index, image)` and stacks the results. All must share one size.
+
+    Threads, not processes: OpenCV lets go of the interpreter lock, and full-size photos never pile up in memory.
+    """
+    size = read_pixels(paths[0]).shape
+
+    def read(index: int) -> UInt8[np.ndarray, "h w C"]:
+        image = read_pixels(paths[index])
+        image_size(paths[index], "", image, size)
+        return process(index, image)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        return np.stack(list(pool.map(read, range(len(paths)))))
+
+
+def _rgb8(path: Path, raw: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "H W C"]:
+    if raw.dtype == np.uint16:
+        raw = ((raw.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if raw.dtype != np.uint8:
+        raise InputError(path, "", f"{raw.dtype} pixels", "8 or 16 bits a channel")
+    raw = raw.reshape(*raw.shape[:2], -1)
+    grey, alpha = raw[..., :1], raw[..., -1:]
+    match raw.shape[2]:
+        case 1:
+            return np.repeat(grey, 3, axis=2)
+        case 2:
+            return np.concatenate([grey, grey, grey, alpha], axis=2)
+        case 3:
+            return cv2.cvtColor(raw, cv2.COLOR_BGR2RGB)
+        case 4:
+            return cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA)
+        case channels:
+            raise InputError(path, "", f"{channels} channels", "1 to 4")
+
+
+def _cut_short(data: bytes) -> bool:
+    """Some OpenCV versions pad truncated PNG and JPEG files with grey and only mutter; end markers tell."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" not in data
+    if not data.startswith(b"\xff\xd8"):
+        return False
+    # Hop over the segments before the scan: a thumbnail in the EXIF segment has an end marker of its own.
+    at = 2
+    while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return data.find(b"\xff\xd9", at) < 0

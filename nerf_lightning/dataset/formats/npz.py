@@ -1,0 +1,134 @@
+"""The course format: one .npz file with images, OpenCV camera-to-world poses and a focal length."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerf_lightning.cameras import Bounds, Cameras, orbit_like
+from nerf_lightning.dataset.extent import border_colour, estimate_bounds
+from nerf_lightning.dataset.formats import checks
+from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import atomic
+
+NEEDED = ("images_train", "c2ws_train", "images_val", "c2ws_val")
+OPTIONAL = ("c2ws_test", "focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
+
+
+def load_npz(path: Path, name: str | None = None) -> Scene:
+    """Reads the course format. Poses are OpenCV camera to world already: nothing is converted.
+
+    Entries, with V views a split:
+        images_train, images_val: (V, H, W, 3 or 4), uint8 or floats in [0, 1].
+        c2ws_train, c2ws_val, c2ws_test: (V, 4, 4); the last is the orbit, made up like the training cameras if absent.
+        focal: pixels, with the principal point in the middle; or K: (3, 3), for all views, which then rules.
+        near, far: distances along the rays, and aabb: (2, 3), world units; optional, the box is estimated if absent.
+        background: (3,), sRGB; if absent the one colour along the photos' borders, or black.
+        unbounded: whether content lies outside aabb too, false if absent.
+        to_source: (4, 4), similarity to the frame of the original, identity if absent. `save_npz` writes these three
+        only where they say something.
+
+    Raises:
+        InputError: anything missing, malformed or contradictory.
+    """
+    data = checks.read_npz(path, NEEDED + OPTIONAL, NEEDED)
+    if "K" not in data and "focal" not in data:
+        checks.require_keys(path, data, ["focal"])
+    images = {
+        split: checks.uint8_images(path, f"images_{split}", data[f"images_{split}"]) for split in ("train", "val")
+    }
+    size = images["train"].shape[1:]
+    height, width = size[:2]
+    if "K" in data:
+        K = checks.intrinsics(path, "K", data["K"])
+    else:
+        focal = checks.positive(path, "focal", data["focal"])
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+
+    def cameras(key: str) -> Cameras:
+        c2w = torch.from_numpy(checks.rigid_poses(path, key + "[{}]", data[key])).float()
+        return Cameras(torch.from_numpy(K).float().repeat(len(c2w), 1, 1), c2w, width, height)
+
+    splits = {}
+    for split in ("train", "val"):
+        count = len(images[split])
+        checks.split_size(path, f"images_{split}", count, len(np.atleast_1d(data[f"c2ws_{split}"])))
+        checks.image_size(path, f"images_{split}", images[split], size)
+        splits[split] = Views(torch.from_numpy(images[split]), cameras(f"c2ws_{split}"))
+    orbit = orbit_like(splits["train"].cameras)
+    if "c2ws_test" in data:
+        orbit = cameras("c2ws_test")
+        checks.split_size(path, "c2ws_test", len(orbit))
+
+    background = border_colour(splits["train"].images) or (0.0, 0.0, 0.0)
+    if "background" in data:
+        red, green, blue = checks.numeric(path, "background", data["background"], "3").tolist()
+        background = (red, green, blue)
+    to_source = torch.eye(4)
+    if "to_source" in data:
+        to_source = torch.from_numpy(checks.numeric(path, "to_source", data["to_source"], "4 4")).float()
+    return Scene(
+        name=name or re.sub(r"_\d+x\d+$", "", path.stem).lower(),
+        source=str(path),
+        train=splits["train"],
+        val=splits["val"],
+        orbit=orbit,
+        bounds=_bounds(path, data, splits["train"], background),
+        background=background,
+        to_source=to_source,
+    )
+
+
+def _bounds(path: Path, data: dict[str, np.ndarray], train: Views, background: tuple[float, float, float]) -> Bounds:
+    near, far = (checks.number(path, key, data[key]) if key in data else None for key in ("near", "far"))
+    checks.near_far(path, near, far)
+    if "aabb" not in data:
+        return estimate_bounds(train, background, near, far)
+    aabb = torch.from_numpy(checks.box(path, "aabb", data["aabb"])).float()
+    unbounded = False
+    if "unbounded" in data:
+        if data["unbounded"].shape != () or data["unbounded"].dtype != bool:
+            raise InputError(path, "unbounded", f"{data['unbounded'].dtype}", "one true or false")
+        unbounded = bool(data["unbounded"])
+    return Bounds(aabb, unbounded, near, far)
+
+
+def save_npz(scene: Scene, path: Path) -> None:
+    """Writes the course format, so that `load_npz` gives the same scene back; whole or not at all.
+
+    Raises:
+        InputError: the views do not share one K, or the folder cannot be written.
+    """
+    K = scene.train.cameras.K[0]
+    for cameras in (scene.train.cameras, scene.val.cameras, scene.orbit):
+        if not torch.equal(cameras.K, K.expand_as(cameras.K)):
+            raise InputError(path, "K", "views with different intrinsics", "one K for all views of an .npz scene")
+    arrays: dict[str, Tensor] = {
+        "images_train": scene.train.images,
+        "c2ws_train": scene.train.cameras.c2w,
+        "images_val": scene.val.images,
+        "c2ws_val": scene.val.cameras.c2w,
+        "c2ws_test": scene.orbit.c2w,
+        "focal": K[0, 0],
+        "K": K,
+        "aabb": scene.bounds.aabb,
+    }
+    for key in ("near", "far"):
+        if (value := getattr(scene.bounds, key)) is not None:
+            arrays[key] = torch.tensor(value, dtype=torch.float64)
+    if scene.bounds.unbounded:
+        arrays["unbounded"] = torch.tensor(True)
+    if any(scene.background):
+        arrays["background"] = torch.tensor(scene.background, dtype=torch.float64)
+    if not torch.equal(scene.to_source, torch.eye(4)):
+        arrays["to_source"] = scene.to_source
+    content: dict[str, Any] = {key: array.numpy() for key, array in arrays.items()}
+    try:
+        with atomic(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **content)
+    except OSError as error:
+        raise InputError(path, "", f"no way to write ({error})", "a folder that exists, with space") from error

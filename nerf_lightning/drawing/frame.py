@@ -1,0 +1,88 @@
+"""One frame: what a view shows, channel beside channel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+from torch import Tensor
+
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.drawing.panels import near_bright
+from nerf_lightning.renderer import Rendered
+from nerf_lightning.system import NeRF3D
+from nerf_lightning.system.metrics import decibels
+from nerf_lightning.utils.evenly import evenly
+
+CHANNELS = ("rgb", "depth", "opacity")
+LOOKS, LOOK_SIDE = 6, 64
+"""Views, and pixels along their longer side, that the range of depths is told from."""
+ERROR_TIMES = 4
+"""By how much errors are magnified."""
+
+
+@dataclass(frozen=True)
+class Style:
+    """How frames are drawn."""
+
+    channels: tuple[str, ...]
+    background: tuple[float, float, float] | None
+    """What shows where nothing is, in [0, 1]; None leaves it transparent."""
+    depths: tuple[float, float]
+    """What is bright and what is dark in a picture of depth, in the scene's unit: one range for a whole film."""
+
+
+def depth_range(system: NeRF3D, cameras: Cameras) -> tuple[float, float]:
+    """The 2nd and the 98th percentile of the depths that a few of the views show, in the scene's unit."""
+    shrink = min(1.0, LOOK_SIDE / max(cameras.width, cameras.height))
+    small = cameras.resized(max(1, round(cameras.width * shrink)), max(1, round(cameras.height * shrink)))
+    seen = []
+    for view in evenly(len(small), LOOKS):
+        rendered = system.render(small.view_rays(view).to(system.device))
+        seen.append(rendered.depth[rendered.opacity > 0.5])
+    covered = torch.cat(seen).cpu().numpy()
+    if not len(covered):
+        return 0.0, 1.0
+    low, high = np.percentile(covered, [2, 98]).tolist()
+    return low, max(high, low + 1e-6)
+
+
+def draw(system: NeRF3D, cameras: Cameras, view: int, style: Style) -> dict[str, UInt8[ndarray, "H W C"]]:
+    """A view's channels; C is 4, with straight alpha, where the background is left transparent."""
+    rendered = system.render(cameras.view_rays(view).to(system.device))
+    painted = {name: colours(rendered, name, style) for name in style.channels}
+    shape = (cameras.height, cameras.width, -1)
+    return {name: (one.clamp(0, 1) * 255).round().byte().view(shape).cpu().numpy() for name, one in painted.items()}
+
+
+def colours(rendered: Rendered, channel: str, style: Style) -> Float[Tensor, "R C"]:
+    """What one channel shows along some rays, rendered on the style's background; black stands for a transparent one."""
+    opacity = rendered.opacity[:, None]
+    if channel == "opacity":
+        grey = opacity.expand(-1, 3)
+        return grey if style.background is not None else torch.cat([grey, torch.ones_like(opacity)], dim=1)
+    if channel == "rgb":
+        covered = rendered.rgb  # on black: premultiplied
+    else:
+        covered = depth_colours(rendered.depth, style.depths) * opacity
+        if style.background is not None:
+            covered = covered + (1 - opacity) * torch.tensor(style.background, device=opacity.device)
+    if style.background is not None:
+        return covered
+    return torch.cat([covered / opacity.clamp_min(1e-6), opacity], dim=1)
+
+
+def depth_colours(depth: Float[Tensor, "R"], depths: tuple[float, float]) -> Float[Tensor, "R 3"]:
+    """Near bright, far dark, by a scale that is even to the eye."""
+    painted = near_bright(depth.cpu().numpy()[:, None], *depths)[:, 0]
+    return torch.from_numpy(painted.copy()).to(depth.device).float() / 255
+
+
+def error_picture(
+    shown: UInt8[ndarray, "H W 3"], truth: UInt8[ndarray, "H W 3"]
+) -> tuple[UInt8[ndarray, "H W 3"], float]:
+    """The difference, magnified, and the PSNR in dB of the two as bytes."""
+    difference = np.abs(shown.astype(np.float64) - truth)
+    mse = float(np.mean((difference / 255) ** 2))
+    return (ERROR_TIMES * difference).clip(0, 255).astype(np.uint8), decibels(mse)

@@ -1,0 +1,60 @@
+"""Frequencies of a picture: how much of each is there, and how much of it a field has learned."""
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from nerf_lightning.drawing.ink import BLUE, DPI, ORANGE, VERMILLION
+
+BANDS = 64
+"""Rings into which the frequencies up to one cycle in two pixels are gathered."""
+
+
+def brightness(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+    """Luma of sRGB (ITU-R BT.601), its mean taken away."""
+    grey = image @ np.array([0.299, 0.587, 0.114])
+    return grey - grey.mean()
+
+
+def amplitudes(grey: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Size of every frequency, zero in the middle. A Hann window keeps the picture's borders from looking like edges."""
+    window = np.hanning(grey.shape[0] + 2)[1:-1, None] * np.hanning(grey.shape[1] + 2)[1:-1]
+    return np.abs(np.fft.fftshift(np.fft.fft2(grey * window))) / np.sqrt((window**2).sum() * grey.size)
+
+
+def by_frequency(
+    spectrum: Float[np.ndarray, "H W"], bands: int = BANDS
+) -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B"]]:
+    """Root mean square over rings of equal frequency: their middles in cycles a pixel, and the sizes (nan for empty rings)."""
+    down, across = (np.fft.fftshift(np.fft.fftfreq(n)) for n in spectrum.shape)
+    radius = np.hypot(down[:, None], across)
+    # The last ring ends with 0.5 itself; the corners beyond go into one of their own.
+    ring = np.where(radius <= 0.5, np.minimum((radius / 0.5 * bands).astype(int), bands - 1), bands)
+    count = np.bincount(ring.ravel(), minlength=bands + 1)[:bands]
+    power = np.bincount(ring.ravel(), (spectrum**2).ravel(), minlength=bands + 1)[:bands]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (np.arange(bands) + 0.5) * 0.5 / bands, np.sqrt(power / count)
+
+
+def spectrum_chart(target: Float[np.ndarray, "H W 3"], result: Float[np.ndarray, "H W 3"], title: str) -> Figure:
+    """Both spectra as pictures, and by frequency beside that of the error: where they cross, learning ends."""
+    figure = Figure(figsize=(16, 5), dpi=DPI, layout="constrained")
+    left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.4))
+    spectra = {
+        "target": amplitudes(brightness(target)),
+        "result": amplitudes(brightness(result)),
+        "error": amplitudes(brightness(result) - brightness(target)),
+    }
+    top = max(float(spectra["target"].max()), 1e-9)
+    for axes, name in ((left, "target"), (middle, "result")):
+        decades = np.log10(np.maximum(spectra[name], top * 1e-6) / top)
+        shown = axes.imshow(decades, extent=(-0.5, 0.5, 0.5, -0.5), vmin=-6, vmax=0, cmap="magma", aspect="auto")
+        axes.set(title=f"{name}: amplitude, decades", xlabel="cycles a pixel, across", ylabel="cycles a pixel, down")
+    figure.colorbar(shown, ax=middle)
+    for (name, spectrum), colour in zip(spectra.items(), (BLUE, ORANGE, VERMILLION), strict=True):
+        frequency, size = by_frequency(spectrum)
+        right.semilogy(frequency, np.maximum(size, top * 1e-9), color=colour, label=name)
+    right.set(title=title, xlabel="cycles a pixel (0.5: every other pixel)", ylabel="rms amplitude", xlim=(0, 0.5))
+    right.grid(alpha=0.3)
+    right.legend()
+    return figure

@@ -1,0 +1,1 @@
+"""All runs of a sweep in one picture."""

@@ -1,0 +1,1 @@
+"""What several fields are made of."""

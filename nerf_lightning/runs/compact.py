@@ -1,0 +1,152 @@
+"""The compact file: a trained system in as few bytes as it can be rendered from, in one .npz of plain arrays.
+
+header                     JSON as bytes: format, version, config, scene, and how each array is coded
+field.NAME, sampler.NAME   parameters as halves, or as bytes between the least and the most of their column; masks as bits
+NAME:range                 least and most of each column, where it is coded as bytes
+"""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from nerf_lightning.config.build import build_system
+from nerf_lightning.errors import InputError
+from nerf_lightning.runs.folder import RunFolder, frame_from
+from nerf_lightning.runs.trusted import check_config
+from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.utils.device import CPU
+
+FORMAT, VERSION = "nerf_lightning compact", 1
+WORTH_BYTES = 2048
+"""Numbers from which a table is coded as bytes; smaller arrays, those of networks, stay halves."""
+Arrays = dict[str, Any]  # of numpy arrays
+
+
+def encode(system: System, precision: str, config: dict[str, Any], scene: dict[str, Any]) -> bytes:
+    """A system as the content of a compact file.
+
+    Args:
+        system: trained; `confine` it before to leave out what no camera sees.
+        precision: "half" or "byte".
+        config, scene: of its run, see `run_folder`.
+    """
+    arrays: Arrays = {}
+    codes: dict[str, Any] = {}
+    learned = dict(system.field.named_parameters())
+    for part, tensors in parts(system).items():
+        for name, tensor in tensors.items():
+            code = "bits" if tensor.dtype == torch.bool else "half" if name in learned else "exact"
+            if code == "half" and precision == "byte" and tensor.numel() >= WORTH_BYTES:
+                code = "byte"
+            whole = f"{part}.{name}"
+            codes[whole] = {"code": code, "shape": list(tensor.shape)}
+            arrays |= _coded(whole, tensor.detach().cpu().numpy(), code)
+    header = {"format": FORMAT, "version": VERSION, "config": config, "scene": scene, "arrays": codes}
+    arrays["header"] = np.frombuffer(json.dumps(header, allow_nan=False).encode(), np.uint8)
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
+
+
+def parts(system: System) -> dict[str, dict[str, Tensor]]:
+    """What there is to keep of each part of a system."""
+    packed = {"field": system.field.packed()}
+    if isinstance(system, NeRF3D):
+        packed["sampler"] = system.sampler.packed()
+    return packed
+
+
+def _coded(name: str, array: np.ndarray, code: str) -> Arrays:
+    if code == "bits":
+        return {name: np.packbits(array.reshape(-1))}
+    if code == "half":
+        most = np.finfo(np.float16).max
+        return {name: array.clip(-most, most).astype(np.float16)}
+    if code == "exact":
+        return {name: array}
+    # What was pruned is zero and would only widen the range.
+    rows = array.reshape(len(array), -1) if array.ndim < 3 else array.reshape(-1, array.shape[-1])
+    used = rows[rows.any(1)] if rows.any() else rows
+    low, high = used.min(0), used.max(0)
+    step = np.where(high > low, (high - low) / 255, 1)
+    codes = np.rint((rows.clip(low, high) - low) / step).astype(np.uint8)
+    codes[~rows.any(1)] = 0  # one value compresses to nothing
+    return {name: codes, f"{name}:range": np.stack([low, high]).astype(np.float32)}
+
+
+def _decoded(name: str, arrays: Arrays, code: str, shape: list[int]) -> Tensor:
+    array = arrays[name]
+    if code == "bits":
+        array = np.unpackbits(array, count=int(np.prod(shape))).astype(bool)
+    elif code == "half":
+        array = array.astype(np.float32)
+    elif code == "byte":
+        low, high = arrays[f"{name}:range"]
+        array = (low + array.astype(np.float32) * ((high - low) / 255)).astype(np.float32)
+    elif code != "exact":
+        raise ValueError(f"{name} is coded as {code!r}")
+    return torch.from_numpy(array.reshape(shape).copy())
+
+
+def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunFolder:
+    """A system, ready to render, from what `encode` gave.
+
+    Args:
+        content: of a compact file.
+        path: where it came from, for messages.
+        device: where to render.
+
+    Raises:
+        InputError: where it is no compact file, or not whole, or of another version, or names what is not trusted.
+    """
+    expected = "a compact file of this package"
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            arrays = {key: file[key] for key in file.files}
+        header = json.loads(arrays.pop("header").tobytes())
+        if (header["format"], header["version"]) != (FORMAT, VERSION):
+            found = f"{header['format']}, version {header['version']}"
+            raise InputError(path, "header", found, f"{FORMAT}, version {VERSION}", "export the run again")
+        config, scene = header["config"], header["scene"]
+        frame, orbit, to_source = frame_from(scene)
+        tensors = {key: _decoded(key, arrays, one["code"], one["shape"]) for key, one in header["arrays"].items()}
+    except InputError:
+        raise
+    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(path, "", f"{type(error).__name__}: {error}", expected) from error
+    cfg = OmegaConf.create(check_config(config, path))
+    system = build_system(cfg, frame, device)
+    try:
+        system.field.unpack(_of("field", tensors))
+        if isinstance(system, NeRF3D):
+            system.sampler.unpack(_of("sampler", tensors))
+    except (KeyError, RuntimeError) as error:
+        raise InputError(path, "", str(error), "the weights of the model it names") from error
+    return RunFolder(cfg, system.eval().to(device), orbit, to_source, scene)
+
+
+def _of(part: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    prefix = f"{part}."
+    return {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
+
+
+def load_compact(path: Path, device: torch.device = CPU) -> RunFolder:
+    """Reads a compact file, ready to render on a device.
+
+    Raises:
+        InputError: as `decode`, and where there is no such file.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            path, "", error.strerror or str(error), "a compact file", "python -m nerf_lightning.export"
+        ) from error
+    return decode(content, path, device)

@@ -1,0 +1,37 @@
+"""The photos or the picture of a run that is read back: what it was trained on, or others, and nothing fetched anew."""
+
+import copy
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from omegaconf import DictConfig
+
+from nerf_lightning.config.build import build_data, target_of
+from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule
+from nerf_lightning.errors import InputError
+
+
+def data_again(cfg: DictConfig, scene: Mapping[str, Any], photos: str | None = None) -> RayDataModule | PixelDataModule:
+    """The data module of a run. As the run may be a stranger's, the network is not asked.
+
+    Args:
+        cfg: the run's configuration.
+        scene: what its scene.json says.
+        photos: others to take, a file or folder; None takes those it was trained on.
+
+    Raises:
+        InputError: where they are not there any more, or are others by now.
+    """
+    source = scene.get("source", BUILT_IN)
+    at_hand = copy.deepcopy(cfg)
+    if "download" in inspect.signature(target_of(cfg, "dataset")).parameters:
+        at_hand.dataset.download = False
+        if at_hand.dataset.get("path") is None and source != BUILT_IN:
+            at_hand.dataset.path = source
+    data = build_data(at_hand, photos)
+    name = scene.get("name", data.scene.name)
+    if photos is None and data.scene.name != name:
+        expected = f"{name!r}, which the run was trained on"
+        raise InputError("config", "dataset", f"the scene {data.scene.name!r}", expected, "give dataset.path=")
+    return data

@@ -1,0 +1,63 @@
+"""A run by its path: a folder, or the compact file that was made of one."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from omegaconf import DictConfig
+from torch import Tensor
+
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import use_kernels
+from nerf_lightning.runs.compact import load_compact
+from nerf_lightning.runs.folder import RunFolder, load_run
+from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.quiet import quiet
+
+
+@dataclass(frozen=True)
+class SceneRun:
+    """A run of a scene, as `RunFolder` has it."""
+
+    cfg: DictConfig
+    system: NeRF3D
+    orbit: Cameras
+    to_source: Float[Tensor, "4 4"]
+    scene: dict[str, Any]
+
+    @property
+    def scale(self) -> float:
+        """Length of a world unit in the frame of the photos' own file."""
+        return float(torch.linalg.det(self.to_source[:3, :3].double())) ** (1 / 3)
+
+
+def open_run(path: Path, device: torch.device) -> RunFolder:
+    """Reads a trained system, ready to render on a device with the kernels it was trained with.
+
+    Raises:
+        InputError: where there is none, or it is broken, of another version, or names what is not trusted.
+    """
+    quiet()
+    found = load_compact(path, device) if path.suffix == ".npz" else load_run(path, device=device)
+    use_kernels(found.cfg.kernels)
+    return found
+
+
+def open_scene_run(path: Path, device: torch.device) -> SceneRun:
+    """As `open_run`, of a scene.
+
+    Raises:
+        InputError: as said, and for a picture's run.
+    """
+    found = open_run(path, device)
+    if not isinstance(found.system, NeRF3D) or found.orbit is None or found.to_source is None:
+        raise InputError(path, "", "a picture's run", "a scene's run", "final.png shows a picture")
+    return SceneRun(found.cfg, found.system, found.orbit, found.to_source, found.scene)
+
+
+def beside(path: Path) -> Path:
+    """The folder that what is made of a run goes to: the run's own, or that of its compact file."""
+    return path.parent if path.suffix == ".npz" else path

@@ -1,0 +1,214 @@
+"""One training run, from a composed configuration to the files in its folder."""
+
+import copy
+import logging
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import lightning as L
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from nerf_lightning.callbacks import Results
+from nerf_lightning.callbacks.attached import attached
+from nerf_lightning.config.build import (
+    build_data,
+    build_system,
+    build_trainer,
+    check_background,
+    device_of,
+    frame_of,
+    resolved,
+)
+from nerf_lightning.config.limits import limits_of
+from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, draw_rays
+from nerf_lightning.dataset.plausible import check_scene
+from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import use_kernels
+from nerf_lightning.model import Field
+from nerf_lightning.runs.data import data_again
+from nerf_lightning.runs.folder import load_config, load_scene, read_checkpoint, save_config, save_scene
+from nerf_lightning.system import NeRF2D, NeRF3D, System
+from nerf_lightning.system.compiled import BACKEND, check_compiler
+from nerf_lightning.utils.allocator import keep_freed_memory
+from nerf_lightning.utils.machine import CROWDED, crowding
+from nerf_lightning.utils.options import AtLeast, Count, check_options
+from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.seeding import step_generator
+
+SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
+"""What stands beside the options in TensorBoard's HParams tab."""
+log = logging.getLogger(__name__)
+LATER = {"device": "auto", "compile": False, "limits": {"batch": None, "chunk": None}}
+"""What runs of earlier versions do not have, and may be given when they are resumed."""
+GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
+
+
+def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None = None) -> float:
+    """Builds, fits, tests, writes. Returns the held-out PSNR in dB.
+
+    Args:
+        cfg: the configuration; with `resume`, that of the run resumed takes its place.
+        checkpoint: state of a run with the same configuration, to go on from.
+        folder: where to write; None takes the one that Hydra made.
+
+    Raises:
+        InputError: on bad input, most of it before anything is written into the run's folder.
+    """
+    folder = folder or Path(HydraConfig.get().runtime.output_dir)
+    resumed = cfg.resume is not None
+    if resumed:
+        cfg, checkpoint = resume(cfg, folder)
+    device = device_of(cfg)
+    quiet()
+    settings = {"seed": cfg.seed, "threads": cfg.threads, "kernels": cfg.kernels, "compile": cfg.compile}
+    check_options("", prepare_process, settings)
+    prepare_process(**settings)
+    if cfg.compile:
+        check_compiler(device, BACKEND)
+    if resumed:
+        data = data_again(cfg, load_scene(folder)[0], cfg.dataset.get("path"))
+    else:
+        data = build_data(cfg)
+    data.enlarge(limits_of(cfg, device).batch)
+    doubts = check_scene(data.scene) if isinstance(data, RayDataModule) else []
+    for doubt in doubts:
+        log.warning("%s: %s", data.scene.name, doubt)
+    system = build_system(cfg, frame_of(data), device)
+    system.backend = BACKEND if cfg.compile else None
+    if system.field.sizing:
+        log.info("model: %s", system.field.sizing)
+    check_background(cfg, data, system)
+    trainer = build_trainer(cfg, folder, device)
+    results_of(trainer).warnings = doubts
+    check_processes(trainer, system)
+    if trainer.is_global_zero:
+        save_config(cfg, folder)
+        save_scene(data, folder)
+    with trainer.precision_plugin.train_step_context():
+        warm_up(system, data, trainer.strategy.root_device)
+    trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
+    trainer.test(system, data, verbose=False)
+    results = results_of(trainer).summary
+    if trainer.is_global_zero:
+        if trainer.logger is not None:
+            log_hyperparameters(trainer.logger, cfg, results)
+        report(results, folder)
+    return results["psnr"]
+
+
+def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
+    """The configuration of the run in `folder` with this command line's overrides on top, and its last checkpoint."""
+    saved = OmegaConf.create(LATER)
+    saved.merge_with(load_config(folder))
+    checkpoint = folder / "checkpoints" / "last.ckpt"
+    read_checkpoint(checkpoint)  # a broken one is told in one line, before anything starts
+    given = [override.partition("=")[0] for override in HydraConfig.get().overrides.task]
+    for key in given:
+        if key == "resume":
+            continue
+        if OmegaConf.select(saved, key, default=key) is key:
+            raise InputError("resume", key, "an option the run does not have", f"one of those in {folder}/config.yaml")
+        OmegaConf.update(saved, key, OmegaConf.select(cfg, key))
+    if "device" in given:  # its trainer's was resolved when the run began
+        OmegaConf.update(saved, "trainer.accelerator", cfg.trainer.accelerator)
+    return saved, checkpoint
+
+
+def prepare_process(
+    seed: Annotated[int, AtLeast(0)], threads: Count | None, kernels: str, compile: bool = False
+) -> None:
+    """What a run sets for its whole process."""
+    if threads is not None:
+        torch.set_num_threads(threads)
+    use_kernels("reference" if compile else kernels)
+    keep_freed_memory()
+    torch.set_flush_denormal(True)  # dying weights otherwise slow the CPU down many times over
+    L.seed_everything(seed, verbose=False)
+
+
+def check_processes(trainer: L.Trainer, system: System) -> None:
+    """Refuses what several processes cannot do together.
+
+    Raises:
+        InputError: for a field that changes its size, and for a sweep whose jobs would start processes of their own.
+    """
+    if trainer.world_size == 1:
+        return
+    if isinstance(system, NeRF3D) and type(system.field).grow is not Field.grow:
+        name = type(system.field).__name__
+        raise InputError(
+            "config",
+            "model",
+            f"{name}, which grows",
+            "a field of fixed size for several processes",
+            "choose model=hashgrid",
+        )
+    cluster = getattr(trainer.strategy, "cluster_environment", None)
+    if HydraConfig.get().mode == RunMode.MULTIRUN and not getattr(cluster, "creates_processes_externally", False):
+        expected = "one process a job in a sweep"
+        raise InputError(
+            "config",
+            "trainer.devices",
+            str(trainer.world_size),
+            expected,
+            "or a launcher that starts the processes itself",
+        )
+
+
+def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch.device) -> None:
+    """Runs a small step on a copy, so that kernels are ready before the clock starts.
+
+    A CPU's are compiled the first time, those of `compile` in every process.
+    """
+    compiled = device.type == "cpu" or system.backend is not None
+    told = " (the first time they are compiled: half a minute)" if compiled else ""
+    with Console().status(f"getting the kernels ready{told}"):
+        trial = copy.deepcopy(system).to(device)
+        if isinstance(trial, NeRF3D):
+            assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
+            batch = draw_rays(data.scene.train, 64, step_generator(0, 0, 0)).to(device)
+            trial.loss(batch, step_generator(0, 1, 0, device), 1)[
+                0
+            ].backward()  # step 1: without a look at the whole grid
+        elif isinstance(trial, NeRF2D):
+            uv, rgb = torch.rand(64, 5, generator=step_generator(0, 0, 0)).to(device).split([2, 3], dim=1)
+            trial.loss(PixelBatch(uv, rgb)).backward()
+
+
+def results_of(trainer: L.Trainer) -> Results:
+    """What writes results.json."""
+    results = attached(trainer, Results)
+    assert results is not None  # build_trainer puts one into every trainer
+    return results
+
+
+def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, results: dict) -> None:
+    """Puts the run's options beside its final figures in TensorBoard's HParams tab."""
+    plain = resolved(cfg)
+    options = {group: plain[group] for group in GROUPS if plain.get(group) is not None}
+    params = {**options, "method": cfg.method, "scene": results["scene"]["name"], "seed": cfg.seed}
+    metrics = {f"final/{key}": results[key] or 0.0 for key in SCORES}
+    if isinstance(logger, L.pytorch.loggers.TensorBoardLogger):
+        logger.log_hyperparams(params, metrics)
+        logger.finalize("success")
+
+
+def report(results: dict, folder: Path) -> None:
+    """The last words on the terminal."""
+    for one in results["recoveries"]:
+        print(f"guard: at step {one['step']}: {one['cause']}; {one['action']}")
+    scene, seconds = results["scene"]["name"], results["train_seconds"]
+    print(f"{scene}: {results['psnr']:.2f} dB held out after {seconds:.0f} s of training ({results['status']})")
+    if results["diagnosis"]:
+        print(results["diagnosis"])
+    crowded = crowding(results)
+    if crowded is not None and crowded > CROWDED:
+        print(f"the machine was busy with something else, which took {crowded:.0%} of this run's threads")
+    with suppress(ValueError):  # where the run's folder lies elsewhere, its full path it is
+        folder = folder.relative_to(Path.cwd())
+    print(f"everything is in {folder}; curves: tensorboard --logdir {folder.parent}")

@@ -1,0 +1,1 @@
+"""Helpers that know nothing of fields: files, seeds, the machine, its devices."""

@@ -1,0 +1,1 @@
+"""A trained run or a scene in the browser."""

@@ -1,0 +1,230 @@
+"""A trained field as a page in the browser: what it looks like from where the mouse goes, with the cameras that saw it."""
+
+import math
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import viser
+from viser.transforms import SO3
+
+from nerf_lightning.cameras import Cameras, Rays, focus_point
+from nerf_lightning.dataset import Scene
+from nerf_lightning.drawing.frame import CHANNELS
+from nerf_lightning.renderer.renderer import NAMED
+from nerf_lightning.system import NeRF3D
+from nerf_lightning.view.drawing import Viewpoint, box_edges
+from nerf_lightning.view.page import Page
+from nerf_lightning.view.painter import Painter, Wish
+
+FIRST_SECONDS = 0.08
+"""That the first picture after a movement may take to render: with coding and transport the answer comes within 0.2 s."""
+FINER = 2
+"""By how much each further picture of a view at rest is finer along each side."""
+BOX, INSIDE, SAMPLES = (110, 110, 110), (44, 160, 44), (214, 39, 40)
+QUALITY = 80
+"""Of the JPEG that is sent, out of 100."""
+
+
+class Visitor:
+    """A browser that has the page open: what it wants to see, and how fine it has it.
+
+    Args:
+        client: Viser's.
+    """
+
+    def __init__(self, client: viser.ClientHandle):
+        self.client = client
+        self.version = 0
+        """Goes up whenever what it wants changes."""
+        self.side = 0
+        """Pixels along the longer side of the picture it has of that; 0 for none."""
+        self.painted = 0.0
+        """When it got that, seconds of the monotonic clock."""
+
+
+class FieldPage(Page):
+    """Serves a field. Pictures are rendered by whoever calls `paint`; `run` does so for ever.
+
+    Args:
+        name: the page's title.
+        system: what is shown.
+        orbit: from where it is looked at first.
+        scene: with photos, whose cameras can then be shown; None does without.
+        host, port: see `Page`.
+        photo_side: longest side of the photos on the frusta, pixels.
+        most: pixels along the longer side of a picture of a view at rest.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        system: NeRF3D,
+        orbit: Cameras,
+        scene: Scene | None,
+        host: str,
+        port: int,
+        photo_side: int,
+        most: int,
+    ):
+        home, distance = home_of(orbit)
+        super().__init__(name, home, distance, host, port)
+        self.system = system
+        self.painter = Painter(system, orbit)
+        red, green, blue = system.renderer.colour.tolist()
+        self.backgrounds = {"scene": (red, green, blue), **NAMED}
+        self.scene = scene
+        self.visitors: dict[int, Visitor] = {}
+        self.changed = threading.Condition()
+        self.clicked: Rays | None = None
+        with self.server.atomic():
+            self.set_stage()
+            if scene is not None:
+                self.add_cameras(scene, photo_side, visible=False)
+            self._add_controls(most)
+        self.server.on_client_connect(self._welcome)
+        self.server.on_client_disconnect(self._farewell)
+        self.server.scene.on_click()(lambda event: self.click(event.ray_origin, event.ray_direction))
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        visitor = Visitor(client)
+        with self.changed:
+            self.visitors[client.client_id] = visitor
+        client.camera.on_update(lambda _: self._want(visitor))
+        self._want(visitor)
+
+    def _farewell(self, client: viser.ClientHandle) -> None:
+        with self.changed:
+            self.visitors.pop(client.client_id, None)
+
+    def _want(self, *visitors: Visitor) -> None:
+        """What some visitors see is out of date; all of them where none is named."""
+        with self.changed:
+            for visitor in visitors or tuple(self.visitors.values()):
+                visitor.version += 1
+                visitor.side = 0
+            self.changed.notify_all()
+
+    def _add_controls(self, most: int) -> None:
+        gui = self.server.gui
+        gui.add_markdown(
+            "Drag to turn, right drag to move, scroll to come nearer. Click into the picture for a ray's samples."
+        )
+        gui.add_button("back to the start").on_click(self.go_home)
+        with gui.add_folder("picture"):
+            self.channel = gui.add_dropdown("channel", CHANNELS)
+            self.background = gui.add_dropdown("background", tuple(self.backgrounds))
+            self.most = gui.add_slider("resolution", 64, 2048, 32, min(max(most, 64), 2048), hint="longer side, pixels")
+            most_far = float(f"{3 * self.scale:.2g}")
+            step = most_far / 200
+            self.near = gui.add_slider("near", 0.0, most_far, step, 0.0, hint="what is nearer is cut away")
+            self.far = gui.add_slider("far", 0.0, most_far, step, most_far, hint="what is farther is cut away")
+            for control in (self.channel, self.background, self.most, self.near, self.far):
+                control.on_update(lambda _: self._want())
+        with gui.add_folder("show"):
+            self.lines("/box", box_edges(self.system.field.bounds.aabb.cpu()), BOX)
+            box = self.server.scene.get_handle_by_name("/box")
+            assert box is not None  # it has edges
+            box.visible = False
+            self.switch("box", box)
+            if self.scene is not None:
+                self.add_camera_switches()
+            self.ray_group = self.server.scene.add_frame("/ray", show_axes=False)
+            self.switch("clicked ray", self.ray_group)
+        self.status = gui.add_markdown("")
+
+    def click(self, origin: tuple[float, float, float], direction: tuple[float, float, float]) -> None:
+        """Somebody clicked into the picture: the next thing painted is that ray."""
+        ahead = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float32), dim=0)
+        self.clicked = Rays(torch.tensor(origin, dtype=torch.float32)[None], ahead[None])
+        with self.changed:
+            self.changed.notify_all()
+
+    def draw_ray(self, ray: Rays) -> None:
+        """One ray within the bounds, its samples, and what came of it in words."""
+        device = self.system.device
+        ray = ray.to(device)
+        with torch.no_grad():
+            samples = self.system.sampler(ray, self.system.field.density)
+            places = samples.positions(ray)
+            rendered = self.system.render(ray)
+        near, far = (end.cpu() for end in self.system.field.bounds.near_far(ray))
+        far = torch.minimum(torch.maximum(far, near), near + 4 * self.scale)
+        ends = torch.stack([ray.origins.cpu() + t[:, None] * ray.directions.cpu() for t in (near, far)], dim=1)
+        with self.redrawing, self.server.atomic():
+            self.lines("/ray/inside", ends.numpy(), INSIDE)
+            self.points("/ray/samples", places.cpu().numpy(), SAMPLES, 0.006)
+        rgb = ", ".join(f"{float(c):.2f}" for c in rendered.rgb[0])
+        depth, opacity = float(rendered.depth[0]), float(rendered.opacity[0])
+        self.status.content = f"clicked: {len(samples)} samples, colour {rgb}, opacity {opacity:.2f}, depth {depth:.3f}"
+
+    def wish(self, visitor: Visitor) -> Wish:
+        """What a visitor wants to see now."""
+        camera = visitor.client.camera
+        c2w = np.eye(4)
+        c2w[:3, :3] = SO3(camera.wxyz).as_matrix()
+        c2w[:3, 3] = camera.position
+        far = self.far.value if self.far.value < self.far.max else math.inf
+        background = self.backgrounds[self.background.value]
+        return Wish(
+            c2w, camera.fov, camera.aspect, self.channel.value, background, self.near.value, far, self.most.value
+        )
+
+    def waiting(self) -> Visitor | None:
+        """Whose picture is coarsest, of those who do not have it as fine as they want; None where all have."""
+        with self.changed:
+            behind = [one for one in self.visitors.values() if one.version and one.side < self.most.value]
+            return min(behind, key=lambda one: (one.side, one.painted), default=None)
+
+    def paint(self, seconds: float = FIRST_SECONDS) -> bool:
+        """Renders what is wanted most, once.
+
+        Args:
+            seconds: that it may take, where this is the first picture of what somebody wants; finer ones take longer.
+
+        Returns:
+            Whether there was anything to do.
+        """
+        if self.clicked is not None:
+            ray, self.clicked = self.clicked, None
+            self.draw_ray(ray)
+        visitor = self.waiting()
+        if visitor is None:
+            return False
+        version, had = visitor.version, visitor.side
+        wish = self.wish(visitor)
+        first = self.painter.side_within(wish, seconds)
+        side = first if not had else min(max(FINER * had, first), wish.most)
+        picture = self.painter.paint(wish, side, lambda: visitor.version == version)
+        if picture is None:
+            return True
+        visitor.client.scene.set_background_image(picture, format="jpeg", jpeg_quality=QUALITY)
+        with self.changed:
+            if visitor.version == version:
+                visitor.side = max(side, 1)
+            visitor.painted = time.monotonic()
+        return True
+
+    def again(self) -> None:
+        """Called when the field has changed: everybody gets a new picture."""
+        self.painter.forget()
+        self._want()
+
+    def run(self, ended: Callable[[], bool] = lambda: False) -> None:
+        """Paints whenever somebody wants a picture, until `ended`."""
+        while not ended():
+            if not self.paint():
+                with self.changed:
+                    self.changed.wait(timeout=0.5)
+
+
+def home_of(orbit: Cameras) -> tuple[Viewpoint, float]:
+    """Where an orbit begins, as a viewer's camera, and how far it is from what it looks at."""
+    focus = focus_point(orbit.c2w)
+    up = torch.nn.functional.normalize(-orbit.c2w[:, :3, 1].mean(0), dim=0)
+    distance = float((orbit.centres - focus).norm(dim=1).mean())
+    fov = 2 * math.atan(orbit.height / (2 * float(orbit.K[0, 1, 1])))
+    home = Viewpoint(orbit.centres[0].numpy(), focus.numpy(), up.numpy(), fov)
+    return home, max(distance, 1e-6)

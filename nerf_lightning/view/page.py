@@ -1,0 +1,191 @@
+"""What all pages in the browser share, served by Viser: a stage, cameras with their photos, lines, points and switches."""
+
+import contextlib
+import io
+import logging
+import math
+import threading
+from collections.abc import Callable
+
+import numpy as np
+import viser
+from viser.transforms import SO3
+
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.view.drawing import Frustum, Viewpoint, frusta, through
+
+TRAINING, HELD_OUT = (31, 119, 180), (255, 127, 14)
+LINE = 1.5
+"""Width of lines, screen pixels."""
+FRUSTUM_DEPTH = 0.12
+"""Depth of a frustum at first, as a share of the cameras' distance to what they look at."""
+
+
+class _Server(viser.ViserServer):
+    """A server whose pages cannot ask for a tunnel to the internet."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        return None
+
+
+class Page:
+    """Serves a page from a thread of its own until `stop`.
+
+    Args:
+        name: its title.
+        home: from where it is looked at first.
+        scale: what sizes on the page derive from, world units.
+        host: address to listen on.
+        port: where to listen; the next free one where it is taken.
+    """
+
+    def __init__(self, name: str, home: Viewpoint, scale: float, host: str, port: int):
+        self.name = name
+        self.home = home
+        self.scale = scale
+        self.redrawing = threading.Lock()  # callbacks come from many threads
+        self.groups: dict[str, viser.FrameHandle] = {}
+        self.names: list[viser.FrameHandle] = []
+        self.pyramids: list[tuple[Frustum, viser.CameraFrustumHandle]] = []
+        logging.getLogger("websockets").setLevel(logging.WARNING)
+        with _hushed():
+            self.server = _Server(host, port, verbose=False)
+
+    @property
+    def port(self) -> int:
+        return self.server.get_port()
+
+    def stop(self) -> None:
+        with _hushed():
+            self.server.stop()
+
+    def set_stage(self) -> None:
+        """Light, sizes and the first look; nothing that a browser would fetch from elsewhere."""
+        scene, gui, camera = self.server.scene, self.server.gui, self.server.initial_camera
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.set_panel_label(self.name)
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(cast_shadow=False)
+        scene.set_up_direction(self.home.up.astype(np.float64))
+        camera.near, camera.far = 2e-3 * self.scale, 1e3 * self.scale
+        camera.position, camera.look_at, camera.fov = self.home.position, self.home.look_at, self.home.fov
+
+        @self.server.on_client_connect
+        def allow_any_scale(client: viser.ClientHandle) -> None:
+            client.camera.max_orbit_distance = max(1e4, 1e3 * self.scale)
+            client.camera.min_orbit_distance = min(1e-2, 1e-3 * self.scale)
+
+    def add_cameras(self, shown: Scene, photo_side: int, visible: bool = True) -> None:
+        """Frusta and their names, in a group for each split, so that a group is shown and hidden as one."""
+        scene = self.server.scene
+        splits = (("training", shown.train, TRAINING), ("held out", shown.val, HELD_OUT))
+        for word, views, colour in splits:
+            group = word.replace(" ", "_")
+            self.groups[word] = scene.add_frame(f"/{group}", show_axes=False, visible=visible)
+            self.names.append(scene.add_frame(f"/{group}/names", show_axes=False, visible=False))
+            for i, frustum in enumerate(frusta(views, word, photo_side)):
+                wxyz = SO3.from_matrix(frustum.c2w[:3, :3].astype(np.float64)).wxyz
+                position = frustum.c2w[:3, 3]
+                handle = scene.add_camera_frustum(
+                    f"/{group}/{i}",
+                    frustum.fov,
+                    frustum.aspect,
+                    scale=viser_scale(frustum, FRUSTUM_DEPTH * self.scale),
+                    thickness=LINE,
+                    thickness_units="screen",
+                    color=colour,
+                    image=frustum.photo,
+                    wxyz=wxyz,
+                    position=position,
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+                handle.on_click(self._visit(frustum, i if word == "training" else None))
+                self.pyramids.append((frustum, handle))
+                scene.add_label(f"/{group}/names/{i}", frustum.name, position=position, font_screen_scale=0.8)
+
+    def _visit(self, frustum: Frustum, view: int | None) -> Callable[[viser.SceneNodePointerEvent], None]:
+        """What a click on a frustum does: the browser's camera goes there."""
+
+        def visit(event: viser.SceneNodePointerEvent) -> None:
+            look_from(event.client, through(frustum, self.scale, self.home.up))
+            if view is not None:
+                self.visited(view)
+
+        return visit
+
+    def visited(self, view: int) -> None:
+        """Called when a training view is looked through."""
+
+    def add_camera_switches(self) -> None:
+        """What to show of the cameras."""
+        gui = self.server.gui
+        for word, group in self.groups.items():
+            self.switch(word, group)
+        self.switch("names", *self.names)
+        self.photos = gui.add_checkbox("photos", True)
+        self.photos.on_update(lambda _: self.show_photos())
+        self.depth = gui.add_slider("frustum size", 0.01, 0.5, 0.01, FRUSTUM_DEPTH)
+        self.depth.on_update(lambda _: self.size_frusta())
+
+    def switch(self, word: str, *handles: viser.SceneNodeHandle | None) -> None:
+        """A checkbox that shows and hides scene nodes; none where there is nothing to show."""
+        present = [handle for handle in handles if handle is not None]
+        if not present:
+            return
+        box = self.server.gui.add_checkbox(word, present[0].visible)
+
+        def show(_: viser.GuiEvent) -> None:
+            for handle in present:
+                handle.visible = box.value
+
+        box.on_update(show)
+
+    def go_home(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            look_from(event.client, self.home)
+
+    def show_photos(self) -> None:
+        with self.server.atomic():
+            for frustum, handle in self.pyramids:
+                handle.image = frustum.photo if self.photos.value else None
+
+    def size_frusta(self) -> None:
+        with self.server.atomic():
+            for frustum, handle in self.pyramids:
+                handle.scale = viser_scale(frustum, self.depth.value * self.scale)
+
+    def lines(self, name: str, segments: np.ndarray, colour: tuple[int, int, int]) -> None:
+        """Line segments [N, 2, 3] under a name, in place of what it had."""
+        if not len(segments):
+            self.server.scene.remove_by_name(name)
+            return
+        self.server.scene.add_line_segments(name, segments, colour, thickness=LINE, thickness_units="screen")
+
+    def points(self, name: str, points: np.ndarray, colour: tuple[int, int, int], size: float) -> None:
+        """Points [N, 3] under a name, in place of what it had; their size is a share of the scene's scale."""
+        if not len(points):
+            self.server.scene.remove_by_name(name)
+            return
+        self.server.scene.add_point_cloud(
+            name, points, colour, point_size=size * self.scale, point_shape="circle", precision="float32"
+        )
+
+
+def viser_scale(frustum: Frustum, depth: float) -> float:
+    """The scale at which Viser draws a frustum `depth` deep: it sizes frusta by their volume, d^3 tan^2(fov/2) aspect / 3."""
+    return depth * math.cbrt(math.tan(frustum.fov / 2) ** 2 * frustum.aspect / 3)
+
+
+def look_from(client: viser.ClientHandle, viewpoint: Viewpoint) -> None:
+    """Puts a browser's camera somewhere, at once."""
+    with client.atomic():
+        client.camera.up_direction = viewpoint.up
+        client.camera.position = viewpoint.position
+        client.camera.look_at = viewpoint.look_at
+        client.camera.fov = viewpoint.fov
+
+
+def _hushed() -> contextlib.AbstractContextManager[object]:
+    """Viser announces its start and stop whatever it is told; the verb has a line of its own."""
+    return contextlib.redirect_stdout(io.StringIO())

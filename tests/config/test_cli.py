@@ -1,0 +1,177 @@
+"""The command line: help, errors, resuming after a kill, and the installed wheel."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from commands import command, popen
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
+    done = command("--help", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "+experiment=lego" in done.stdout
+    assert "model: fourier, hashgrid, hashgrid2d" in done.stdout
+    probe = "import sys; sys.argv = ['x', '--help']\nfrom nerf_lightning.__main__ import main\n"
+    probe += "try: main()\nfinally: print(sorted({'torch', 'lightning', 'cv2'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", probe], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stdout.endswith("[]\n"), done.stdout[-200:] + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["model.widht=3"], ["model.widht", "--cfg job"]),
+        (["+model.widht=3"], ["model.widht", "unknown option", "did you mean width?"]),
+        (["model=nope"], ["model/nope", "hashgrid hashgrid2d"]),
+        (["+experiment=nope"], ["experiment/nope", "lego"]),
+        (["model.levels=many"], ["model.levels", "'many'", "a whole number at least 1"]),
+        (["model.levels=0"], ["model.levels", "found 0", "at least 1"]),
+        (["model.density=magic"], ["model.density", "'magic'", "relu, softplus or exp"]),
+        (["model=picture_mlp"], ["model", "PictureMLP", "three coordinates"]),
+        (["+experiment=picture", "model=hashgrid"], ["model", "HashGridField", "two coordinates"]),
+        (["model._target_=nerf_lightning.model.Nope"], ["model._target_", "Nope", "an importable class"]),
+        (["budget.steps=0"], ["budget.steps", "found 0", "more than 0"]),
+        (["budget.seconds=-3"], ["budget.seconds", "-3", "more than 0"]),
+        (["optimizer.lr=-1"], ["optimizer", "-1", "torch.optim.Adam"]),
+        (["trainer.precision=foo"], ["trainer", "foo"]),
+        (["threads=0"], ["threads", "found 0", "at least 1"]),
+        (["seed=x"], ["seed", "'x'", "a whole number"]),
+        (["dataset=photos"], ["dataset.path", "nothing", "give dataset.path="]),
+        (["dataset=photos", "dataset.path=missing.npz"], ["missing.npz", "nothing there", "check the path"]),
+        (["dataset=photos", "dataset.path=notes.txt"], ["notes.txt", "expected"]),
+        (["dataset=photos", "dataset.path=broken.npz"], ["broken.npz", "no zip archive", "expected"]),
+        (["dataset.rays=0"], ["dataset.rays", "found 0", "at least 1"]),
+        (["callbacks.orbit.fps=0"], ["callbacks.orbit.fps", "found 0", "more than 0"]),
+        (["callbacks.heldout.at=[0.5,0.1]"], ["callbacks.heldout.at", "[0.5, 0.1]", "ascending"]),
+        (["renderer.background=pink"], ["renderer.background", "'pink'", "black, white"]),
+        (["resume=nowhere"], ["nowhere/config.yaml", "no such file"]),
+    ],
+)
+def test_bad_input_gets_one_line_and_exit_code_2(arguments: list[str], words: list[str], inside, tmp_path: Path):
+    (tmp_path / "notes.txt").write_text("nothing to see")
+    (tmp_path / "broken.npz").write_text("not a zip")
+    small = [] if any("experiment" in a or a.startswith("dataset=") for a in arguments) else ["dataset.size=16"]
+    code, _, err = inside(*small, *arguments)
+    assert code == 2, err
+    assert err.count("\n") == 1, err
+    for word in [*words, "NERF_LIGHTNING_TRACEBACK=1"]:
+        assert word in err
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / "broken.npz", tmp_path / "notes.txt"]
+
+
+def test_photos_without_alpha_refuse_another_background(inside, tmp_path: Path):
+    from nerf_lightning.dataset import save_npz
+    from nerf_lightning.dataset.bricks.scene import bricks
+    from nerf_lightning.dataset.scene import Scene, Views
+
+    scene = bricks(size=16, train_views=4, val_views=1, cache="")
+    flat = [Views(v.images[..., :3].contiguous(), v.cameras) for v in (scene.train, scene.val)]
+    save_npz(Scene("flat", "made", *flat, scene.orbit, scene.bounds), tmp_path / "flat.npz")
+    code, _, err = inside("dataset=photos", "dataset.path=flat.npz", "renderer.background=white")
+    assert code == 2
+    assert "renderer.background: found white, expected scene" in err
+
+
+def test_traceback_on_request(inside, monkeypatch):
+    monkeypatch.setenv("NERF_LIGHTNING_TRACEBACK", "1")
+    code, _, err = inside("budget.steps=0", "dataset.size=16")
+    assert code == 2
+    assert "Traceback" in err
+
+
+def test_without_the_lego_file_the_bricks_stand_in(inside):
+    small = ["dataset.resize=16", "callbacks.orbit.frames=0", "budget.steps=2", "dataset.rays=64"]
+    code, out, err = inside("+experiment=lego", "dataset.download=false", *small)
+    assert code == 0, err
+    (warning,) = [line for line in (out + err).splitlines() if "WARNING" in line]
+    assert "data/lego_200x200.npz is not there" in warning
+    assert "bricks" in warning
+    assert any(line.startswith("bricks: ") for line in out.splitlines())
+
+
+def test_killed_at_any_moment_and_resumed_ends_with_the_same_weights(inside, tmp_path: Path):
+    """SIGKILL during training; the run still ends as the unbroken one does, to the last bit."""
+    # Growing all the time: whatever the moment of the kill, sizes differ between the checkpoint and a fresh field.
+    options = ["model=voxels", "model.coarsest=8", "model.finest=24", "model.grown=1.0", "model.stages=9"]
+    options += ["optimizer.lr=0.15", "sampler.samples=64", "sampler.resolution=32"]
+    options += ["dataset.size=16", "dataset.train_views=20", "dataset.val_views=2", "dataset.rays=512"]
+    options += ["dataset.samples=8192", "callbacks.orbit.frames=0", "budget.steps=150", "threads=1"]
+    options += ["callbacks.checkpoints.every_seconds=0.05"]
+    assert inside(*options, "name=whole")[0] == 0
+    process = popen(*options, "name=broken", cwd=tmp_path)
+    deadline = time.monotonic() + 60
+    state = None
+    while state is None or state["global_step"] < 50:
+        assert process.poll() is None, "the run ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+        saved = list(tmp_path.glob("outputs/broken/*/checkpoints/last.ckpt"))
+        state = torch.load(saved[0], weights_only=True) if saved else None
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    (run,) = (tmp_path / "outputs" / "broken").iterdir()
+    assert not (run / "results.json").exists()
+    code, _, err = inside(f"resume={run}")
+    assert code == 0, err
+    (whole,) = tmp_path.glob("outputs/whole/*/checkpoints/last.ckpt")
+    (broken,) = tmp_path.glob("outputs/broken/*/checkpoints/last.ckpt")
+    first, second = (torch.load(path, weights_only=True) for path in (whole, broken))
+    assert first["global_step"] == second["global_step"] == 150
+    for key, value in first["state_dict"].items():
+        assert torch.equal(value, second["state_dict"][key]), key
+
+
+def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_path: Path):
+    assert inside("+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=5")[0] == 0
+    (run,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
+    code, _, err = inside(f"resume={run}", "budget.steps=9")
+    assert code == 0, err
+    assert yaml.safe_load((run / "results.json").read_text())["steps"] == 9
+    code, _, err = inside(f"resume={run}", "sampler.samples=9")
+    assert code == 2
+    assert "sampler.samples" in err
+
+
+def test_a_users_own_groups(inside, tmp_path: Path):
+    (tmp_path / "mine" / "model").mkdir(parents=True)
+    (tmp_path / "mine" / "model" / "tiny.yaml").write_text("_target_: nerf_lightning.model.PictureMLP\nwidth: 4\n")
+    given = ["dataset=picture", "dataset.max_side=16", "model=tiny", "callbacks=picture", "budget.steps=2"]
+    code, out, err = inside("--config-dir=mine", *given)
+    assert code == 0, err
+    assert "sunset" in out
+
+
+def test_the_wheel_brings_its_configuration(tmp_path: Path):
+    """Installed somewhere else, run from yet another folder, the package finds everything it needs."""
+    build = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "-q",
+        "--no-deps",
+        "--no-build-isolation",
+        "-w",
+        str(tmp_path),
+        str(ROOT),
+    ]
+    subprocess.run(build, check=True, capture_output=True, timeout=120)
+    (wheel,) = tmp_path.glob("*.whl")
+    site = tmp_path / "site"
+    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(site), str(wheel)]
+    subprocess.run(install, check=True, capture_output=True, timeout=120)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    process = popen("+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=2", cwd=elsewhere, path=str(site))
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert (site / "nerf_lightning" / "conf" / "config.yaml").is_file()
+    assert list((elsewhere / "outputs" / "smoke_2d").glob("*/results.json"))

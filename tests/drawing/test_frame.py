@@ -1,0 +1,53 @@
+"""What frames show, channel by channel, against what the renderer says."""
+
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.drawing.frame import Style, colours, depth_colours, error_picture
+from nerf_lightning.renderer import Rendered
+
+RED = torch.tensor([1.0, 0.0, 0.0])
+
+
+def seen(background: torch.Tensor) -> Rendered:
+    """Three rays: nothing there, half a red thing at 2, all of it at 4."""
+    opacity = torch.tensor([0.0, 0.5, 1.0])
+    rgb = opacity[:, None] * RED + (1 - opacity)[:, None] * background
+    return Rendered(rgb, opacity, opacity * torch.tensor([0.0, 2.0, 4.0]))
+
+
+def test_the_background_shows_through_all_channels_but_opacity():
+    blue = (0.0, 0.0, 1.0)
+    style = Style(("rgb", "depth", "opacity"), blue, (2.0, 4.0))
+    rendered = seen(torch.tensor(blue))
+    torch.testing.assert_close(colours(rendered, "rgb", style), torch.tensor([[0, 0, 1.0], [0.5, 0, 0.5], [1, 0, 0]]))
+    near, far = depth_colours(torch.tensor([2.0, 4.0]), (2.0, 4.0))
+    expected = torch.stack([torch.tensor(blue), 0.5 * near + torch.tensor([0, 0, 0.5]), far])
+    torch.testing.assert_close(colours(rendered, "depth", style), expected)
+    torch.testing.assert_close(colours(rendered, "opacity", style), torch.tensor([[0.0], [0.5], [1.0]]).expand(3, 3))
+
+
+def test_transparent_colours_are_straight_and_give_any_background():
+    style = Style(("rgb",), None, (0.0, 1.0))
+    straight = colours(seen(torch.zeros(3)), "rgb", style)
+    assert straight.shape == (3, 4)
+    torch.testing.assert_close(straight[:, 3], torch.tensor([0.0, 0.5, 1.0]))
+    torch.testing.assert_close(straight[1:, :3], RED.expand(2, 3))
+    white = straight[:, :3] * straight[:, 3:] + (1 - straight[:, 3:])
+    torch.testing.assert_close(white, seen(torch.ones(3)).rgb)
+    torch.testing.assert_close(colours(seen(torch.zeros(3)), "opacity", style)[:, 3], torch.ones(3))
+
+
+def test_near_is_bright_and_far_is_dark_and_what_is_beyond_stays_there():
+    brightness = depth_colours(torch.tensor([0.0, 1.0, 1.5, 2.0, 9.0]), (1.0, 2.0)).sum(1)
+    assert brightness[0] == brightness[1] > brightness[2] > brightness[3] == brightness[4]
+
+
+def test_errors_are_magnified_and_told_in_decibels():
+    truth = np.full((4, 5, 3), 100, np.uint8)
+    shown = truth.copy()
+    shown[..., 0] += 10
+    picture, psnr = error_picture(shown, truth)
+    assert (picture == np.array([40, 0, 0])).all()
+    assert psnr == pytest.approx(10 * np.log10(255**2 / (100 / 3)))

@@ -1,0 +1,89 @@
+"""The photos of a run read back: those it was trained on or none, from anywhere, and never from the network."""
+
+import shutil
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from nerf_lightning.config.build import build_data
+from nerf_lightning.config.compose import composed
+from nerf_lightning.dataset import save_npz
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.errors import InputError
+from nerf_lightning.runs.data import data_again
+from nerf_lightning.runs.folder import load_config, load_scene, save_config, save_scene
+
+URL = "http://stranger.example/published.npz"
+
+
+@pytest.fixture(autouse=True)
+def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    def asked(*_: Any, **__: Any) -> None:
+        raise AssertionError("the network was asked")
+
+    monkeypatch.setattr(urllib.request, "urlopen", asked)
+
+
+def a_run(folder: Path, *overrides: str) -> Path:
+    """What reading a run's photos needs of its folder."""
+    small = ["+experiment=lego", f"dataset.url={URL}", "dataset.resize=16", "dataset.download=false", *overrides]
+    cfg = composed(small, folder)
+    save_scene(build_data(cfg), folder)
+    cfg.dataset.download = True
+    save_config(cfg, folder)
+    return folder
+
+
+def again(run: Path, photos: str | None = None) -> Any:
+    return data_again(load_config(run), load_scene(run)[0], photos).scene
+
+
+@pytest.fixture
+def published(tmp_path: Path) -> Path:
+    path = tmp_path / "data" / "published.npz"
+    path.parent.mkdir()
+    save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), path)
+    return path
+
+
+def test_what_was_downloaded_is_found_from_anywhere(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    run = a_run(tmp_path / "run", "dataset.folder=data")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert (again(run).name, again(run).sha256()) == ("published", again(run, str(published)).sha256())
+    published.unlink()
+    with pytest.raises(InputError, match=r"data/published\.npz.*nothing there"):
+        again(run)
+
+
+def test_the_built_in_scene_stays_what_a_run_was_trained_on(tmp_path: Path):
+    run = a_run(tmp_path / "run", f"dataset.folder={tmp_path}")
+    assert again(run).name == "bricks"
+    save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), tmp_path / "published.npz")
+    with pytest.raises(
+        InputError, match="found the scene 'published', expected 'bricks', which the run was trained on"
+    ):
+        again(run)
+    assert again(run, str(tmp_path / "published.npz")).name == "published"
+
+
+def test_a_strangers_run_neither_asks_the_network_nor_leaves_a_file(small_run: Path, inside, tmp_path: Path):
+    run = tmp_path / "run"
+    shutil.copytree(small_run, run)
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["dataset"] = {
+        "_target_": "nerf_lightning.dataset.from_download",
+        "url": "http://stranger.example/.profile",
+        "folder": str(tmp_path),
+        "path": None,
+        "resize": 16,
+    }
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    code, _, err = inside(f"resume={run}", "budget.steps=11")
+    assert "the network was asked" not in err
+    assert code == 0, err
+    assert not (tmp_path / ".profile").exists()

@@ -1,0 +1,94 @@
+"""Reading runs for tables and charts, whole ones and broken ones."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.runs.index import find_runs, flat, read_run, varied
+
+
+def made(root: Path, name: str, config: dict | None = None, results: object = None) -> Path:
+    folder = root / name
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(yaml.safe_dump(config or {"seed": 0}, sort_keys=False))
+    if results is not None:
+        (folder / "results.json").write_text(results if isinstance(results, str) else json.dumps(results))
+    return folder
+
+
+def test_a_whole_run(tmp_path: Path):
+    results = {"psnr": 31.5, "status": "finished", "diagnosis": "", "curve": [[0.5, 10, 20], [1.0, 20, 31.5]]}
+    run = read_run(made(tmp_path, "a", {"model": {"width": 16}}, results))
+    assert (run.psnr, run.status, run.diagnosis) == (31.5, "finished", "")
+    assert run.curve == [(0.5, 10, 20), (1.0, 20, 31.5)]
+    assert run.option("model.width") == 16 and run.option("model.depth") is None and run.option("seed.x") is None
+
+
+@pytest.mark.parametrize(
+    ("results", "status", "word"),
+    [
+        (None, "unfinished", "no results.json"),
+        ('{"psnr": 3', "unreadable", "results.json"),
+        ("[1, 2]", "unreadable", "list"),
+        ("{}", "unreadable", ""),
+        ({"psnr": None, "status": "failed", "diagnosis": "out of memory", "curve": None}, "failed", "out of memory"),
+        ({"psnr": "high", "status": "finished", "curve": [[1, 2], "x", [1, 2, "y"]]}, "finished", ""),
+    ],
+)
+def test_a_broken_run_says_what_is_wrong_and_has_no_figures(results: object, status: str, word: str, tmp_path: Path):
+    run = read_run(made(tmp_path, "a", None, results))
+    assert run.status == status and word in run.diagnosis
+    assert run.psnr is None and run.curve == []
+
+
+@pytest.mark.parametrize("text", ["a: [1", "- 1\n- 2", "!!python/object/apply:os.getcwd []", ""])
+def test_a_configuration_that_cannot_be_read_is_empty(text: str, tmp_path: Path):
+    folder = made(tmp_path, "a", None, {"status": "finished"})
+    (folder / "config.yaml").write_text(text)
+    assert read_run(folder).config == {}
+
+
+def test_runs_are_found_below_a_folder_in_the_order_of_their_numbers(tmp_path: Path):
+    for value in ("10", "2", "1e-3", "0.05"):
+        made(tmp_path, f"deep/lr={value},x=1", None, {"status": "finished"})
+    (tmp_path / "notes").mkdir()
+    names = [run.folder.name for run in find_runs(tmp_path)]
+    assert names == [f"lr={value},x=1" for value in ("1e-3", "0.05", "2", "10")]
+
+
+def test_a_folder_without_runs_is_told(tmp_path: Path):
+    with pytest.raises(InputError, match="no such folder"):
+        find_runs(tmp_path / "missing")
+    with pytest.raises(InputError, match="no run in it"):
+        find_runs(tmp_path)
+
+
+def test_nested_options_get_dotted_keys():
+    assert flat({"a": {"b": {"c": 1}, "d": [1, {"e": 2}]}, "f": None}) == {"a.b.c": 1, "a.d": [1, {"e": 2}], "f": None}
+
+
+def test_what_varies(tmp_path: Path):
+    configs = [
+        {
+            "seed": seed,
+            "dataset": {"seed": seed, "pixels": 5},
+            "model": {"_target_": "x", "width": width},
+            "method": "m",
+        }
+        for seed in (0, 1)
+        for width in (16, 64)
+    ]
+    runs = [read_run(made(tmp_path, str(i), config)) for i, config in enumerate(configs)]
+    assert varied(runs) == ["seed", "model.width"], "dataset.seed only repeats the seed"
+    assert varied(runs[:1]) == [] and varied([]) == []
+    other = configs[0] | {"method": "n", "model": {"_target_": "y", "width": 3, "depth": 2}}
+    runs.append(read_run(made(tmp_path, "other", other)))
+    assert varied([runs[0], runs[-1]]) == ["method"], "another kind of model differs in everything"
+    runs.append(read_run(made(tmp_path, "broken", None)))
+    (runs[-1].folder / "config.yaml").unlink()
+    assert varied([*runs[:4], read_run(runs[-1].folder)]) == ["seed", "model.width"], (
+        "one without a configuration is no reason"
+    )

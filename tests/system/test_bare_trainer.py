@@ -1,0 +1,41 @@
+"""The systems are LightningModules like others: they train without this package's callbacks too."""
+
+from pathlib import Path
+
+import lightning as L
+import torch
+
+from nerf_lightning.config.build import build_data, build_system, frame_of
+from nerf_lightning.config.compose import composed
+from nerf_lightning.runs.folder import load_run
+from nerf_lightning.training.train import prepare_process, train
+from nerf_lightning.utils.device import CPU
+
+STEPS = 24
+OPTIONS = ("+experiment=smoke_3d", "dataset.size=16", "dataset.train_views=6", f"budget.steps={STEPS}", "device=cpu")
+OFF = ("callbacks.heldout=null", "callbacks.snapshots=null", "callbacks.orbit=null", "callbacks.guard=null", "~logger")
+
+
+def test_a_trainer_with_steps_alone_gives_the_weights_of_a_budget_of_as_many(tmp_path: Path):
+    cfg = composed([*OPTIONS, *OFF], tmp_path)
+    train(cfg)
+    expected = load_run(tmp_path).system.state_dict()
+
+    prepare_process(cfg.seed, cfg.threads, cfg.kernels)
+    data = build_data(cfg)
+    system = build_system(cfg, frame_of(data), CPU)
+    trainer = L.Trainer(
+        max_steps=STEPS,
+        max_epochs=-1,
+        accelerator="cpu",
+        limit_val_batches=0,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.fit(system, data)
+    assert trainer.global_step == STEPS and system.progress == (STEPS - 1) / STEPS
+    found = system.state_dict()
+    assert found.keys() == expected.keys()
+    assert all(torch.equal(found[key], expected[key]) for key in found)

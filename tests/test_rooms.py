@@ -1,0 +1,41 @@
+"""The plan of the package: imports run one way, from room to room."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+ORDER = (
+    ("errors", "__init__"),
+    ("utils", "cameras"),
+    ("kernels",),
+    ("dataset", "model", "sampler"),
+    ("renderer",),
+    ("system",),
+    ("drawing",),
+    ("callbacks",),
+    ("config",),
+    ("runs",),
+    ("gallery", "capture", "chart", "evaluate", "export", "render", "view"),
+    ("training",),
+    ("stability", "rightsize", "__main__"),
+)
+"""Each room may import from those above it."""
+UP = {("callbacks", "view")}
+"""While a field trains, a callback may show the page that the verb shows of a finished one."""
+
+
+def imported(file: Path) -> set[str]:
+    """The rooms a module takes something from."""
+    nodes = [node for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(node, ast.ImportFrom)]
+    return {(node.module or "").split(".")[1] for node in nodes if (node.module or "").startswith("nerf_lightning.")}
+
+
+def test_imports_run_one_way():
+    level = {room: number for number, rooms in enumerate(ORDER) for room in rooms}
+    package = ROOT / "nerf_lightning"
+    found = set()
+    for file in package.rglob("*.py"):
+        room = file.relative_to(package).parts[0].removesuffix(".py")
+        found |= {(room, other) for other in imported(file) - {room}}
+    assert len(found) > 50
+    assert {(room, other) for room, other in found if level[room] <= level[other]} == UP

@@ -1,0 +1,40 @@
+"""The same seed gives the same weights, to the last bit: in another process, and across an interruption."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from every_model import ANOTHER, MODELS, fingerprints
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_every_shipped_model_is_among_them():
+    assert set(MODELS) == {file.stem for file in (ROOT / "conf" / "model").glob("*.yaml")}
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Runs set them for their whole process; the next test finds them as they were."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def test_same_seed_same_weights_in_another_process_and_across_an_interruption(threads: None, tmp_path: Path):
+    line = [sys.executable, str(ROOT / "tests" / "every_model.py"), str(tmp_path / "broken"), "11"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(line, env={**os.environ, "PYTHONPATH": str(ROOT)}, **pipes) as process:
+        first = fingerprints(tmp_path / "whole", 0)
+        out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    second = json.loads(out.splitlines()[-1])
+    assert set(first) == set(second) == {*MODELS, ANOTHER}
+    for name in first:
+        assert first[name] == second[name], name
+    assert first[ANOTHER] != first["siren"], "another seed must give other weights"

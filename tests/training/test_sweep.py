@@ -1,0 +1,153 @@
+"""Sweeps: done once, taken up where they stopped, and no job's failure is another's."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from commands import command
+
+SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3"]
+BARE = ["callbacks.baselines=null", "callbacks.charts=null", "callbacks.training_gif=null", "callbacks.enlarge=null"]
+
+
+def table(root: Path) -> dict[str, dict[str, str]]:
+    with (root / "sweep.csv").open() as file:
+        return {row["job"]: row for row in csv.DictReader(file)}
+
+
+def test_a_sweep_leaves_table_and_figure_and_is_done_once(inside, tmp_path: Path):
+    command = ["-m", *SMALL, "callbacks.charts=null", "model.width=8,16", "seed=0,1"]
+    code, out, err = inside(*command)
+    name = "sweep_budget.steps=3_callbacks.charts=null_dataset.max_side=16_model.width=8,16_seed=0,1"
+    root = tmp_path / "outputs" / "smoke_2d" / name
+    assert code == 0, err
+    names = {f"model.width={width},seed={seed}" for width in (8, 16) for seed in (0, 1)}
+    assert {path.name for path in root.iterdir() if path.is_dir()} == names
+    rows = table(root)
+    assert set(rows) == names and {row["status"] for row in rows.values()} <= {"finished", "collapsed"}
+    assert rows["model.width=8,seed=1"]["model.width"] == "8" and rows["model.width=8,seed=1"]["seed"] == "1"
+    assert float(rows["model.width=8,seed=1"]["psnr"]) > 3
+    assert (root / "gallery.png").stat().st_size > 1000
+    results = {name: (root / name / "results.json").stat().st_mtime_ns for name in names}
+    code, out, err = inside(*command)
+    assert code == 0 and out.count("done before") == 4 and ": starts" not in out
+    assert {name: (root / name / "results.json").stat().st_mtime_ns for name in names} == results
+
+
+def test_a_job_that_raises_is_named_and_the_others_go_on(inside, tmp_path: Path):
+    code, out, err = inside("-m", *SMALL, *BARE, "model.width=8,-1,16,9")
+    (root,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
+    assert code == 1
+    assert err.strip().splitlines()[-1] == "nerf_lightning: 1 of 4 jobs failed: model.width=-1"
+    row = table(root).pop("model.width=-1")
+    assert row["status"] == "failed" and "at least 1" in row["diagnosis"] and row["psnr"] == ""
+    assert sum(row["status"] != "failed" for row in table(root).values()) == 3
+    assert "Traceback" in (root / "model.width=-1" / "error.txt").read_text()
+    assert json.loads((root / "model.width=-1" / "results.json").read_text())["seed"] == 0
+    code, out, err = inside("-m", *SMALL, *BARE, "model.width=8,-1,16,9")
+    assert code == 1 and out.count("done before") == 3, "what failed is tried again"
+    assert (root / "model.width=-1" / "error.txt").is_file()
+
+
+def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(inside, tmp_path: Path, monkeypatch):
+    import torch
+
+    from nerf_lightning.callbacks import Checkpoints
+
+    small = ["-m", "+experiment=smoke_2d", "dataset.max_side=16", "model.width=8", "seed=0,1", *BARE]
+    assert inside(*small, "budget.steps=20", "name=whole")[0] == 0
+    save = Checkpoints.save
+
+    def saved_and_broken(self, trainer, name):
+        save(self, trainer, name)
+        if trainer.global_step == 11:
+            raise OSError("no space left on device")
+
+    monkeypatch.setattr(Checkpoints, "save", saved_and_broken)
+    steps = "callbacks.checkpoints.every_seconds=1e-6"
+    code, out, err = inside(*small, "budget.steps=20", "name=broken", steps)
+    assert code == 1 and "no space left" in err
+    monkeypatch.setattr(Checkpoints, "save", save)
+    code, out, err = inside(*small, "budget.steps=20", "name=broken", steps)
+    assert code == 0 and out.count("goes on from its last checkpoint") == 2
+    whole, broken = (next((tmp_path / "outputs" / name).glob("sweep_*")) / "seed=1" for name in ("whole", "broken"))
+    first, second = (torch.load(path / "checkpoints" / "last.ckpt", weights_only=True) for path in (whole, broken))
+    assert first["global_step"] == second["global_step"] == 20
+    assert all(torch.equal(first["state_dict"][key], second["state_dict"][key]) for key in first["state_dict"])
+    text = (broken / "config.yaml").read_text()
+    (broken / "config.yaml").write_text(text.replace("lr: 0.01", "lr: 0.02"))
+    code, out, err = inside(*small, "budget.steps=20", "name=broken", steps)
+    assert "seed=0: done before" in out and "seed=1: starts" in out
+    assert not (broken / "error.txt").exists()
+
+
+def test_a_study_is_one_command(inside, tmp_path: Path):
+    code, out, err = inside("+experiment=study_rate", "dataset.max_side=16", "budget.steps=2", "model.width=8", *BARE)
+    assert code == 0, err
+    (root,) = (tmp_path / "outputs" / "study_rate").iterdir()
+    assert len(table(root)) == 7 and (root / "gallery.png").is_file()
+    assert {float(row["optimizer.lr"]) for row in table(root).values()} == {1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1}
+
+
+@pytest.mark.filterwarnings("ignore")  # Optuna warns, and here warnings are errors
+def test_optuna_proposes_the_same_trials_again_and_failing_ones_are_recorded(inside, tmp_path: Path, capfd):
+    line = ["+experiment=tune_picture", "dataset.max_side=16", "budget.steps=2", "hydra.sweeper.n_trials=2", *BARE]
+    told = [inside(*line), inside(*line)]
+    assert [code for code, _, _ in told] == [0, 0], told
+    assert [out.count(": starts") for _, out, _ in told] == [2, 0]
+    assert [out.count("done before") for _, out, _ in told] == [0, 2]
+    with pytest.raises(ValueError, match="No trials are completed"):
+        inside(*line, "model.coarsest=0")
+    out, err = capfd.readouterr()
+    assert out.count(": starts") == 2 and err.count("failed: config: model.coarsest") == 2
+    assert {len(table(path)) for path in (tmp_path / "outputs" / "tune_picture").iterdir()} == {2}
+
+
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_other_launchers(launcher: str, tmp_path: Path):
+    """In processes of their own, whose way back to this package must work."""
+    settings = {"joblib": ["hydra.launcher.n_jobs=2"], "submitit_local": ["threads=1"]}[launcher]
+    done = command("-m", *SMALL, *BARE, "model.width=8,-1", f"hydra/launcher={launcher}", *settings, cwd=tmp_path)
+    assert done.returncode == 1, done.stderr
+    assert "1 of 2 jobs failed: model.width=-1" in done.stderr
+    (root,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
+    statuses = [row["status"] for row in table(root).values()]
+    assert statuses.count("failed") == 1 and statuses.count("unfinished") == 0
+
+
+def test_two_processes_share_a_run_and_leave_one_folder(inside, tmp_path: Path):
+    options = [
+        "+experiment=picture",
+        "dataset.max_side=32",
+        "budget.steps=150",
+        "trainer.accelerator=cpu",
+        "threads=1",
+    ] + BARE
+    code, out, err = inside(*options, "name=one")
+    assert code == 0, err
+    done = command(*options, "trainer=ddp", "name=two", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    results = []
+    for name, told in (("one", out), ("two", done.stdout)):
+        (folder,) = (tmp_path / "outputs" / name).iterdir()
+        results.append(json.loads((folder / "results.json").read_text()))
+        assert len(list(folder.rglob("results.json"))) == 1
+        assert (folder / "checkpoints" / "last.ckpt").stat().st_size > 0
+        assert told.count("everything is in") == 1
+    one, two = results
+    assert abs(one["psnr"] - two["psnr"]) < 0.2 and one["psnr"] > 15
+    assert (two["steps"], two["status"]) == (150, "finished")
+
+
+def test_a_missing_launcher_says_what_to_install(inside, monkeypatch):
+    code, out, err = inside("-m", *SMALL, "seed=0,1", "hydra/launcher=submitit_lunar")
+    assert code == 2 and "nerf_lightning[sweeps]" in err and err.count("\n") == 1
+
+
+def test_several_processes_refuse_what_they_cannot_share(inside):
+    pair = ["trainer=ddp", "trainer.accelerator=cpu"]
+    code, out, err = inside("model=tensorf", "dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", *pair)
+    assert code == 2 and "TensoRFField, which grows" in err and "model=hashgrid" in err
+    code, out, err = inside("-m", *SMALL, "seed=0,1", *pair)
+    assert code == 1 and err.count("one process a job in a sweep") >= 2

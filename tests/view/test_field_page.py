@@ -1,0 +1,188 @@
+"""The page about a field: what it paints for a browser that is played here, and the live view while training."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import viser
+from export.balls import CENTRE, RADIUS, ball_system
+from viser.transforms import SO3
+
+from nerf_lightning.cameras import Cameras, look_at, orbit_around
+from nerf_lightning.config.compose import composed
+from nerf_lightning.errors import InputError
+from nerf_lightning.runs.folder import load_run
+from nerf_lightning.training.train import train
+from nerf_lightning.view.field_page import FieldPage, Visitor, home_of
+from nerf_lightning.view.painter import Painter, Wish
+from nerf_lightning.view.serve import find_port
+
+UP = torch.tensor([0.0, 0.0, 1.0])
+BLUE = (0.0, 0.0, 1.0)
+
+
+def orbit() -> Cameras:
+    K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
+    return Cameras(K.repeat(4, 1, 1), orbit_around(CENTRE, UP, 3.0, 0.3, 4), 32, 24)
+
+
+def wish(**changes: Any) -> Wish:
+    c2w = look_at(CENTRE + torch.tensor([3.0, 0, 0]), CENTRE, UP).double().numpy()
+    given = {"c2w": c2w, "fov": 0.8, "aspect": 1.5, "channel": "rgb", "background": BLUE, "near": 0.0, "far": math.inf}
+    return Wish(**{**given, "most": 60, **changes})
+
+
+@pytest.fixture(scope="module")
+def painter() -> Painter:
+    return Painter(ball_system(), orbit())
+
+
+def test_pictures_show_what_the_system_renders_from_there(painter: Painter):
+    picture = painter.paint(wish(), 60, lambda: True)
+    assert picture is not None and picture.shape == (40, 60, 3)
+    system, cameras = painter.system, wish().cameras(60)
+    assert (cameras.width, cameras.height) == (60, 40)
+    own = system.renderer.colour.clone()
+    system.renderer.colour = torch.tensor(BLUE)
+    expected = system.render(cameras.view_rays(0)).rgb.view(40, 60, 3).numpy()
+    system.renderer.colour = own
+    assert np.abs(picture / 255 - expected).max() <= 0.5 / 255 + 1e-6
+    assert picture[0, 0].tolist() == [0, 0, 255]
+    # A ball of radius r at distance d covers a circle of the radius f r / sqrt(d^2 - r^2).
+    focal = 20 / math.tan(0.4)
+    opacity = painter.paint(wish(channel="opacity", background=(0.0, 0.0, 0.0)), 60, lambda: True)
+    assert opacity is not None
+    covered = math.sqrt(float((opacity[..., 0] / 255.0).sum()) / math.pi)
+    assert covered == pytest.approx(focal * RADIUS / math.sqrt(9 - RADIUS**2), rel=0.08)
+
+
+def test_what_is_nearer_or_farther_is_cut_away(painter: Painter):
+    whole, behind, before = (
+        painter.paint(wish(channel="depth", background=(0.0, 0.0, 0.0), **cut), 60, lambda: True)
+        for cut in ({}, {"near": 3.0}, {"far": 3.0 - RADIUS - 0.2})
+    )
+    assert whole is not None and behind is not None and before is not None
+    assert behind[20, 30].sum() < whole[20, 30].sum(), "the back of the ball is farther, so darker"
+    assert behind[20, 30].any() and not before[15:25, 20:40].any()
+
+
+def test_no_picture_is_finished_that_nobody_wants(painter: Painter):
+    asked = iter([True, False])
+    assert painter.paint(wish(aspect=1.0), 200, lambda: next(asked)) is None
+    assert torch.equal(painter.system.renderer.colour, torch.zeros(3)), "the run's own background is back"
+
+
+def test_sizes_follow_the_speed(painter: Painter):
+    painter.rate = 10_000.0
+    assert painter.side_within(wish(aspect=1.0, most=500), 0.25) == 50
+    assert painter.side_within(wish(aspect=4.0, most=500), 0.25) == 100
+    assert painter.side_within(wish(aspect=1.0, most=30), 0.25) == 30
+
+
+class Browser(viser.ClientHandle):
+    """What Viser knows of one, with a camera that a test moves and the pictures it got."""
+
+    def __init__(self) -> None:
+        self.client_id = 7
+        c2w = wish().c2w
+        self.pictures: list[np.ndarray] = []
+        self.camera = SimpleNamespace(
+            wxyz=SO3.from_matrix(c2w[:3, :3]).wxyz,
+            position=c2w[:3, 3],
+            fov=0.8,
+            aspect=1.5,
+            on_update=lambda call: None,
+        )
+        self.scene = SimpleNamespace(
+            set_background_image=lambda image, format, jpeg_quality: self.pictures.append(image)
+        )
+
+
+@pytest.fixture
+def page() -> Iterator[FieldPage]:
+    page = FieldPage("ball", ball_system(), orbit(), None, "127.0.0.1", find_port("127.0.0.1", 0)[1], 8, 96)
+    yield page
+    page.stop()
+
+
+def test_a_browser_gets_a_coarse_picture_then_finer_ones_and_then_rest(page: FieldPage):
+    browser = Browser()
+    assert not page.paint()
+    page._welcome(browser)
+    page.painter.rate = 24 * 24 / 0.08
+    while page.paint():
+        page.painter.rate = 24 * 24 / 0.08
+    sides = [picture.shape[1] for picture in browser.pictures]
+    assert sides[0] < 40 and sides[-1] == 96 and sides == sorted(set(sides))
+    page.background.value = "white"
+    page._want()
+    assert page.paint()
+    assert browser.pictures[-1][0, 0].tolist() == [255, 255, 255]
+    page._farewell(browser)
+    assert not page.paint()
+
+
+def test_a_movement_makes_the_picture_coarse_again(page: FieldPage):
+    browser = Browser()
+    page._welcome(browser)
+    (visitor,) = page.visitors.values()
+    while page.paint():
+        pass
+    browser.camera.position = browser.camera.position + np.array([0.0, 0.5, 0.0])
+    page._want(visitor)
+    page.painter.rate = 1.0
+    assert page.paint()
+    assert browser.pictures[-1].shape[1] == 24
+    version = visitor.version
+    page.painter.paint = lambda wish, side, wanted: page._want(visitor)  # type: ignore[method-assign,assignment]
+    assert page.paint(), "moved on while it was painted: nothing is sent, and there is more to do"
+    assert visitor.version == version + 1 and visitor.side == 0
+
+
+def test_a_click_shows_the_samples_of_its_ray(page: FieldPage):
+    page.click((3.0, -0.2, 0.05), (-2.0, 0.0, 0.0))
+    page.paint()
+    points = page.server.scene.get_handle_by_name("/ray/samples").points
+    np.testing.assert_allclose(points[:, 1:], np.tile([-0.2, 0.05], (len(points), 1)), atol=1e-5)
+    assert (np.diff(points[:, 0]) < 0).all() and abs(points[:, 0]).max() <= 1.0
+    assert f"depth {3 - 0.1 - RADIUS:.1f}" in page.status.content and "opacity 1.00" in page.status.content
+
+
+def test_home_is_where_the_orbit_begins():
+    view, distance = home_of(orbit())
+    assert distance == pytest.approx(3.0, rel=1e-3)
+    np.testing.assert_allclose(view.look_at, CENTRE.numpy(), atol=1e-3)
+    np.testing.assert_allclose(view.position, orbit().centres[0].numpy())
+    assert view.fov == pytest.approx(2 * math.atan(12 / 40))
+
+
+SMALL = ["+experiment=smoke_3d", "dataset.size=16", "budget.steps=12", "callbacks.orbit=null", "threads=1", "~logger"]
+
+
+def test_a_live_view_leaves_the_training_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    browser = Browser()
+    welcomed = FieldPage.__init__
+
+    def with_browser(self: FieldPage, *given: Any) -> None:
+        welcomed(self, *given)
+        self.visitors[browser.client_id] = Visitor(browser)
+
+    monkeypatch.setattr(FieldPage, "__init__", with_browser)
+    train(composed([*SMALL, "callbacks=live", "callbacks.live.port=0", "callbacks.live.share=0.9"], tmp_path / "live"))
+    assert browser.pictures
+    train(composed(SMALL, tmp_path / "alone"))
+    live, alone = (load_run(tmp_path / name).system.state_dict() for name in ("live", "alone"))
+    assert all(torch.equal(live[key], alone[key]) for key in alone)
+
+
+def test_a_live_view_wants_a_scene_and_a_share(tmp_path: Path):
+    with pytest.raises(InputError, match="share: found 1.0, expected above 0 and below 1"):
+        train(composed([*SMALL, "callbacks=live", "callbacks.live.share=1.0"], tmp_path / "a"))
+    flat = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=2", "callbacks.orbit=null", "~logger"]
+    with pytest.raises(InputError, match="callbacks: found live, expected a scene"):
+        train(composed([*flat, "callbacks=live"], tmp_path / "b"))
