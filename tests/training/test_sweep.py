@@ -5,10 +5,9 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import command
+from commands import BARE, command
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3"]
-BARE = ["callbacks.baselines=null", "callbacks.charts=null", "callbacks.training_gif=null", "callbacks.enlarge=null"]
 
 
 def table(root: Path) -> dict[str, dict[str, str]]:
