@@ -15,6 +15,7 @@ The tree is the data flow, seven stages in order:
     callbacks/  budget, guard, held-out PSNR, snapshots, orbit, checkpoints, progress, results.json
     config/     command line -> configuration -> objects; build.py is the only place that instantiates
     training/   one run, from a configuration to the files in its folder; sweeps: many runs from one command line
+    api.py      the same from Python: load_scene, train, load_run
     runs/       run folders and compact files: found, read without trusting them, opened
 
 The verbs, each a folder with `__main__.py` (its options) and `verb.py` (its work): capture/, render/, evaluate/, export/,
@@ -26,4 +27,19 @@ Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S sa
 to world; pixel centres lie at +0.5. Lengths are in the scene's own unit, colours are sRGB in [0, 1].
 """
 
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from nerf_lightning.api import Run, View, load_run, load_scene, train
+
 __version__ = "0.1.0"
+__all__ = ["Run", "View", "load_run", "load_scene", "train"]
+
+
+def __getattr__(name: str) -> Any:
+    """Imports the front door when it is first asked for: the command line's help and errors need nothing heavy."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from nerf_lightning import api
+
+    return getattr(api, name)

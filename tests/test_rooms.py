@@ -5,7 +5,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
-    ("errors", "__init__"),
+    ("errors",),
     ("utils", "cameras"),
     ("kernels",),
     ("dataset", "model", "sampler"),
@@ -17,7 +17,8 @@ ORDER = (
     ("runs",),
     ("gallery", "capture", "chart", "evaluate", "export", "render", "view"),
     ("training",),
-    ("stability", "rightsize", "__main__"),
+    ("stability", "rightsize", "api", "__main__"),
+    ("__init__",),
 )
 """Each room may import from those above it."""
 UP = {("callbacks", "view")}

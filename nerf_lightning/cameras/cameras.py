@@ -43,7 +43,10 @@ class Cameras:
     def __len__(self) -> int:
         return self.c2w.shape[0]
 
-    def __getitem__(self, index: slice | Tensor) -> "Cameras":
+    def __getitem__(self, index: int | slice | Tensor) -> "Cameras":
+        """Some of the views; of one number that view, as cameras still."""
+        if isinstance(index, int):
+            index = torch.tensor([index])
         return replace(self, K=self.K[index], c2w=self.c2w[index])
 
     def to(self, device: torch.device | str) -> "Cameras":

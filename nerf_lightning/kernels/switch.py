@@ -20,6 +20,11 @@ def use_kernels(choice: str) -> None:
     _allowed = choice == "auto"
 
 
+def chosen_kernels() -> str:
+    """What `use_kernels` was told last."""
+    return "auto" if _allowed else "reference"
+
+
 def fast(*tensors: Tensor) -> bool:
     """Whether the fast version applies: it is allowed, and all floating tensors are single precision on a CPU."""
     return _allowed and all(

@@ -25,7 +25,7 @@ from nerf_lightning.config.build import (
     resolved,
 )
 from nerf_lightning.config.limits import limits_of
-from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, draw_rays
+from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, Scene, draw_rays
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
@@ -48,13 +48,16 @@ LATER = {"device": "auto", "compile": False, "limits": {"batch": None, "chunk": 
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
-def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None = None) -> float:
+def train(
+    cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None = None, scene: Scene | None = None
+) -> float:
     """Builds, fits, tests, writes. Returns the held-out PSNR in dB.
 
     Args:
         cfg: the configuration; with `resume`, that of the run resumed takes its place.
         checkpoint: state of a run with the same configuration, to go on from.
         folder: where to write; None takes the one that Hydra made.
+        scene: to train on, where it is at hand; None reads what the configuration says.
 
     Raises:
         InputError: on bad input, most of it before anything is written into the run's folder.
@@ -72,8 +75,10 @@ def train(cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None =
         check_compiler(device, BACKEND)
     if resumed:
         data = data_again(cfg, load_scene(folder)[0], cfg.dataset.get("path"))
-    else:
+    elif scene is None:
         data = build_data(cfg)
+    else:
+        data = RayDataModule(scene, cfg.dataset.rays, cfg.dataset.samples, cfg.dataset.seed)
     data.enlarge(limits_of(cfg, device).batch)
     doubts = check_scene(data.scene) if isinstance(data, RayDataModule) else []
     for doubt in doubts:

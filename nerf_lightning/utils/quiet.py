@@ -3,10 +3,13 @@
 import logging
 import warnings
 
+NOISY = ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero")
+"""Loggers of hardware and habits."""
+
 
 def quiet() -> None:
     """Silences what Lightning says about hardware and habits that this package decides for itself."""
-    for name in ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero"):
+    for name in NOISY:
         logging.getLogger(name).setLevel(logging.WARNING)
     for message in (".*does not have many workers.*", ".*GPU available but not used.*", ".*isinstance.treespec.*"):
         warnings.filterwarnings("ignore", message)

@@ -1,0 +1,195 @@
+"""The front door in Python: scenes, trainings and runs, as the command line has them."""
+
+import logging
+import math
+import os
+import random
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.config.cli import given_of, quoted
+from nerf_lightning.config.compose import composed
+from nerf_lightning.dataset import Scene, open_scene
+from nerf_lightning.export.order import Order
+from nerf_lightning.export.verb import export
+from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
+from nerf_lightning.runs.index import read_run
+from nerf_lightning.runs.open import open_scene_run
+from nerf_lightning.system import NeRF3D
+from nerf_lightning.training.train import train as train_configured
+from nerf_lightning.utils.device import the_device
+from nerf_lightning.utils.options import check_options
+from nerf_lightning.utils.quiet import NOISY
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera sees of a field, on the run's background."""
+
+    rgb: Float[Tensor, "H W 3"]
+    """Colours in [0, 1]."""
+    opacity: Float[Tensor, "H W"]
+    depth: Float[Tensor, "H W"]
+    """Mean distance along the ray, in the scene's unit."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained run, ready to render."""
+
+    path: Path
+    """Its folder, or its compact file."""
+    system: NeRF3D
+    orbit: Cameras
+    """A path to show it along."""
+    results: dict[str, Any]
+    """What results.json says; empty for a compact file."""
+
+    @property
+    def psnr(self) -> float:
+        """Mean PSNR over the held-out views, in dB; not a number where none was measured."""
+        return float(self.results.get("psnr") or math.nan)
+
+    def render(self, camera: Cameras) -> View:
+        """What the first of some cameras sees, on the CPU; `scene.val.cameras[0]` is one."""
+        found = self.system.render(camera.view_rays(0).to(self.system.device))
+        shape = (camera.height, camera.width)
+        rgb, opacity, depth = (x.cpu() for x in (found.rgb, found.opacity, found.depth))
+        return View(rgb.clamp(0, 1).view(*shape, 3), opacity.view(shape), depth.view(shape))
+
+    def export(self, path: str | Path, format: str = "compact", options: Sequence[str] = ()) -> Path:
+        """Writes the run as one file.
+
+        Args:
+            path: of the file.
+            format, options: as `python -m nerf_lightning.export` takes them, such as "glb" and ["resolution=128"].
+
+        Raises:
+            InputError: as the verb does.
+        """
+        output = Path(path).expanduser()
+        given = [f"run={self.path}", f"output={output}", f"format={format}", f"device={self.system.device.type}"]
+        with undisturbed():
+            keys = given_of(composed([*quoted(given, ("run", "output")), *options], self.path, "export"))
+            check_options("", Order, keys)
+            export(Order(**keys))
+        return output
+
+
+def load_scene(path: str | Path, resize: int | None = None) -> Scene:
+    """A scene in any format that the command line takes.
+
+    Args:
+        path: an .npz file, a Blender folder, or a nerfstudio / instant-ngp capture.
+        resize: longest side in pixels, where photos are larger.
+
+    Raises:
+        InputError: where there is none, or it is damaged.
+    """
+    return open_scene(os.path.abspath(Path(path).expanduser()), resize=resize)
+
+
+def load_run(path: str | Path, device: str = "auto") -> Run:
+    """A run of a scene by its folder or its compact file; what it holds is never executed.
+
+    Args:
+        path: of either.
+        device: that renders: auto, cpu, cuda or mps.
+
+    Raises:
+        InputError: where there is none, it is broken, or a picture's, or the device is not there.
+    """
+    place = Path(path).expanduser()
+    with undisturbed():
+        found = open_scene_run(place, the_device(device))
+    return Run(place, found.system, found.orbit, read_run(place).results if place.is_dir() else {})
+
+
+def train(
+    scene: Scene | str | Path,
+    recipe: str | None = None,
+    *,
+    seconds: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    folder: str | Path | None = None,
+    options: Sequence[str] = (),
+) -> Run:
+    """Trains as `python -m nerf_lightning dataset=photos dataset.path=SCENE` does, with the same defaults and results.
+
+    Args:
+        scene: from `load_scene`, or its path.
+        recipe: a model with the settings that suit it, such as tensorf_medium; None for the command line's default.
+        seconds, steps: what training ends after, whichever comes first; without both, 90 seconds.
+        seed: of weights, batches and jitter: the same seed and threads, and steps, give the same weights.
+        device: auto, cpu, cuda or mps.
+        folder: of the run; None makes one below outputs/, named after the scene and the time.
+        options: whatever else the command line takes, such as ["renderer.background=white", "model.width=64"].
+
+    Raises:
+        InputError: as the command line does, in one line.
+        FileExistsError: where the folder holds a run.
+    """
+    if not isinstance(scene, Scene):
+        scene = load_scene(scene)
+    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    place = Path("outputs", scene.name, now) if folder is None else Path(folder).expanduser()
+    if (place / "config.yaml").exists():
+        raise FileExistsError(f"{place} holds a run; load_run opens it, another folder= keeps both")
+    given = [
+        "dataset=photos",
+        f"dataset.path={scene.source}",
+        f"dataset.resize={max(scene.resolution)}",
+        f"name={scene.name}",
+        f"seed={seed}",
+        f"device={device}",
+        f"budget.seconds={'null' if seconds is None else seconds}",
+        f"budget.steps={'null' if steps is None else steps}",
+    ]
+    if recipe is not None:
+        given.append(f"recipe={recipe}")
+    with undisturbed():
+        train_configured(
+            composed([*quoted(given, ("dataset.path", "name")), *options], place), folder=place, scene=scene
+        )
+    return load_run(place, device)
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Leaves the process as it was: random numbers, threads, kernels, denormal numbers, warnings, logs, Hydra's state."""
+    hydra, threads, kernels = HydraConfig.instance().cfg, torch.get_num_threads(), chosen_kernels()
+    flushed = float(torch.tensor(1e-40) * 1) == 0
+    numbers, more_numbers, environment = random.getstate(), np.random.get_state(), dict(os.environ)
+    torchs, cards = torch.get_rng_state(), torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+    levels = {name: logging.getLogger(name).level for name in NOISY}
+    try:
+        with warnings.catch_warnings():
+            yield
+    finally:
+        HydraConfig.instance().cfg = hydra
+        torch.set_num_threads(threads)
+        use_kernels(kernels)
+        torch.set_flush_denormal(flushed)
+        torch.set_rng_state(torchs)
+        if cards:
+            torch.cuda.set_rng_state_all(cards)
+        random.setstate(numbers)
+        np.random.set_state(more_numbers)
+        for name in os.environ.keys() - environment.keys():
+            del os.environ[name]
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)

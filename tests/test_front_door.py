@@ -1,0 +1,84 @@
+"""import nerf_lightning as nl: what the command line does, from Python."""
+
+import math
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra.core.hydra_config import HydraConfig
+
+import nerf_lightning as nl
+from nerf_lightning.dataset import save_npz
+from nerf_lightning.errors import InputError
+from nerf_lightning.stability.toys import PILE, toy
+
+STEPS = 12
+FEW = ("callbacks.snapshots=null", "callbacks.orbit=null", "~logger")
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("scene") / "pile, of three.npz"
+    save_npz(toy(PILE, size=16, views=8, held_out=2), place)
+    return place
+
+
+def weights(run: nl.Run) -> list[torch.Tensor]:
+    return list(run.system.state_dict().values())
+
+
+def test_it_trains_as_the_command_line_does(path: Path, inside, tmp_path: Path):
+    scene = nl.load_scene(path)
+    run = nl.train(
+        scene, recipe="hashgrid_small", steps=STEPS, seed=3, device="cpu", folder=tmp_path / "mine", options=FEW
+    )
+    given = ["dataset=photos", f"dataset.path='{path}'", "recipe=hashgrid_small", f"budget.steps={STEPS}", "seed=3"]
+    code, _, err = inside(*given, "device=cpu", f"hydra.run.dir={tmp_path}/theirs", *FEW)
+    assert code == 0, err
+    theirs = nl.load_run(tmp_path / "theirs", device="cpu")
+    assert all(map(torch.equal, weights(run), weights(theirs))) and run.psnr == theirs.psnr > 5
+    again = nl.train(path, "hashgrid_small", steps=STEPS, seed=3, device="cpu", folder=tmp_path / "again", options=FEW)
+    assert all(map(torch.equal, weights(run), weights(again)))
+
+    camera = scene.val.cameras[0]
+    view = run.render(camera)
+    assert view.rgb.shape == (16, 16, 3) and view.opacity.shape == view.depth.shape == (16, 16)
+    assert torch.equal(view.rgb, run.render(scene.val.cameras[-2]).rgb)  # there are two
+    compact = nl.load_run(run.export(tmp_path / "mine.npz", options=["loss=3"]), device="cpu")
+    assert math.isnan(compact.psnr) and float((compact.render(camera).rgb - view.rgb).abs().max()) < 0.2
+
+
+def test_the_process_stays_as_it_was(path: Path, tmp_path: Path):
+    threads, numbers, more = torch.get_num_threads(), torch.get_rng_state(), np.random.get_state()[1].copy()
+    hydra = HydraConfig.instance().cfg
+    torch.set_flush_denormal(False)  # whatever ran before here
+    nl.train(path, steps=1, device="cpu", folder=tmp_path / "run", options=[*FEW, "threads=1", "kernels=reference"])
+    assert torch.get_num_threads() == threads and torch.equal(torch.get_rng_state(), numbers)
+    assert (np.random.get_state()[1] == more).all() and HydraConfig.instance().cfg is hydra
+    assert float(torch.tensor(1e-40) * 1) > 0, "denormal numbers are numbers again"
+
+
+def test_what_is_wrong_is_told(path: Path, tmp_path: Path):
+    with pytest.raises(InputError, match="nothing"):
+        nl.load_scene(tmp_path / "none.npz")
+    with pytest.raises(InputError, match="dataset.rays"):
+        nl.train(path, steps=1, device="cpu", folder=tmp_path / "run", options=["dataset.rays=0"])
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "config.yaml").touch()
+    with pytest.raises(FileExistsError, match="another folder="):
+        nl.train(path, steps=1, folder=tmp_path / "old")
+    with pytest.raises(AttributeError, match="no attribute 'trian'"):
+        nl.trian  # noqa: B018
+
+
+@pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda example: example.stem)
+def test_examples_run(example: Path, path: Path, tmp_path: Path, monkeypatch):
+    assert len(example.read_text(encoding="utf-8").splitlines()) <= 30
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(example), str(path), "0.5"])
+    runpy.run_path(str(example), run_name="__main__")
+    assert list(tmp_path.glob("*.png"))
