@@ -3,7 +3,7 @@ VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 
-.PHONY: run test lint format clean
+.PHONY: run test quick lint format clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -26,6 +26,12 @@ lint: $(VENV)/.test
 
 test: lint                  ## install, check style and types, run the tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
+
+QUICK := tests/test_rooms.py $(addprefix tests/, cameras dataset sampler model renderer system) \
+	$(addprefix tests/runs/test_, before.py folder.py) $(addprefix tests/config/test_, rates.py resolvers.py)
+
+quick: $(VENV)/.test        ## what a change most likely breaks, in half a minute
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal $(QUICK)
 
 format: $(VENV)/.test
 	$(BIN)/ruff check --fix .
