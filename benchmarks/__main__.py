@@ -108,7 +108,7 @@ def main() -> None:
             text.append(f"{name}\n\n{table(rows)}\n")
             print("\n" + text[-1], flush=True)
     arguments.output.mkdir(parents=True, exist_ok=True)
-    (arguments.output / "table.txt").write_text("\n".join(text))
+    (arguments.output / "table.txt").write_text("\n".join(text), encoding="utf-8")
     write_json(arguments.output / "benchmarks.json", report)
     print(f"written to {arguments.output}")
     if unequal is not None:

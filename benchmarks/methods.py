@@ -28,7 +28,7 @@ def train(experiment: str, overrides: list[str], seed: int, folder: Path, measur
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"benchmarks: {experiment} failed: {done.stderr.strip().splitlines()[-1:]}")
-    return json.loads((folder / "results.json").read_text())
+    return json.loads((folder / "results.json").read_text(encoding="utf-8"))
 
 
 def seconds_to(curve: list[list[float]], target: float) -> float | None:

@@ -54,7 +54,7 @@ COMPOSED = ("launcher=joblib", "trainer=ddp", "tune_picture", "suite=full", "tar
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
 def commands(page: Path) -> list[str]:
@@ -126,7 +126,7 @@ def test_every_command_of_a_page_works(
         file = tmp_path / block.splitlines()[0].removeprefix("# ")
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(block)
-    if "calibration=" in page.read_text():
+    if "calibration=" in page.read_text(encoding="utf-8"):
         folder, _ = request.getfixturevalue("made")
         shutil.copytree(folder / "calibration", tmp_path / "sheet_photos")
         shutil.copytree(folder / "photos", tmp_path / "object_photos")

@@ -22,7 +22,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
 
 
 def read(path: Path) -> dict:
-    return json.loads(path.read_text())
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def test_a_run_leaves_its_pictures_and_figures(run: Path):

@@ -170,4 +170,4 @@ def _write_calibration(path: Path, found: Calibration, solved: Solved, family: s
         },
     }
     with atomic(path) as temporary:
-        temporary.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+        temporary.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")

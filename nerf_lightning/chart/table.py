@@ -48,7 +48,7 @@ def write_csv(path: Path, comparisons: Sequence[Comparison], left_out: Sequence[
     """A line for each point; then one for each run that is in none, with its status and diagnosis."""
     rows = rows_of(comparisons)
     columns = [*(rows[0] if rows else ("point", "folders")), "status", "diagnosis"]
-    with atomic(path) as temporary, temporary.open("w", newline="") as file:
+    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows({**row, "status": "charted"} for row in rows)

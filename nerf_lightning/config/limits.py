@@ -29,7 +29,7 @@ def limits_of(cfg: DictConfig, device: torch.device) -> Limits:
     """
     folder = conf_dir() / "devices"
     own = folder / f"{device.type}.yaml"
-    limits = yaml.safe_load((own if own.exists() else folder / "cpu.yaml").read_text())
+    limits = yaml.safe_load((own if own.exists() else folder / "cpu.yaml").read_text(encoding="utf-8"))
     given = cfg.get("limits", {})
     if not isinstance(given, DictConfig | dict):
         raise InputError("config", "limits", repr(given), "batch and chunk, each a number or null")

@@ -88,7 +88,7 @@ def make_film(plan: dict[str, Any], draw: Callable[[int], Picture], count: int, 
 def prepare(folder: Path, plan: dict[str, Any], own: bool) -> None:
     """Makes a folder ready for the frames of a plan; those of another plan are thrown away where the folder is our own."""
     try:
-        found = json.loads((folder / PLAN).read_text())
+        found = json.loads((folder / PLAN).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         found = None
     if found != plan and folder.exists():

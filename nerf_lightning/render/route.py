@@ -99,7 +99,7 @@ def read_path(file: Path) -> Cameras:
         InputError: where it is neither.
     """
     try:
-        plain = json.loads(file.read_text())
+        plain = json.loads(file.read_text(encoding="utf-8"))
         cameras = _nerfstudio(plain) if "camera_path" in plain else _own(plain)
     except FileNotFoundError as error:
         raise InputError(file, "", "no such file", "a camera path in JSON") from error

@@ -34,7 +34,7 @@ def read_ladder(name: str, folder: Path) -> Ladder:
     own = name.endswith((".yaml", ".yml"))
     path = Path(name).expanduser() if own else folder / f"{name}.yaml"
     try:
-        plain = yaml.safe_load(path.read_text())
+        plain = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         known = ", ".join(sorted(one.stem for one in folder.glob("*.yaml")))
         raise InputError("config", "ladder", repr(name), f"one of {known}, or a YAML file with `rungs`") from error

@@ -35,7 +35,7 @@ def write_report(found: Found, cfg: DictConfig, choices: dict[str, Any], output:
     write_json(output / "rightsize.json", as_json(found))
     write_png(output / "chart.png", pixels_of(chart(found)))
     with atomic(output / "best.yaml") as temporary:
-        temporary.write_text(experiment(found, cfg, choices))
+        temporary.write_text(experiment(found, cfg, choices), encoding="utf-8")
     one = found.full[found.choice]
     print(found.reason)
     print(

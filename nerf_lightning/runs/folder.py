@@ -47,7 +47,7 @@ def plain_config(cfg: DictConfig) -> dict[str, Any]:
 def save_config(cfg: DictConfig, folder: Path) -> None:
     """Writes the resolved configuration."""
     with atomic(folder / "config.yaml") as temporary:
-        temporary.write_text(yaml.safe_dump(plain_config(cfg), sort_keys=False))
+        temporary.write_text(yaml.safe_dump(plain_config(cfg), sort_keys=False), encoding="utf-8")
 
 
 def load_config(folder: Path) -> DictConfig:
@@ -58,7 +58,7 @@ def load_config(folder: Path) -> DictConfig:
     """
     path = folder / "config.yaml"
     try:
-        plain = yaml.safe_load(path.read_text())
+        plain = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise InputError(path, "", "no such file", "the folder of a run", "look below outputs/") from error
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -158,7 +158,7 @@ def load_scene(folder: Path) -> tuple[dict[str, Any], tuple[Frame, Cameras | Non
     """
     path = folder / "scene.json"
     try:
-        scene = json.loads(path.read_text())
+        scene = json.loads(path.read_text(encoding="utf-8"))
         if scene.get("format", FORMAT) != FORMAT:
             found, expected = f"format {scene['format']}", f"format {FORMAT}, which this version reads"
             raise InputError(path, "format", found, expected, "use the version of nerf_lightning that made the run")

@@ -61,12 +61,12 @@ def read_run(folder: Path) -> Run:
     """Reads one folder; what is missing or broken becomes the run's status and diagnosis."""
     config: Any = None
     try:
-        config = yaml.safe_load((folder / "config.yaml").read_text())
+        config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
         config = {}
     plain = config if isinstance(config, dict) else {}
     try:
-        results = json.loads((folder / "results.json").read_text())
+        results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     except FileNotFoundError:
         return Run(folder, plain, {}, "unfinished", "no results.json yet")
     except (OSError, ValueError) as error:

@@ -71,7 +71,7 @@ def run(cell: Cell, root: Path) -> Outcome:
     if before is not None:
         return before
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "log.txt").open("w") as log, _to(log):
+    with (folder / "log.txt").open("w", encoding="utf-8") as log, _to(log):
         outcome = _train(cell, folder)
     write_json(folder / OUTCOME, {**_identity(cell), "outcome": asdict(outcome)})
     return outcome
@@ -84,7 +84,7 @@ def _identity(cell: Cell) -> dict[str, Any]:
 
 def _read(folder: Path, cell: Cell) -> Outcome | None:
     try:
-        content = json.loads((folder / OUTCOME).read_text())
+        content = json.loads((folder / OUTCOME).read_text(encoding="utf-8"))
         if {key: content[key] for key in _identity(cell)} == _identity(cell):
             return Outcome(**content["outcome"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -134,10 +134,10 @@ def _train(cell: Cell, folder: Path) -> Outcome:
         cfg = composed(given, folder)
         cfg.optimizer.lr *= condition.rate
         train(cfg)
-        results = json.loads((folder / "results.json").read_text())
+        results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
         psnr, status, diagnosis = results["psnr"], results["status"], results["diagnosis"]
         if method.flat:
-            between = json.loads((folder / "enlarged.json").read_text())["field"]
+            between = json.loads((folder / "enlarged.json").read_text(encoding="utf-8"))["field"]
             psnr = psnr if between is None else between  # none where each byte is right
         recoveries = len(results["recoveries"])
         alarm = "; ".join([*results["warnings"], *([diagnosis] if status == "finished" and diagnosis else [])])

@@ -28,7 +28,7 @@ def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> None:
     page = worst_page(found, lambda one: folder_of(root, one.condition, one.method, one.seed))
     write_png(root / "worst.png", pixels_of(page))
     with atomic(root / "stability.md") as temporary:
-        temporary.write_text("\n".join([markdown(found), *summary(found, saved)]) + "\n")
+        temporary.write_text("\n".join([markdown(found), *summary(found, saved)]) + "\n", encoding="utf-8")
     for square in found:
         if square.failed and not square.control:
             first = square.failed[0]

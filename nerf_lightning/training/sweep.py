@@ -98,14 +98,14 @@ def record(folder: Path, cfg: "DictConfig", error: Exception) -> None:
         with suppress(OmegaConfBaseException):  # a configuration that cannot be resolved may be what failed
             save_config(cfg, folder)
     with atomic(folder / "error.txt") as temporary:
-        temporary.write_text("".join(traceback.format_exception(error)))
+        temporary.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
     if read_run(folder).status != "failed":
         write_json(folder / "results.json", failed_results(cfg.get("method"), cfg.get("seed"), diagnosis))
 
 
 def write_table(root: Path, runs: Sequence[Run]) -> None:
     """sweep.csv: a line for each job."""
-    with atomic(root / TABLE) as temporary, temporary.open("w", newline="") as file:
+    with atomic(root / TABLE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         options = varied(runs)
         writer.writerow(["job", "status", *options, *COLUMNS, "diagnosis"])

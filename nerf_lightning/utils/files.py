@@ -47,4 +47,4 @@ def _umask() -> int:
 def write_json(path: Path, content: object) -> None:
     """Writes strict JSON (no NaN), atomically."""
     with atomic(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

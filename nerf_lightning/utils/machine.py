@@ -27,7 +27,7 @@ def cores() -> int:
 def processor() -> str:
     """The processor's name, as far as the system tells it."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:  # there is none beyond Linux
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

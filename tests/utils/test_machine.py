@@ -78,7 +78,7 @@ def test_guests_and_waiting_are_not_counted_as_work(monkeypatch: pytest.MonkeyPa
 
 
 def test_another_systems_processor(monkeypatch: pytest.MonkeyPatch):
-    def missing(self: object) -> str:
+    def missing(self: object, encoding: str) -> str:
         raise FileNotFoundError
 
     monkeypatch.setattr(machine.Path, "read_text", missing)

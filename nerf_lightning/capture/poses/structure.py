@@ -92,7 +92,7 @@ def capture_without_tags(folder: Path, packing: Packing) -> tuple[list[Placed], 
         "unit": "the cameras' median distance to what they look at",
     }
     with atomic(packing.output.with_name("calibration.yaml")) as temporary:
-        temporary.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+        temporary.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")
     return photos, scene
 
 

@@ -58,7 +58,7 @@ def read_layout(path: Path, dictionary: str, size: float) -> TagLayout:
     if not path.exists() and path.parent == Path() and shipped.exists():
         path = shipped
     try:
-        content: Any = yaml.safe_load(path.read_text())
+        content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(path, "", f"no readable YAML ({error})", "a file with tags: {0: {x: 0.0, y: 0.0}}") from error
     tags = content.get("tags") if isinstance(content, dict) else None
