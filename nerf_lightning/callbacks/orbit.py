@@ -63,13 +63,12 @@ class Orbit(L.Callback):
             image = to_bytes(rgb.view(cameras.height, cameras.width, 3).cpu())
             return panel([image], f"{scene.name}, step {trainer.global_step}")
 
-        count, start = MOST if self.frames is None else self.frames, time.perf_counter()
+        count, start = min(MOST if self.frames is None else self.frames, len(cameras)), time.perf_counter()
         pictures = [picture(evenly(len(cameras), count)[0])]
         if self.frames is None:
             one = time.perf_counter() - start
-            allowed = Budget.of(trainer).drawing_seconds(trainer.global_step)
-            fitting, shrink = affordable(min(count, len(cameras)), one, allowed)
-            if (fitting, shrink) != (min(count, len(cameras)), 1.0):
+            fitting, shrink = affordable(count, one, Budget.of(trainer).drawing_seconds(trainer.global_step))
+            if fitting < count or shrink < 1:
                 width, height = (max(1, round(side * shrink)) for side in (cameras.width, cameras.height))
                 print(
                     f"{self.path}: {fitting} frames of {width}x{height}, as one of {cameras.width}x{cameras.height} takes "
