@@ -9,7 +9,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from nerf_lightning.config import cli
+from nerf_lightning.config import conf_dir
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, Views, save_npz
@@ -67,7 +67,7 @@ def configured(dataset: list[str], seconds: float, overrides: list[str], folder:
 
 def looked_for(cfg: DictConfig, folder: Path) -> Found:
     """What the search finds, with its report."""
-    ladder = read_ladder(str(cfg.method), cli.conf_dir() / "ladders")
+    ladder = read_ladder(str(cfg.method), conf_dir() / "ladders")
     found = search(cfg, Target(within_db=NEAR), ladder, folder)
     write_png(folder / "chart.png", pixels_of(chart(found)))
     return found

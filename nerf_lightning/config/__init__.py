@@ -1,1 +1,9 @@
 """From the command line to objects: conf/ composed, checked and built. Only here and in the verbs is Hydra known."""
+
+from pathlib import Path
+
+
+def conf_dir() -> Path:
+    """The shipped configuration: inside the package in an installed wheel, beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"

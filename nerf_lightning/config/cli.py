@@ -1,4 +1,4 @@
-"""What every command line of the package shares: where conf/ is, and errors as one line. Imports nothing heavy."""
+"""What every command line of the package shares, such as errors in one line. Imports nothing heavy."""
 
 import functools
 import os
@@ -17,17 +17,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerf_lightning.config import resolvers  # noqa: F401  (conf/ uses its resolvers)
+from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
 from nerf_lightning.errors import InputError
 
 TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
 """Environment variable: set to 1, errors come with the full traceback."""
-
-
-def conf_dir() -> Path:
-    """The shipped configuration: inside the package in an installed wheel, beside it in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 def by_path(arguments: Sequence[str], folder: Path) -> list[str]:

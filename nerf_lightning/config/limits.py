@@ -6,7 +6,7 @@ import torch
 import yaml
 from omegaconf import DictConfig
 
-from nerf_lightning.config.cli import conf_dir
+from nerf_lightning.config import conf_dir
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.options import Count, check_options
 

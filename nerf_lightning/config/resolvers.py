@@ -4,8 +4,11 @@ import hashlib
 import sys
 from collections.abc import Sequence
 
+import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
+
+from nerf_lightning.config import conf_dir
 
 LONGEST = 120
 """Letters of a folder's name."""
@@ -47,12 +50,26 @@ def job_name(overrides: Sequence[str], fixed: Sequence[str]) -> str:
     return slug(",".join(sorted(one for one in overrides if one.lstrip("+~").partition("=")[0] not in fixed)))
 
 
+def recipe_of(recipe: str | None, model: str) -> str | None:
+    """A recipe that was chosen, while the model it is for is still the one: `+experiment=lego model=mlp` takes another."""
+    file = conf_dir() / "recipe" / f"{recipe}.yaml"
+    if not file.is_file():
+        return recipe  # a user's own, elsewhere
+    for entry in yaml.safe_load(file.read_text(encoding="utf-8"))["defaults"]:
+        if isinstance(entry, str):
+            return recipe if recipe_of(entry, model) else None
+        if "override /model" in entry:
+            return recipe if entry["override /model"] == model else None
+    return recipe
+
+
 def register() -> None:
     """Makes the names known to configurations. What comes from the command line is cached: jobs take it over."""
 
     OmegaConf.register_new_resolver("sweep_folder", lambda: sweep_folder(sys.argv[1:]), use_cache=True, replace=True)
     OmegaConf.register_new_resolver("fixed_keys", lambda: fixed_keys(sys.argv[1:]), use_cache=True, replace=True)
     OmegaConf.register_new_resolver("job_name", job_name, replace=True)
+    OmegaConf.register_new_resolver("recipe_of", recipe_of, replace=True)
 
 
 register()  # on import: the processes of a sweep import this module, and nothing else of the command line

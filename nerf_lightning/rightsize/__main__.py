@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nerf_lightning.config import cli
+from nerf_lightning.config import cli, conf_dir
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.options import check_options
 
@@ -49,7 +49,7 @@ def task(cfg: "DictConfig") -> None:
     from nerf_lightning.rightsize.search import search
 
     goal = Target(**target)
-    ladder = read_ladder(cfg.ladder or cfg.method, cli.conf_dir() / "ladders")
+    ladder = read_ladder(cfg.ladder or cfg.method, conf_dir() / "ladders")
     run = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key not in OWN])
     found = search(run, goal, ladder, output)
     write_report(found, run, dict(HydraConfig.get().runtime.choices), output)
