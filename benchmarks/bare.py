@@ -7,7 +7,7 @@ import torch
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.device import synchronize
-from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.utils.seeding import Stream, step_generator
 
 
 def bare_step(
@@ -23,10 +23,10 @@ def bare_step(
         optimizer.state.pop(parameter, None)
     batch = data.draw(step).to(system.device)
     optimizer.zero_grad()
-    loss, system.stats = system.loss(batch, step_generator(system.seed, 1, step, system.device), step)
+    loss, system.stats = system.loss(batch, step_generator(system.seed, Stream.STEP, step, system.device), step)
     loss.backward()
     optimizer.step()
     if system.stats.counted:
-        data.adapt(system.stats.samples)
+        data.note_samples(system.stats.samples)
     synchronize(system.device)
     return time.perf_counter() - start

@@ -31,7 +31,7 @@ from nerf_lightning.stability.toys import PILE, toy
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.quiet import quiet
-from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.view.painter import Painter, Wish
 
 SCENES = ("hashgrid", "voxels", "tensorf", "mlp")
@@ -125,12 +125,12 @@ def stepped(system: System, data: object, steps: int, where: torch.device) -> li
         for parameter in system.field.grow(step / steps):
             optimizer.state.pop(parameter, None)
         batch = data.draw(step).to(where)
-        loss, stats = system.loss(batch, step_generator(0, 1, step, where), step)
+        loss, stats = system.loss(batch, step_generator(0, Stream.STEP, step, where), step)
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
         if stats.counted:
-            data.adapt(stats.samples)
+            data.note_samples(stats.samples)
         losses.append(float(loss.detach()))
     return losses
 
@@ -297,12 +297,12 @@ def test_a_step_asks_little_of_the_device(name: str, device: torch.device, tmp_p
             optimizer.state.pop(parameter, None)
         batch = data.draw(step).to(device)
         with Count() as count:
-            loss, stats = system.loss(batch, step_generator(0, 1, step, device), step)
+            loss, stats = system.loss(batch, step_generator(0, Stream.STEP, step, device), step)
             loss.backward()
             optimizer.step()
             optimizer.zero_grad()
         if stats.counted:
-            data.adapt(stats.samples)
+            data.note_samples(stats.samples)
         counts.append(count)
     for count in counts[-period + 2 :]:
         assert count.operations <= MOST[name], count.names.most_common()
@@ -327,13 +327,13 @@ def test_rays_that_room_was_too_small_for_teach_nothing(device: torch.device, tm
     assert isinstance(system, NeRF3D)
     stepped(system.to(device), data, 2, device)
     batch, sampler = data.draw(2).to(device), system.sampler
-    sampler.update(2, system.field.density, step_generator(0, 1, 2, device))
+    sampler.update(2, system.field.density, step_generator(0, Stream.STEP, 2, device))
     before = sampler.per_ray
     assert before is not None, "there is room for as many as were counted"
 
     def drawn(per_ray: tuple[float, float] | None) -> Any:
         sampler.per_ray = per_ray
-        return sampler(batch.rays, system.field.density, step_generator(0, 1, 2, device))
+        return sampler(batch.rays, system.field.density, step_generator(0, Stream.STEP, 2, device))
 
     with torch.no_grad():
         counted, roomy, tight = drawn(None), drawn(before), drawn((before[0], 0.4 * before[1]))
@@ -348,7 +348,7 @@ def test_rays_that_room_was_too_small_for_teach_nothing(device: torch.device, tm
     def loss(pixels: torch.Tensor) -> float:
         sampler.per_ray = (before[0], 0.4 * before[1])
         changed = replace(batch, pixels=pixels)
-        return float(system.loss(changed, step_generator(0, 1, 2, device), 2)[0].detach())
+        return float(system.loss(changed, step_generator(0, Stream.STEP, 2, device), 2)[0].detach())
 
     others = batch.pixels.clone()
     others[~tight.whole] = 255 - others[~tight.whole]

@@ -142,7 +142,7 @@ class Budget(L.Callback):
         with self.paused():
             data = data_of(trainer)
             chosen = evenly(data.held_out_views, LOOK_AT)
-            flat = plateau.note(spent, fmean(system.evaluate(data.held_out(view)).psnr for view in chosen))
+            flat = plateau.note(spent, fmean(view.psnr for view in system.evaluate_held_out(data, chosen)))
         if not agreed(trainer, flat):
             return
         if system.progress < system.field.grown_after:

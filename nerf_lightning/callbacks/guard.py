@@ -13,11 +13,11 @@ from torch import Tensor
 from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.watch import Breakdown, Watch
-from nerf_lightning.dataset import PixelDataModule, RayDataModule, ViewBatch, draw_rays
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.model import Rectifier
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.utils.options import AtLeast, Count
-from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.utils.seeding import Stream, step_generator
 
 LOWER, MUCH_LOWER = 0.3, 0.2
 """Factors on the learning rate where it is what is to blame: after something was learned, and where nothing was."""
@@ -25,8 +25,6 @@ WARM = 100
 """Steps in which the rate comes back after a new start, where it was to blame ..."""
 COOL = 0.1
 """... and what it has fallen to at the end besides: nobody knows how much lower it ought to be."""
-PIXELS = 8192
-"""Drawn to learn how well one plain colour would do."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +39,7 @@ class Recovery:
 
 def plain_error(data: RayDataModule | PixelDataModule, system: System) -> float:
     """The squared error of the best single colour on training pixels: what a field that shows nothing reaches."""
-    if isinstance(data, RayDataModule):
-        drawn = draw_rays(data.scene.train, PIXELS, step_generator(data.seed, 2, 0))
-        truth = system.truth(ViewBatch(drawn.rays, drawn.pixels, 1, PIXELS).to(system.device))
-    else:
-        truth = system.truth(data.held_out(0).to(system.device))
+    truth = system.truth(data.some_pixels().to(system.device))
     return float((truth - truth.mean(0)).square().mean())
 
 
@@ -213,9 +207,11 @@ class Guard(L.Callback):
     def _start_again(self, system: System, step: int, apart: bool) -> str:
         """Fresh weights, and something else besides, as the same again would come to the same end."""
         system.load_state_dict(self._start)
-        fresh = copy.deepcopy(system.field).cpu()  # the same weights on every device, and none of its chance used up
+        fresh = copy.deepcopy(
+            system.field
+        ).cpu()  # the same weights on every device, and none of its random numbers used up
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(int(step_generator(system.seed, 3, step).initial_seed() & 0xFFFFFFFF))
+            torch.manual_seed(int(step_generator(system.seed, Stream.RESTART, step).initial_seed() & 0xFFFFFFFF))
             started_anew(fresh)
         system.field.load_state_dict(fresh.state_dict())
         system.on_fit_start()  # what a sampler finds out about the scene is part of a start

@@ -73,14 +73,14 @@ class HeldOut(L.Callback):
         with Budget.of(trainer).paused():
             data = data_of(trainer)
             if self.views is None and self.view_seconds is None:  # nobody knows yet how many views there is time for
-                self.view_seconds = pl_module.evaluate(data.held_out(0)).seconds
+                self.view_seconds = next(pl_module.evaluate_held_out(data, [0])).seconds
             chosen = evenly(data.held_out_views, self.count(trainer))
             if self.views is None and len(chosen) < data.held_out_views and not self.curve:
                 print(
                     f"{len(chosen)} of {data.held_out_views} held-out views are measured while training, as one takes "
                     f"{self.view_seconds:.1f} s; callbacks.heldout.views={data.held_out_views} takes all"
                 )
-            results = [pl_module.evaluate(data.held_out(view)) for view in chosen]
+            results = list(pl_module.evaluate_held_out(data, chosen))
             while len(self.curve) < due:  # a step may pass several marks at once: one measurement serves them all
                 self.record(trainer, results)
 

@@ -3,6 +3,7 @@
 import math
 import platform
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -18,8 +19,8 @@ from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
-from nerf_lightning.dataset import PictureBatch, PixelDataModule, RayDataModule
-from nerf_lightning.system import NeRF2D, System, decibels, psnr
+from nerf_lightning.dataset import PictureBatch
+from nerf_lightning.system import NeRF2D, System, decibels
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.machine import describe_machine
 
@@ -51,15 +52,6 @@ def peak_memory_bytes(device: torch.device) -> int | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
-
-
-def plain_colour_psnr(data: RayDataModule | PixelDataModule, system: System) -> float:
-    """PSNR of the best single colour for each held-out view: what a collapsed field reaches."""
-    scores = []
-    for view in range(data.held_out_views):
-        truth = system.truth(data.held_out(view).to(system.device))
-        scores.append(psnr(truth.mean(0).expand_as(truth), truth))
-    return fmean(scores)
 
 
 def gap(trainer: L.Trainer, system: System, quality: float) -> str:
@@ -101,14 +93,14 @@ class Results(L.Callback):
         path: the file, below the run folder.
         method: name of the model, as configured.
         seed: of the run.
+        warnings: what was doubtful about the data before training began.
     """
 
-    def __init__(self, path: str, method: str, seed: int):
+    def __init__(self, path: str, method: str, seed: int, warnings: Sequence[str] = ()):
         self.path = path
         self.method = method
         self.seed = seed
-        self.warnings: list[str] = []
-        """What was doubtful about the data before training began."""
+        self.warnings = list(warnings)
         self.views: list[dict[str, float]] = []
         self.summary: dict[str, Any] = {}
         """What was written last."""
@@ -123,7 +115,7 @@ class Results(L.Callback):
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         quality = fmean(view["psnr"] for view in self.views)
-        plain = plain_colour_psnr(data_of(trainer), pl_module)
+        plain = fmean(view["plain_psnr"] for view in self.views)
         nothing = min(plain + NO_BETTER, SEEN_AS_EQUAL)
         stopped = "stopped_early" if Budget.of(trainer).progress(trainer.global_step) < 1.0 else "finished"
         broken = [name for name, value in pl_module.named_parameters() if not value.isfinite().all()]

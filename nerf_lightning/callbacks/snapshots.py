@@ -57,7 +57,7 @@ class Snapshots(L.Callback):
             return
         with Budget.of(trainer).paused():
             data, step = data_of(trainer), trainer.global_step
-            result = pl_module.evaluate(data.held_out(self.view))
+            (result,) = pl_module.evaluate_held_out(data, [self.view])
             caption = f"{data.scene.name}, step {step}, {Budget.of(trainer).seconds:.0f} s, {result.psnr:.2f} dB"
             picture = result_panel(result, caption)
             write_png(Path(trainer.default_root_dir) / self.folder / f"step_{step:07d}.png", picture)

@@ -7,8 +7,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.cameras.transforms import pixel_to_ray
-
 
 @dataclass(frozen=True)
 class Rays:
@@ -83,5 +81,4 @@ class Cameras:
     def view_rays(self, view: int) -> Rays:
         """All H*W rays of one view, row by row."""
         pixel = torch.arange(self.height * self.width, device=self.K.device)
-        uv = torch.stack([pixel % self.width, pixel // self.width], dim=-1).to(self.K.dtype) + 0.5
-        return Rays(*pixel_to_ray(self.K[view], self.c2w[view], uv))
+        return self.rays(torch.full_like(pixel, view), pixel // self.width, pixel % self.width)

@@ -184,14 +184,13 @@ def build_budget(cfg: DictConfig) -> Budget:
     return Budget(**limits)
 
 
-def build_trainer(cfg: DictConfig, folder: Path, device: torch.device) -> L.Trainer:
-    """The Trainer with its callbacks, on a device, writing into `folder`."""
+def build_trainer(cfg: DictConfig, folder: Path, device: torch.device, results: Results | None = None) -> L.Trainer:
+    """The Trainer with its callbacks, on a device, writing into `folder`; with `results`, a results.json too."""
     logger: Logger | bool = make(cfg, "logger", save_dir=folder) if cfg.get("logger") is not None else False
     chosen = [name for name, node in (cfg.get("callbacks") or {}).items() if node is not None]
     callbacks = [make(cfg, f"callbacks.{name}") for name in chosen]
-    results = Results("results.json", cfg.method, cfg.seed)
     # The budget goes first: the others read its clock. Results go before the orbit: figures should not wait for a GIF.
-    callbacks = [build_budget(cfg), results, *callbacks]
+    callbacks = [build_budget(cfg), *([results] if results else []), *callbacks]
     where: dict[str, Any] = {"accelerator": device.type}
     if device.type not in KNOWN:
         where["strategy"] = SingleDeviceStrategy(device)

@@ -1,14 +1,19 @@
-"""The training stream: one batch a step, drawn from nothing but the seed and the step's number."""
+"""How data modules feed a system: a batch for each step, drawn from the seed and the step alone, and held-out views whole."""
 
 from collections.abc import Callable, Iterator
-from typing import TypeVar
+from typing import Any, Generic, TypeVar
 
 import lightning as L
 import torch
+from torch import Tensor
 
+from nerf_lightning.dataset.scene import Views
 from nerf_lightning.utils.device import CPU, fits
 
 Batch = TypeVar("Batch")
+
+
+Photos = TypeVar("Photos", Views, Tensor)
 
 ENDLESS = 2**31 - 1
 """Reported length. Lightning reads one batch ahead of a loader without length, which would break exact resuming."""
@@ -59,3 +64,44 @@ class HeldOutLoader:
 
     def __iter__(self) -> Iterator:
         return map(self.view, range(self.views))
+
+
+class StepDataModule(L.LightningDataModule, Generic[Photos]):
+    """What the data modules of rays and of pixels share.
+
+    Args:
+        photos: what batches are drawn from.
+        seed: of the draw.
+    """
+
+    held_out_views: int
+
+    def __init__(self, photos: Photos, seed: int):
+        super().__init__()
+        self.photos: Photos = photos
+        self.seed = seed
+        self._near: Photos | None = None
+        """The photos where batches are drawn."""
+
+    def draw(self, step: int) -> Any:
+        """The batch of a step: this process's share of it."""
+        if self._near is None:
+            self._near = self.photos.to(drawn_on(self.trainer, self.photos.nbytes))
+        return self.draw_from(self._near, step, share(self.trainer))
+
+    def draw_from(self, photos: Photos, step: int, part: slice) -> Any:
+        """A part of the batch of a step."""
+        raise TypeError(f"{type(self).__name__} must define draw_from(photos, step, part)")
+
+    def held_out(self, view: int) -> Any:
+        """One held-out view, whole."""
+        raise TypeError(f"{type(self).__name__} must define held_out(view)")
+
+    def train_dataloader(self) -> StepLoader:
+        return StepLoader(self.draw, lambda: self.trainer.global_step if self.trainer else 0)
+
+    def test_dataloader(self) -> HeldOutLoader:
+        return HeldOutLoader(self.held_out, self.held_out_views)
+
+    def teardown(self, stage: str) -> None:
+        self._near = None  # another trainer may have another device

@@ -4,14 +4,13 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import lightning as L
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader, drawn_on, share
+from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.utils.seeding import Stream, step_generator
 
 
 def unknown(width: int, height: int) -> None:
@@ -89,7 +88,7 @@ def pixels_at(image: UInt8[Tensor, "H W 3"], index: Int[Tensor, "N"]) -> PixelBa
     return PixelBatch(centres(height, width, index), image.view(-1, 3)[index].float() / 255)
 
 
-class PixelDataModule(L.LightningDataModule):
+class PixelDataModule(StepDataModule[Tensor]):
     """Feeds NeRF2D. There is nothing to hold out: quality is measured on all pixels.
 
     Args:
@@ -104,41 +103,27 @@ class PixelDataModule(L.LightningDataModule):
     held_out_views = 1
 
     def __init__(self, scene: Picture, pixels: int = 10_000, seed: int = 0):
-        super().__init__()
+        super().__init__(scene.image, seed)
         if pixels < 1:
             raise InputError("dataset.pixels", "", str(pixels), "at least 1")
         self.scene = scene
         self.pixels = pixels
-        self.seed = seed
-        self._near: UInt8[Tensor, "H W 3"] | None = None
-        """The picture where batches are drawn."""
 
     def enlarge(self, batch: int) -> None:
-        """Takes so many times as many pixels a step, for a device that takes more at once. Before training."""
+        """Takes that many times the pixels a step, for a device that takes more at once. Before training."""
         self.pixels *= batch
 
-    def draw(self, step: int) -> PixelBatch:
-        if self._near is None:
-            self._near = self.scene.image.to(drawn_on(self.trainer, self.scene.image.nbytes))
-        device, whole = self._near.device, self._near[..., 0].numel()
-        generator = step_generator(self.seed, 0, step, device)
-        index = torch.randint(whole, (self.pixels,), generator=generator, device=device)
-        return pixels_at(self._near, index[share(self.trainer)])
+    def draw_from(self, photos: UInt8[Tensor, "H W 3"], step: int, part: slice) -> PixelBatch:
+        generator = step_generator(self.seed, Stream.BATCH, step, photos.device)
+        index = torch.randint(photos[..., 0].numel(), (self.pixels,), generator=generator, device=photos.device)
+        return pixels_at(photos, index[part])
 
-    def teardown(self, stage: str) -> None:
-        self._near = None  # another trainer may have another device
-
-    def train_dataloader(self) -> StepLoader:
-        return StepLoader(self.draw, lambda: self.trainer.global_step if self.trainer else 0)
+    def some_pixels(self) -> PixelBatch:
+        """As of `RayDataModule`: all of them."""
+        return self.held_out(0)
 
     def held_out(self, view: int) -> PictureBatch:
         """The whole picture."""
         height, width, _ = self.scene.image.shape
         everything = pixels_at(self.scene.image, torch.arange(height * width))
         return PictureBatch(everything.uv, everything.rgb, height, width)
-
-    def test_dataloader(self) -> HeldOutLoader:
-        return HeldOutLoader(self.held_out, self.held_out_views)
-
-    def transfer_batch_to_device(self, batch: PixelBatch, device: torch.device, dataloader_idx: int) -> PixelBatch:
-        return batch.to(device)

@@ -2,16 +2,20 @@
 
 from dataclasses import dataclass
 
-import lightning as L
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.dataset.loader import HeldOutLoader, StepLoader, drawn_on, share
+from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.scene import Scene, Views
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.utils.seeding import Stream, step_generator
+
+RAYS, SAMPLES = 1024, 16384
+"""Rays of the first step, and the samples a step that their number is then adapted to."""
+SOME_PIXELS = 8192
+"""Drawn to learn which colours there are."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +28,6 @@ class RayBatch:
 
     def to(self, device: torch.device | str) -> "RayBatch":
         return RayBatch(self.rays.to(device), self.pixels.to(device))
-
-    def target(self, backgrounds: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-        """The pixels in [0, 1], composited onto `backgrounds` where they have alpha."""
-        pixels = (self.pixels / 255).to(backgrounds.dtype)
-        if pixels.shape[1] == 3:
-            return pixels
-        return torch.lerp(backgrounds, pixels[:, :3], pixels[:, 3:])
 
 
 @dataclass(frozen=True)
@@ -57,7 +54,7 @@ def draw_rays(views: Views, count: int, generator: torch.Generator, part: slice 
     return RayBatch(views.cameras.rays(view, row, col), views.images[view, row, col])
 
 
-class RayDataModule(L.LightningDataModule):
+class RayDataModule(StepDataModule[Views]):
     """Feeds NeRF3D.
 
     Args:
@@ -72,8 +69,8 @@ class RayDataModule(L.LightningDataModule):
 
     MOST_RAYS = 32  # times the rays of the first step
 
-    def __init__(self, scene: Scene, rays: int = 4096, samples: int | None = None, seed: int = 0):
-        super().__init__()
+    def __init__(self, scene: Scene, rays: int = RAYS, samples: int | None = SAMPLES, seed: int = 0):
+        super().__init__(scene.train, seed)
         if rays < 1:
             raise InputError("dataset.rays", "", str(rays), "at least 1")
         if samples is not None and samples < 1:
@@ -81,19 +78,16 @@ class RayDataModule(L.LightningDataModule):
         self.scene = scene
         self.rays = self.first_rays = rays
         self.samples = samples
-        self.seed = seed
         self.batch = 1
-        self._near: Views | None = None
-        """The photos where batches are drawn."""
 
     def enlarge(self, batch: int) -> None:
-        """Takes so many times as many rays and samples a step, for a device that takes more at once. Before training."""
+        """Takes that many times the rays and samples a step, for a device that takes more at once. Before training."""
         self.batch *= batch
         self.rays = self.first_rays = self.first_rays * batch
         self.samples = None if self.samples is None else self.samples * batch
 
-    def adapt(self, drawn: int) -> None:
-        """Called after each step with the samples its rays took: moves the number of rays toward the aim."""
+    def note_samples(self, drawn: int) -> None:
+        """Takes in how many samples a step's rays took: the number of rays moves toward the aim."""
         if self.samples is None:
             return
         # Damped, since one batch's count is noisy; bounded, since empty space would ask for endless rays.
@@ -101,33 +95,26 @@ class RayDataModule(L.LightningDataModule):
         limit = self.first_rays * self.MOST_RAYS
         self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
 
-    def draw(self, step: int) -> RayBatch:
-        if self._near is None:
-            self._near = self.scene.train.to(drawn_on(self.trainer, self.scene.train.images.nbytes))
-        device = self._near.images.device
-        return draw_rays(self._near, self.rays, step_generator(self.seed, 0, step, device), share(self.trainer))
+    def start_again(self) -> None:
+        """For another training on the same photos: the number of rays is that of a first step."""
+        self.rays = self.first_rays
 
-    def teardown(self, stage: str) -> None:
-        self._near = None  # another trainer may have another device
+    def draw_from(self, photos: Views, step: int, part: slice) -> RayBatch:
+        generator = step_generator(self.seed, Stream.BATCH, step, photos.images.device)
+        return draw_rays(photos, self.rays, generator, part)
 
-    def train_dataloader(self) -> StepLoader:
-        return StepLoader(self.draw, lambda: self.trainer.global_step if self.trainer else 0)
+    def some_pixels(self) -> RayBatch:
+        """Training pixels that tell which colours there are to learn."""
+        return draw_rays(self.scene.train, SOME_PIXELS, step_generator(self.seed, Stream.PLAIN, 0))
 
     @property
     def held_out_views(self) -> int:
         return len(self.scene.val)
 
     def held_out(self, view: int) -> ViewBatch:
-        """One held-out view, whole."""
         views = self.scene.val
         height, width = views.cameras.height, views.cameras.width
         return ViewBatch(views.cameras.view_rays(view), views.images[view].flatten(0, 1), height, width)
-
-    def test_dataloader(self) -> HeldOutLoader:
-        return HeldOutLoader(self.held_out, self.held_out_views)
-
-    def transfer_batch_to_device(self, batch: RayBatch, device: torch.device, dataloader_idx: int) -> RayBatch:
-        return batch.to(device)
 
     def state_dict(self) -> dict[str, int]:
         return {"rays": self.rays, "batch": self.batch}

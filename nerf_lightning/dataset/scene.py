@@ -24,6 +24,11 @@ class Views:
     def __len__(self) -> int:
         return self.images.shape[0]
 
+    @property
+    def nbytes(self) -> int:
+        """Of the pictures."""
+        return self.images.nbytes
+
     def to(self, device: torch.device) -> "Views":
         return Views(self.images.to(device), self.cameras.to(device))
 

@@ -15,7 +15,7 @@ from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PixelDataModule
-from nerf_lightning.dataset.rays import RayDataModule
+from nerf_lightning.dataset.rays import RAYS, SAMPLES, RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
 from nerf_lightning.utils.files import atomic
@@ -34,8 +34,8 @@ def from_photos(
     holdout: Count = 10,
     near: float | None = None,
     far: float | None = None,
-    rays: Count = 4096,
-    samples: Count | None = None,
+    rays: Count = RAYS,
+    samples: Count | None = SAMPLES,
     seed: int = 0,
 ) -> RayDataModule:
     """Posed photos in any supported format, see `open_scene` and `RayDataModule`."""
@@ -46,8 +46,8 @@ def from_bricks(
     size: Count = 200,
     train_views: Count = 100,
     val_views: Count = 10,
-    rays: Count = 4096,
-    samples: Count | None = None,
+    rays: Count = RAYS,
+    samples: Count | None = SAMPLES,
     seed: int = 0,
 ) -> RayDataModule:
     """The built-in scene, see `bricks` and `RayDataModule`."""
@@ -62,8 +62,8 @@ def from_download(
     resize: Count | None = None,
     near: float | None = None,
     far: float | None = None,
-    rays: Count = 4096,
-    samples: Count | None = None,
+    rays: Count = RAYS,
+    samples: Count | None = SAMPLES,
     seed: int = 0,
 ) -> RayDataModule:
     """A published scene: from `path` if given, else from `folder`, else from `url` into `folder`, else the built-in scene.

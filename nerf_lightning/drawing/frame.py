@@ -18,6 +18,7 @@ from nerf_lightning.utils.evenly import evenly
 CHANNELS = ("rgb", "depth", "opacity")
 LOOKS, LOOK_SIDE = 6, 64
 """Views, and pixels along their longer side, that the range of depths is told from."""
+BLACK = (0.0, 0.0, 0.0)
 ERROR_TIMES = 4
 """By how much errors are magnified."""
 
@@ -50,7 +51,8 @@ def depth_range(system: NeRF3D, cameras: Cameras) -> tuple[float, float]:
 
 def draw(system: NeRF3D, cameras: Cameras, view: int, style: Style) -> dict[str, UInt8[ndarray, "H W C"]]:
     """A view's channels; C is 4, with straight alpha, where the background is left transparent."""
-    rendered = system.render(cameras.view_rays(view).to(system.device))
+    rays = cameras.view_rays(view).to(system.device)
+    rendered = system.render(rays, background=style.background or BLACK)
     painted = {name: colours(rendered, name, style) for name in style.channels}
     shape = (cameras.height, cameras.width, -1)
     return {name: (one.clamp(0, 1) * 255).round().byte().view(shape).cpu().numpy() for name, one in painted.items()}

@@ -56,8 +56,8 @@ def evaluate(run: str, output: str | None, worst: int, device: str, photos: str 
     distance, why = perceptual_distance(first.width, first.height)
     judged: list[Judged] = []
     kept: dict[int, ViewResult] = {}
-    for view in tracked(range(data.held_out_views), data.held_out_views, "held-out views"):
-        result = found.system.evaluate(data.held_out(view))
+    views = tracked(range(data.held_out_views), data.held_out_views, "held-out views")
+    for view, result in enumerate(found.system.evaluate_held_out(data, views)):
         lpips = None if distance is None else distance(result.rgb, result.truth)
         judged.append(Judged(view, result.psnr, result.ssim, lpips, result.seconds))
         kept[view] = result

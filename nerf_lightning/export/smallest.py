@@ -44,7 +44,8 @@ class Compact:
 def held_out_psnr(system: System, data: RayDataModule | PixelDataModule, views: Sequence[int] | None = None) -> float:
     """Mean dB over held-out views; over all of them for None."""
     chosen = range(data.held_out_views) if views is None else views
-    return fmean(system.evaluate(data.held_out(view)).psnr for view in tracked(chosen, len(chosen), "held-out views"))
+    results = system.evaluate_held_out(data, tracked(chosen, len(chosen), "held-out views"))
+    return fmean(result.psnr for result in results)
 
 
 def some_cameras(data: RayDataModule, most: int = MOST_VIEWS) -> Cameras:

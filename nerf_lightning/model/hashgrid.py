@@ -132,7 +132,7 @@ class HashGridField(Field):
         width: Count = 64,
         degree: int = 3,
         density: str = "exp",
-        size: str = "fixed",
+        size: str = "auto",
     ):
         super().__init__(bounds)
         self.grid = HashGrid(levels, log2_entries, features, *self.grid_sizes(coarsest, finest, size))

@@ -124,7 +124,7 @@ class TensoRFField(Field):
         width: Count = 32,
         degree: int = 3,
         density: str = "exp",
-        size: str = "fixed",
+        size: str = "auto",
     ):
         super().__init__(bounds)
         coarsest, finest = self.grid_sizes(coarsest, finest, size)

@@ -78,7 +78,7 @@ class VoxelField(Field):
         degree: int = 1,
         density_rate: float = 6.0,
         smoothness: float = 1e-4,
-        size: str = "fixed",
+        size: str = "auto",
     ):
         super().__init__(bounds)
         coarsest, finest = self.grid_sizes(coarsest, finest, size)

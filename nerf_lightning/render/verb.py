@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.drawing.frame import CHANNELS, ERROR_TIMES, Style, depth_range, draw, error_picture
@@ -22,8 +21,6 @@ from nerf_lightning.runs.open import SceneRun, beside, open_scene_run
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.device import synchronize, the_device
 from nerf_lightning.utils.machine import device_in_words
-
-BLACK = (0.0, 0.0, 0.0)
 
 
 def render(order: Order) -> None:
@@ -41,7 +38,6 @@ def render(order: Order) -> None:
     found = open_scene_run(source, device)
     route = the_route(order, found)
     background = the_background(order, found.system, route)
-    found.system.renderer.colour = torch.tensor(background or BLACK, device=device)
     depths = depth_range(found.system, route.cameras) if "depth" in channels else (0.0, 1.0)
     style = Style(channels, background, depths)
     plan = the_plan(order, found.system, route, style)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Rays
@@ -36,6 +36,14 @@ class Rendered:
     def depth(self) -> Float[Tensor, "R"]:
         """Expected distance along the ray of what covers it, in the scene's unit; 0 where nothing does."""
         return self.distance / self.opacity.clamp_min(1e-6)
+
+
+def over(pixels: UInt8[Tensor, "R C"], backgrounds: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+    """Photos' pixels in [0, 1], composited onto backgrounds by their straight alpha where C is 4."""
+    colours = (pixels / 255).to(backgrounds.dtype)
+    if colours.shape[1] == 3:
+        return colours
+    return torch.lerp(backgrounds, colours[:, :3], colours[:, 3:])
 
 
 class VolumeRenderer(torch.nn.Module):

@@ -21,7 +21,7 @@ from nerf_lightning.runs.folder import plain_config, scene_content
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.train import prepare_process, warm_up
 from nerf_lightning.utils.evenly import evenly
-from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.utils.seeding import Stream, step_generator
 
 Data = RayDataModule | PixelDataModule
 SEARCH = 0.75
@@ -85,7 +85,7 @@ def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = No
     """
     prepare_process(cfg.seed, cfg.threads, cfg.kernels)
     if isinstance(data, RayDataModule):
-        data.rays = data.first_rays
+        data.start_again()
     device = device_of(cfg)
     system = build_system(cfg, frame_of(data), device)
     if start is not None:
@@ -143,7 +143,9 @@ def settle(system: NeRF3D) -> None:
     """Lets a new sampler find out where the field is dense."""
     for look in range(LOOKS):
         step = look * getattr(system.sampler, "update_every", 1)
-        system.sampler.update(step, system.field.density, step_generator(system.seed, 4, look, system.device))
+        system.sampler.update(
+            step, system.field.density, step_generator(system.seed, Stream.STUDY, look, system.device)
+        )
 
 
 def coarsest_sampler(

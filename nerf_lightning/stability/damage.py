@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset.scene import Scene, Views
-from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.utils.seeding import Stream, step_generator
 
 Poses = Callable[[Float[Tensor, "V 4 4"]], Float[Tensor, "V 4 4"]]
 Photos = Callable[[Float[Tensor, "V H W C"]], Float[Tensor, "V H W C"]]
@@ -38,7 +38,7 @@ def turned_to_opengl(scene: Scene, seed: int) -> Scene:
 
 def shuffled(scene: Scene, seed: int) -> Scene:
     """Each training photo has another one's pose."""
-    order = torch.randperm(len(scene.train), generator=step_generator(seed, 4, 0))
+    order = torch.randperm(len(scene.train), generator=step_generator(seed, Stream.STUDY, 0))
     return replace(scene, train=posed(scene.train, lambda c2w: c2w[order]))
 
 
@@ -46,7 +46,8 @@ def with_pose_noise(scene: Scene, seed: int, degrees: float) -> Scene:
     """Training cameras turned about random axes, by angles of that standard deviation."""
 
     def turn(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
-        vectors = torch.randn(len(c2w), 3, generator=step_generator(seed, 4, 1)) * (degrees / 180 * torch.pi / 3**0.5)
+        generator = step_generator(seed, Stream.STUDY, 1)
+        vectors = torch.randn(len(c2w), 3, generator=generator) * (degrees / 180 * torch.pi / 3**0.5)
         cross = torch.zeros(len(c2w), 3, 3)
         cross[:, [2, 0, 1], [1, 2, 0]] = vectors
         c2w[:, :3, :3] = torch.linalg.matrix_exp(cross - cross.mT) @ c2w[:, :3, :3]
@@ -57,13 +58,13 @@ def with_pose_noise(scene: Scene, seed: int, degrees: float) -> Scene:
 
 def with_exposure_drift(scene: Scene, seed: int, share: float) -> Scene:
     """Training photos brighter or darker, by up to that share."""
-    gains = 1 + share * (2 * torch.rand(len(scene.train), 1, 1, 1, generator=step_generator(seed, 4, 2)) - 1)
+    gains = 1 + share * (2 * torch.rand(len(scene.train), 1, 1, 1, generator=step_generator(seed, Stream.STUDY, 2)) - 1)
     return replace(scene, train=exposed(scene.train, lambda colours: colours * gains))
 
 
 def with_noise(scene: Scene, seed: int, spread: float) -> Scene:
     """Noise of that standard deviation on each training pixel."""
-    generator = step_generator(seed, 4, 3)
+    generator = step_generator(seed, Stream.STUDY, 3)
     return replace(scene, train=exposed(scene.train, lambda x: x + spread * torch.randn(x.shape, generator=generator)))
 
 

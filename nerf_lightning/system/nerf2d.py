@@ -49,8 +49,8 @@ class NeRF2D(System):
         self.stats = StepStats(loss.detach(), len(batch.uv), len(batch.uv))
         return loss
 
-    def truth(self, view: PictureBatch) -> Tensor:
-        return view.rgb
+    def truth(self, batch: PixelBatch) -> Tensor:
+        return batch.rgb
 
     def show(self, view: PictureBatch) -> tuple[Tensor, None, None]:
         return self.colours(view.uv), None, None

@@ -2,19 +2,20 @@
 
 import copy
 import math
+from collections.abc import Sequence
 from contextlib import nullcontext
 
 import torch
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.dataset import RayBatch, ViewBatch
+from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.model import Field
-from nerf_lightning.renderer import Rendered, VolumeRenderer
+from nerf_lightning.renderer import Rendered, VolumeRenderer, over
 from nerf_lightning.sampler import Sampler, split
 from nerf_lightning.system.compiled import part
 from nerf_lightning.system.system import CHUNK, MakeOptimizer, Schedule, StepStats, System
-from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.utils.seeding import Stream, step_generator
 
 RAYS = 8
 """One ray is sampled for so many samples that are rendered together."""
@@ -53,8 +54,13 @@ class NeRF3D(System):
         assert isinstance(smaller, NeRF3D)  # its field was of this kind
         self.sampler.take(smaller.sampler)
 
+    @property
+    def data(self) -> RayDataModule:
+        """What it trains on."""
+        return self.trainer.datamodule  # type: ignore[attr-defined]
+
     def on_fit_start(self) -> None:
-        self.sampler.look_through(self.trainer.datamodule.scene.train.cameras)  # type: ignore[attr-defined]
+        self.sampler.look_through(self.data.scene.train.cameras)
 
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
@@ -73,7 +79,7 @@ class NeRF3D(System):
         trial = NeRF3D(field, sampler, self.renderer, self.make_optimizer, self.schedule, self.seed, self.chunk)
         trial.backend = self.backend
         with self.paused() if self.paused else nullcontext(), self.trainer.precision_plugin.train_step_context():
-            trial.loss(batch, step_generator(self.seed, 1, self.global_step, self.device), 1)[0].backward()
+            trial.loss(batch, step_generator(self.seed, Stream.STEP, self.global_step, self.device), 1)[0].backward()
 
     def loss(self, batch: RayBatch, generator: torch.Generator, step: int) -> tuple[Tensor, StepStats]:
         """What a step minimises, and what it did; `generator` is all its chance."""
@@ -83,7 +89,7 @@ class NeRF3D(System):
             samples = self.sampler(batch.rays, density, generator)
         backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
         rendered = part(self.renderer.forward, self.backend)(batch.rays, samples, self.field, backgrounds)
-        truth = batch.target(backgrounds)
+        truth = over(batch.pixels, backgrounds)
         # A ray that lacks some of its samples teaches nothing.
         rgb = rendered.rgb if samples.whole is None else torch.where(samples.whole[:, None], rendered.rgb, truth)
         loss = torch.nn.functional.mse_loss(rgb, truth)
@@ -95,14 +101,14 @@ class NeRF3D(System):
         return loss, stats
 
     def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
-        generator = step_generator(self.seed, 1, self.global_step, self.device)
+        generator = step_generator(self.seed, Stream.STEP, self.global_step, self.device)
         loss, self.stats = self.loss(batch, generator, self.global_step)
         if not self.stats.counted:
             return loss
         drawn = self.stats.samples
         if self.trainer.world_size > 1:  # all processes draw from one stream, so they must adapt alike
             drawn = int(self.trainer.strategy.reduce(torch.tensor(drawn, device=self.device), reduce_op="sum"))
-        self.trainer.datamodule.adapt(drawn)  # type: ignore[attr-defined]
+        self.data.note_samples(drawn)
         return loss
 
     @property
@@ -111,8 +117,17 @@ class NeRF3D(System):
         return max(1, self.chunk // RAYS)
 
     @torch.no_grad()
-    def render(self, rays: Rays, near: float = 0.0, far: float = math.inf) -> Rendered:
-        """Renders rays without gradient and without chance, a chunk at a time; what is nearer or farther is cut away."""
+    def render(
+        self, rays: Rays, near: float = 0.0, far: float = math.inf, background: Sequence[float] | None = None
+    ) -> Rendered:
+        """Renders rays without gradient and without randomness, a chunk at a time.
+
+        Args:
+            rays: on the system's device.
+            near, far: distances along each ray, scene's unit; what is nearer or farther is cut away.
+            background: colour in [0, 1]; None takes the renderer's own.
+        """
+        behind = self.renderer.colour if background is None else torch.tensor(background, device=self.device)
         parts = []
         for start in range(0, len(rays), self.chunk_rays):
             chunk = rays[start : start + self.chunk_rays]
@@ -120,7 +135,8 @@ class NeRF3D(System):
             if near > 0 or far < math.inf:
                 found = found.between(near, far)
             for run, samples in split(found, self.chunk):
-                parts.append(self.renderer(chunk[run], samples, self.field))
+                part_rays = chunk[run]
+                parts.append(self.renderer(part_rays, samples, self.field, behind.expand(len(part_rays), 3)))
         return Rendered(
             *(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "distance"))
         )
@@ -129,8 +145,8 @@ class NeRF3D(System):
     def background(self) -> list[float]:
         return [round(c, 3) for c in self.renderer.colour.tolist()]
 
-    def truth(self, view: ViewBatch) -> Tensor:
-        return view.target(self.renderer.backgrounds(len(view.rays)))
+    def truth(self, batch: RayBatch) -> Tensor:
+        return over(batch.pixels, self.renderer.backgrounds(len(batch.rays)))
 
     def show(self, view: ViewBatch) -> tuple[Tensor, Tensor, Tensor]:
         rendered = self.render(view.rays)

@@ -12,11 +12,11 @@ def constant(progress: float, warmup: float = 0.0) -> float:
     return _warm(progress, warmup)
 
 
-def exponential(progress: float, warmup: float = 0.0, final: float = 0.1) -> float:
+def exponential(progress: float, warmup: float = 0.01, final: float = 0.1) -> float:
     """Warm-up, then final^progress: from 1 down to `final` at the end."""
     return _warm(progress, warmup) * final**progress
 
 
-def cosine(progress: float, warmup: float = 0.0, final: float = 0.0) -> float:
+def cosine(progress: float, warmup: float = 0.01, final: float = 0.0) -> float:
     """Warm-up, then half a cosine from 1 down to `final` at the end."""
     return _warm(progress, warmup) * (final + (1 - final) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))

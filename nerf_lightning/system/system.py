@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system.metrics import psnr, ssim
 from nerf_lightning.utils.device import synchronize
@@ -105,9 +106,9 @@ class System(L.LightningModule):
         assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one
         return optimizer.param_groups
 
-    def truth(self, view: Any) -> Float[Tensor, "N 3"]:
-        """The colours a whole-view batch should have."""
-        raise TypeError(f"{type(self).__name__} must define truth(view)")
+    def truth(self, batch: Any) -> Float[Tensor, "N 3"]:
+        """The colours that a batch should have in evaluation."""
+        raise TypeError(f"{type(self).__name__} must define truth(batch)")
 
     def show(self, view: Any) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"] | None, Float[Tensor, "N"] | None]:
         """The colours the field gives a whole-view batch, with depth and opacity where it has them."""
@@ -139,6 +140,12 @@ class System(L.LightningModule):
         depth, opacity = (None if x is None else image(x) for x in (depth, opacity))
         return ViewResult(rgb, truth, psnr(rgb, truth), ssim(rgb, truth), seconds, depth, opacity)
 
+    def evaluate_held_out(self, data: StepDataModule, views: Iterable[int]) -> Iterator[ViewResult]:
+        """Some of the held-out views, one after the other."""
+        return (self.evaluate(data.held_out(view)) for view in views)
+
     def test_step(self, batch: Any, batch_idx: int) -> dict[str, float]:
         result = self.evaluate(batch)
-        return {"psnr": result.psnr, "ssim": result.ssim, "seconds": result.seconds}
+        plain = result.truth.mean((0, 1)).expand_as(result.truth)
+        figures = {"psnr": result.psnr, "ssim": result.ssim, "seconds": result.seconds}
+        return {**figures, "plain_psnr": psnr(plain, result.truth)}

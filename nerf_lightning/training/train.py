@@ -14,7 +14,6 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from nerf_lightning.callbacks import Results
-from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.config.build import (
     build_data,
     build_system,
@@ -38,7 +37,7 @@ from nerf_lightning.utils.allocator import keep_freed_memory
 from nerf_lightning.utils.machine import CROWDED, crowding
 from nerf_lightning.utils.options import AtLeast, Count, check_options
 from nerf_lightning.utils.quiet import quiet
-from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.utils.seeding import Stream, step_generator
 
 SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
 """What stands beside the options in TensorBoard's HParams tab."""
@@ -88,8 +87,8 @@ def train(
     if system.field.sizing:
         log.info("model: %s", system.field.sizing)
     check_background(cfg, data, system)
-    trainer = build_trainer(cfg, folder, device)
-    results_of(trainer).warnings = doubts
+    results = Results("results.json", cfg.method, cfg.seed, doubts)
+    trainer = build_trainer(cfg, folder, device, results)
     check_processes(trainer, system)
     if trainer.is_global_zero:
         save_config(cfg, folder)
@@ -98,12 +97,11 @@ def train(
         warm_up(system, data, trainer.strategy.root_device)
     trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(system, data, verbose=False)
-    results = results_of(trainer).summary
     if trainer.is_global_zero:
         if trainer.logger is not None:
-            log_hyperparameters(trainer.logger, cfg, results)
-        report(results, folder)
-    return results["psnr"]
+            log_hyperparameters(trainer.logger, cfg, results.summary)
+        report(results.summary, folder)
+    return results.summary["psnr"]
 
 
 def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
@@ -176,20 +174,13 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
         trial = copy.deepcopy(system).to(device)
         if isinstance(trial, NeRF3D):
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
-            batch = draw_rays(data.scene.train, 64, step_generator(0, 0, 0)).to(device)
-            trial.loss(batch, step_generator(0, 1, 0, device), 1)[
-                0
-            ].backward()  # step 1: without a look at the whole grid
+            batch = draw_rays(data.scene.train, 64, step_generator(0, Stream.BATCH, 0)).to(device)
+            # Step 1: without a look at the whole grid.
+            loss, _ = trial.loss(batch, step_generator(0, Stream.STEP, 0, device), 1)
+            loss.backward()
         elif isinstance(trial, NeRF2D):
-            uv, rgb = torch.rand(64, 5, generator=step_generator(0, 0, 0)).to(device).split([2, 3], dim=1)
+            uv, rgb = torch.rand(64, 5, generator=step_generator(0, Stream.BATCH, 0)).to(device).split([2, 3], dim=1)
             trial.loss(PixelBatch(uv, rgb)).backward()
-
-
-def results_of(trainer: L.Trainer) -> Results:
-    """What writes results.json."""
-    results = attached(trainer, Results)
-    assert results is not None  # build_trainer puts one into every trainer
-    return results
 
 
 def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, results: dict) -> None:

@@ -89,16 +89,11 @@ class Painter:
         began = time.perf_counter()
         cameras = wish.cameras(side).to(device)
         rays = cameras.view_rays(0)
-        colour = self.system.renderer.colour
         parts = []
-        try:
-            self.system.renderer.colour = torch.tensor(wish.background, device=device)
-            for start in range(0, len(rays), together):
-                if not wanted():
-                    return None
-                parts.append(self.system.render(rays[start : start + together], wish.near, wish.far))
-        finally:
-            self.system.renderer.colour = colour
+        for start in range(0, len(rays), together):
+            if not wanted():
+                return None
+            parts.append(self.system.render(rays[start : start + together], wish.near, wish.far, wish.background))
         rendered = Rendered(
             *(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "distance"))
         )

@@ -5,7 +5,7 @@ import yaml
 
 from nerf_lightning.chart.references import Reference, matching, provenance, read_references
 from nerf_lightning.chart.setting import Setting
-from nerf_lightning.config.cli import conf_dir
+from nerf_lightning.config import conf_dir
 from nerf_lightning.errors import InputError
 
 ENTRY = {

@@ -8,7 +8,8 @@ from nerf_lightning.dataset import RayBatch, RayDataModule, Scene, Views
 from nerf_lightning.dataset.loader import StepLoader
 from nerf_lightning.dataset.rays import draw_rays
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.seeding import step_generator
+from nerf_lightning.renderer import over
+from nerf_lightning.utils.seeding import Stream, step_generator
 
 VIEWS, HEIGHT, WIDTH = 3, 4, 6
 
@@ -59,8 +60,8 @@ def test_a_batch_depends_on_seed_and_step_alone(scene: Scene):
 
 def test_data_and_model_draw_apart(scene: Scene):
     drawn = RayDataModule(scene, rays=50, seed=2).draw(5).pixels
-    assert torch.equal(drawn, draw_rays(scene.train, 50, step_generator(2, 0, 5)).pixels)
-    assert not torch.equal(drawn, draw_rays(scene.train, 50, step_generator(2, 1, 5)).pixels)
+    assert torch.equal(drawn, draw_rays(scene.train, 50, step_generator(2, Stream.BATCH, 5)).pixels)
+    assert not torch.equal(drawn, draw_rays(scene.train, 50, step_generator(2, Stream.STEP, 5)).pixels)
 
 
 def test_held_out_views_come_whole_and_in_order(scene: Scene):
@@ -77,13 +78,13 @@ def test_held_out_views_come_whole_and_in_order(scene: Scene):
 def test_the_target_is_the_pixel_over_the_background(alpha: int, expected: float):
     rays = Rays(torch.zeros(2, 3), torch.eye(3)[:2])
     batch = RayBatch(rays, torch.tensor([[51, 51, 51, alpha], [255, 0, 0, 255]], dtype=torch.uint8))
-    target = batch.target(torch.full((2, 3), 0.5))
+    target = over(batch.pixels, torch.full((2, 3), 0.5))
     torch.testing.assert_close(target, torch.tensor([[expected] * 3, [1.0, 0, 0]]))
 
 
 def test_the_target_without_alpha_is_the_pixel():
     batch = RayBatch(Rays(torch.zeros(1, 3), torch.eye(3)[:1]), torch.tensor([[0, 51, 255]], dtype=torch.uint8))
-    torch.testing.assert_close(batch.target(torch.ones(1, 3)), torch.tensor([[0, 0.2, 1.0]]))
+    torch.testing.assert_close(over(batch.pixels, torch.ones(1, 3)), torch.tensor([[0, 0.2, 1.0]]))
 
 
 @pytest.mark.parametrize("samples_per_ray", [0.5, 3.0, 40.0])
@@ -92,7 +93,7 @@ def test_the_number_of_rays_settles_where_their_samples_meet_the_aim(first: int,
     data = RayDataModule(scene, rays=first, samples=6000)
     most = 0
     for _ in range(60):
-        data.adapt(round(data.rays * samples_per_ray))
+        data.note_samples(round(data.rays * samples_per_ray))
         most = max(most, data.rays)
     aim = max(64, min(6000 / samples_per_ray, first * 32))
     assert abs(data.rays - aim) <= 0.01 * aim + 2
@@ -104,25 +105,25 @@ def test_the_number_of_rays_settles_where_their_samples_meet_the_aim(first: int,
 def test_the_number_of_rays_stays_in_bounds(drawn: int, end: int, scene: Scene):
     data = RayDataModule(scene, rays=100, samples=6000)
     for _ in range(60):
-        data.adapt(drawn)
+        data.note_samples(drawn)
         assert 64 <= data.rays <= 3200
     assert abs(data.rays - end) <= 2
 
 
 def test_without_an_aim_the_number_of_rays_stays(scene: Scene):
-    data = RayDataModule(scene, rays=100)
-    data.adapt(10)
+    data = RayDataModule(scene, rays=100, samples=None)
+    data.note_samples(10)
     assert data.rays == 100
 
 
 def test_the_number_of_rays_is_kept_in_checkpoints(scene: Scene):
     data, other = (RayDataModule(scene, rays=100, samples=6000) for _ in range(2))
-    data.adapt(500)
+    data.note_samples(500)
     other.load_state_dict(data.state_dict())
     assert other.rays == data.rays != 100
     assert torch.equal(other.draw(3).pixels, data.draw(3).pixels)
-    other.adapt(0)
-    data.adapt(0)
+    other.note_samples(0)
+    data.note_samples(0)
     assert other.rays == data.rays
 
 

@@ -13,6 +13,7 @@ import torch
 
 from nerf_lightning.config import cli
 from nerf_lightning.render.__main__ import task
+from nerf_lightning.renderer import over
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.system import NeRF3D
 
@@ -72,7 +73,7 @@ def test_photos_stand_beside_their_renders(render: Render, tmp_path: Path):
     from nerf_lightning.config.build import build_data
 
     data = build_data(load_run(tmp_path / "run").cfg)
-    truth = data.held_out(0).target(torch.zeros(256, 3)).view(16, 16, 3).numpy()
+    truth = over(data.held_out(0).pixels, torch.zeros(256, 3)).view(16, 16, 3).numpy()
     assert np.abs(frame[5:160:10, 5:160:10] / 255 - truth).max() < 1 / 255
 
 

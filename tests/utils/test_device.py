@@ -218,11 +218,11 @@ def test_batches_of_other_devices():
     picture.enlarge(4)
     assert len(picture.draw(0).uv) == 40
     scene = toy(MARBLE, size=4, views=3, held_out=1)
-    small, large, fixed = RayDataModule(scene, 100, 1000), RayDataModule(scene, 100, 1000), RayDataModule(scene, 100)
+    small, large, fixed = (RayDataModule(scene, 100, samples) for samples in (1000, 1000, None))
     large.enlarge(8)
     fixed.enlarge(8)
     assert (large.rays, large.first_rays, large.samples, len(large.draw(0).pixels)) == (800, 800, 8000, 800)
-    large.adapt(4000)
+    large.note_samples(4000)
     assert large.rays == 1040
     small.load_state_dict(large.state_dict())
     assert small.rays == 130, "resumed where a step takes an eighth"

@@ -58,7 +58,7 @@ class PictureCharts(L.Callback):
         if not trainer.is_global_zero:
             return
         data, results = data_of(trainer), attached(trainer, Results)
-        result = pl_module.evaluate(data.held_out(0))
+        (result,) = pl_module.evaluate_held_out(data, [0])
         title = f"{data.scene.name}, step {trainer.global_step}, {result.psnr:.2f} dB"
         charts = {
             "error": error_chart(result.rgb, result.truth, title),
