@@ -141,7 +141,11 @@ VARIANTS = {
         name: [*(one for one in SCENE if not one.startswith("sampler.")), "model=mlp", "model.width=16", *given]
         for name, given in SAMPLERS.items()
     },
-    "penalty, one colour behind": [*options("hashgrid"), "renderer.distortion=0.01", "renderer.background=white"],
+    "penalty, one colour behind": [
+        *options("hashgrid"),
+        "renderer.distortion_loss_weight=0.01",
+        "renderer.background=white",
+    ],
     "random colours behind": [*options("tensorf"), "renderer.background=random"],
 }
 

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
+from nerf_lightning.config.renames import rename_given, renamed_overrides
 from nerf_lightning.errors import InputError
 
 TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
@@ -74,13 +75,14 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
 
-    sys.argv[1:] = quoted(by_path(sys.argv[1:], conf_dir()), texts)
+    sys.argv[1:] = renamed_overrides(quoted(by_path(sys.argv[1:], conf_dir()), texts))
     started = False
 
     @functools.wraps(task)
     def job(cfg: DictConfig) -> object:
         nonlocal started
         started = True
+        rename_given(cfg)
         try:
             return task(cfg)
         except InputError as error:

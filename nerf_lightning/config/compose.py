@@ -7,12 +7,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
+from nerf_lightning.config.renames import rename_given, renamed_overrides
 
 
 def composed(overrides: list[str], folder: Path, config: str = "config") -> DictConfig:
     """The configuration a command line would give to the verb of that primary config, with `folder` as the run's."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose(config, overrides, return_hydra_config=True)
+        cfg = compose(config, renamed_overrides(overrides), return_hydra_config=True)
+    rename_given(cfg)
     with open_dict(cfg):
         cfg.hydra.runtime.output_dir = str(folder)
     HydraConfig.instance().set_config(cfg)

@@ -9,7 +9,7 @@ from nerf_lightning.kernels.sums import before
 from nerf_lightning.sampler import Samples
 
 
-def distortion(density: Float[Tensor, "N"], samples: Samples, scale: float) -> Float[Tensor, ""]:
+def distortion_loss(density: Float[Tensor, "N"], samples: Samples, scale: float) -> Float[Tensor, ""]:
     """Mean over rays of sum_ij w_i w_j |s_i - s_j| + sum_i w_i^2 d_i / 3: how far apart a ray's weights lie.
 
     Barron et al. 2022, "Mip-NeRF 360", eq. 15; in linear time, since samples are sorted along their ray. Distances are told

@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import composite
-from nerf_lightning.renderer.distortion import distortion as spread
+from nerf_lightning.renderer.distortion import distortion_loss
 from nerf_lightning.sampler import Samples
 
 FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]]
@@ -53,7 +53,7 @@ class VolumeRenderer(torch.nn.Module):
         background: "scene" (the scene's own), "black", "white", "random" (a new colour for each training ray, the scene's
             own in evaluation; wants images with alpha), or three numbers in [0, 1].
         scene_background: the colour "scene" stands for.
-        distortion: weight of the penalty on fog in training; see `nerf_lightning.renderer.distortion`. 0 does without.
+        distortion_loss_weight: of the penalty on fog in training, see `distortion_loss`; 0 does without.
         half_size: of the scene's box, world units.
 
     Raises:
@@ -66,13 +66,13 @@ class VolumeRenderer(torch.nn.Module):
         self,
         background: str | list[float] = "scene",
         scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        distortion: float = 0.0,
+        distortion_loss_weight: float = 0.0,
         half_size: float = 1.0,
     ):
         super().__init__()
-        if distortion < 0:
-            raise InputError("renderer.distortion", "", str(distortion), "0 or more")
-        self.distortion = distortion
+        if distortion_loss_weight < 0:
+            raise InputError("renderer.distortion_loss_weight", "", str(distortion_loss_weight), "0 or more")
+        self.distortion_loss_weight = distortion_loss_weight
         self.half_size = half_size
         self.random = background == "random"
         colour: Sequence[float]
@@ -109,6 +109,6 @@ class VolumeRenderer(torch.nn.Module):
         summed, opacity, distance = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
         colour = torch.addcmul(summed, (1 - opacity)[:, None], backgrounds)
         penalty = None
-        if self.distortion and density.requires_grad:
-            penalty = self.distortion * spread(density, samples, self.half_size)
+        if self.distortion_loss_weight and density.requires_grad:
+            penalty = self.distortion_loss_weight * distortion_loss(density, samples, self.half_size)
         return Rendered(colour, opacity, distance, penalty)

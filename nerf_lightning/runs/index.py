@@ -10,6 +10,7 @@ from typing import Any, TypeGuard
 
 import yaml
 
+from nerf_lightning.config.renames import with_new_names
 from nerf_lightning.errors import InputError
 
 FINISHED = ("finished", "collapsed")
@@ -64,7 +65,7 @@ def read_run(folder: Path) -> Run:
         config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
         config = {}
-    plain = config if isinstance(config, dict) else {}
+    plain = with_new_names(config) if isinstance(config, dict) else {}
     try:
         results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     except FileNotFoundError:

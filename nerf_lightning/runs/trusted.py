@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.config.renames import with_new_names
 from nerf_lightning.errors import InputError
 
 TRUST = "NERF_LIGHTNING_TRUST"
@@ -32,7 +33,8 @@ stranger's arguments."""
 
 
 def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
-    """Refuses a configuration from outside that is not plain, or names a target that is not trusted.
+    """A configuration from outside under the names that options have now; refuses one that is not plain, or names a target
+    that is not trusted.
 
     Args:
         plain: as it was read.
@@ -44,7 +46,7 @@ def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
     if not isinstance(plain, dict):
         raise InputError(path, "", type(plain).__name__, "a mapping")
     _check(path, "", plain)
-    return plain
+    return with_new_names(plain)
 
 
 def _check(path: Path | str, key: str, node: Any) -> None:

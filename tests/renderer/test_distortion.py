@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nerf_lightning.renderer.distortion import distortion
+from nerf_lightning.renderer.distortion import distortion_loss
 from nerf_lightning.sampler import Samples
 
 
@@ -31,7 +31,7 @@ def by_pairs(density: torch.Tensor, samples: Samples, scale: float) -> torch.Ten
 def test_the_fast_sum_is_the_sum_over_pairs(counts: list[int]):
     density, samples = packed(counts)
     density.requires_grad_()
-    fast, slow = distortion(density, samples, 0.7), by_pairs(density, samples, 0.7)
+    fast, slow = distortion_loss(density, samples, 0.7), by_pairs(density, samples, 0.7)
     torch.testing.assert_close(fast, slow)
     torch.testing.assert_close(torch.autograd.grad(fast, density), torch.autograd.grad(slow, density))
 
@@ -40,9 +40,9 @@ def test_gathered_weight_costs_less_than_fog():
     _, samples = packed([40])
     fog, wall = torch.full((40,), 0.1, dtype=torch.float64), torch.zeros(40, dtype=torch.float64)
     wall[20] = 100.0
-    assert distortion(wall, samples, 1.0) < 0.1 * distortion(fog, samples, 1.0)
+    assert distortion_loss(wall, samples, 1.0) < 0.1 * distortion_loss(fog, samples, 1.0)
 
 
 def test_no_samples_cost_nothing():
     density, samples = packed([0, 0])
-    assert distortion(density, samples, 1.0) == 0
+    assert distortion_loss(density, samples, 1.0) == 0

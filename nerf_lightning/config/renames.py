@@ -1,0 +1,55 @@
+"""Options that had another name once: command lines, experiments and runs that say the old one go on to work."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+RENAMED = {
+    "renderer.distortion": "renderer.distortion_loss_weight",
+}
+GRIDS = ("HashGridField", "TensoRFField", "VoxelField")
+"""Models that were always as fine as asked for before they had the option `size`."""
+
+
+def with_new_names(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's configuration, as plain values, with each option under the name it has now; silent, as a run stays as it is."""
+    renamed = dict(config)
+    for old, new in RENAMED.items():
+        (group, before), after = old.split("."), new.rpartition(".")[2]
+        options = renamed.get(group)
+        if isinstance(options, dict) and before in options:
+            renamed[group] = {after if key == before else key: value for key, value in options.items()}
+    model = renamed.get("model")
+    if isinstance(model, dict) and str(model.get("_target_")).rpartition(".")[2] in GRIDS:
+        renamed["model"] = {"size": "fixed", **model}
+    return renamed
+
+
+def rename_given(cfg: DictConfig) -> None:
+    """Moves what an experiment of the user's own says under an old name to the new one, in place, with a warning."""
+    for old, new in RENAMED.items():
+        group, name = old.split(".")
+        options = cfg.get(group)
+        if isinstance(options, DictConfig) and name in options:
+            _warn(old, new)
+            with open_dict(cfg):
+                OmegaConf.update(cfg, new, options.pop(name))
+
+
+def renamed_overrides(arguments: Sequence[str]) -> list[str]:
+    """A command line with each option under the name it has now, with a warning for each that was not."""
+    found = []
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        new = RENAMED.get(key.lstrip("+"))
+        if new is not None:
+            _warn(key.lstrip("+"), new)
+            argument = f"{new}{equals}{value}"
+        found.append(argument)
+    return found
+
+
+def _warn(old: str, new: str) -> None:
+    print(f"nerf_lightning: {old} is now called {new}; the old name still works", file=sys.stderr)

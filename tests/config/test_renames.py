@@ -1,0 +1,44 @@
+"""Old option names go on to work: on the command line, in a user's experiment, in runs made before."""
+
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from nerf_lightning.config.compose import composed
+from nerf_lightning.config.renames import RENAMED, rename_given
+from nerf_lightning.runs.trusted import check_config
+
+
+def value_at(cfg, key: str) -> object:
+    return OmegaConf.select(cfg, key)
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
+def test_an_old_name_does_what_the_new_one_does(old: str, new: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    given = composed([f"{old}=0.25"], tmp_path)
+    assert given == composed([f"{new}=0.25"], tmp_path) and value_at(given, new) == 0.25
+    assert f"{old} is now called {new}" in capsys.readouterr().err
+
+    group, name = old.split(".")
+    experiment = composed([], tmp_path)  # a file may add a key that conf/ does not have
+    OmegaConf.update(experiment, old, 0.25, force_add=True)
+    rename_given(experiment)
+    assert value_at(experiment, new) == 0.25 and name not in experiment[group]
+    assert f"{old} is now called {new}" in capsys.readouterr().err
+
+    plain = {"model": {}, group: {"first": 1, name: 0.25}}
+    assert check_config(plain, "config.yaml")[group] == {"first": 1, new.split(".")[1]: 0.25}
+    assert capsys.readouterr().err == "", "a run that is there already stays as it is"
+
+
+def test_grids_of_runs_that_say_no_size_are_as_fine_as_asked_for():
+    for target, size in (("nerf_lightning.model.TensoRFField", "fixed"), ("nerf_lightning.model.MLPField", None)):
+        assert check_config({"model": {"_target_": target}}, "config.yaml")["model"].get("size") == size
+    model = {"_target_": "nerf_lightning.model.VoxelField", "size": "auto"}
+    assert check_config({"model": model}, "config.yaml")["model"] == model
+
+
+def test_new_names_are_options(tmp_path: Path):
+    cfg = composed([], tmp_path)
+    assert all(value_at(cfg, new) is not None and value_at(cfg, old) is None for old, new in RENAMED.items())
