@@ -198,7 +198,7 @@ class Spoil(L.Callback):
             with torch.no_grad():
                 weights = next(pl_module.parameters())
                 weights.fill_(math.nan if self.how == "nan" else 0.0)
-                if self.how == "dead":  # a rectifier below zero everywhere
+                if self.how == "dead":  # a ReLU below zero everywhere
                     pl_module.field.density_head.weight.zero_()
                     pl_module.field.density_head.bias.fill_(-1.0)
 

@@ -21,12 +21,12 @@ def data_of(trainer: L.Trainer) -> RayDataModule | PixelDataModule:
 
 
 def agreed(trainer: L.Trainer, value: Value) -> Value:
-    """What the first of several processes says; clocks differ, and all must decide alike."""
+    """The first process's value in all processes of a run: clocks differ, and all must decide the same."""
     return trainer.strategy.broadcast(value) if trainer.world_size > 1 else value
 
 
 def picture_of(trainer: L.Trainer) -> Picture:
-    """What a 2D run is fitted to."""
+    """The picture of a 2D run."""
     scene = data_of(trainer).scene
     assert isinstance(scene, Picture)  # NeRF2D trains on nothing else
     return scene

@@ -17,9 +17,9 @@ from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.machine import Load
 
 LOOK_AT = 3
-"""Held-out views that are looked at for a plateau."""
+"""Held-out views rendered to look for a plateau."""
 COOLING = 0.15
-"""Share of what was spent up to the plateau that is spent on cooling down."""
+"""Cooling down after a plateau takes this share of what was spent up to it."""
 
 
 class Budget(L.Callback):
@@ -28,14 +28,14 @@ class Budget(L.Callback):
     Training time is the wall clock from the first step on, less what runs inside `paused()` (evaluation, pictures). With
     both limits, the first one reached ends the run.
 
-    With `patience` a few held-out views are rendered now and then, with the clock stopped. Where their quality has reached a
-    plateau, a field that still grows is taken to its full size; one that has it cools down in a short time: progress, and the
+    With `patience`, a few held-out views are rendered from time to time, with the clock stopped. When their quality reaches a
+    plateau, a field that is still growing jumps to its full size. One at full size cools down quickly: progress, and the
     learning rate with it, runs to the end.
 
     Args:
         steps: optimiser steps, or None.
         seconds: seconds of training, or None.
-        patience: dB that half as much time again must bring; None spends the whole budget.
+        patience: dB that 50 % more time must still gain; None spends the whole budget.
 
     Raises:
         InputError: where steps and seconds are None, or one of the three is not positive.
@@ -53,12 +53,12 @@ class Budget(L.Callback):
         self.stopped: dict[str, float] | None = None
         """The plateau that ends the run: its `seconds` and `step`, and `rest_db`, what the rest of the budget would add."""
         self._line = (0.0, 0.0, 1.0)
-        """Progress as a function of what was spent: it runs from here (spent, progress) with this slope."""
+        """Progress is a line over the share spent: (start, progress there, slope)."""
         self._before = 0.0  # spent up to the last pause or restart
         self._since: float | None = None
         self._device = CPU
         self.load = Load()
-        """What this process and others did while the clock ran."""
+        """CPU use of this process and of others while the clock ran."""
 
     @staticmethod
     def of(trainer: L.Trainer) -> "Budget":
@@ -81,14 +81,14 @@ class Budget(L.Callback):
         return max(done)
 
     def progress(self, step: int) -> float:
-        """Fraction of the training done after `step` steps, in [0, 1]: that of the limits spent, until a plateau is found."""
+        """Share of the training done after `step` steps, in [0, 1]: that of the limits spent, until there is a plateau."""
         spent = self.spent(step)
         start, reached, slope = self._line
         return min(1.0, max(spent, reached + slope * (spent - start)))
 
     def drawing_seconds(self, step: int) -> float:
-        """Seconds that pictures and measurements may take where nobody asks for more: as long as training, as far as can be
-        told after `step` steps, and at least half a minute."""
+        """Seconds that pictures and measurements may take by default: as long as training is expected to take, judged after
+        `step` steps, and at least half a minute."""
         return max(30.0, self.seconds / max(self.progress(step), 1e-3))
 
     @contextmanager
@@ -108,7 +108,7 @@ class Budget(L.Callback):
         self._since = time.perf_counter()
 
     def _stop(self) -> None:
-        synchronize(self._device)  # what was given to it is training too
+        synchronize(self._device)  # work still queued on the device counts as training
         self._before, self._since = self.seconds, None
         self.load.stop()
 
@@ -119,7 +119,9 @@ class Budget(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._device, pl_module.paused = pl_module.device, self.paused
-        trainer.should_stop = self.shared_progress(trainer) >= 1.0  # a finished run resumed has nothing left
+        trainer.should_stop = (
+            self.shared_progress(trainer) >= 1.0
+        )  # a finished run that is resumed has nothing left to do
         self._start()
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:

@@ -18,7 +18,7 @@ from nerf_lightning.utils.files import atomic
 
 
 class Checkpoints(L.Callback):
-    """Keeps `last.ckpt` and `best.ckpt` in a folder. Each is renamed into place whole, so a kill leaves the one before.
+    """Keeps `last.ckpt` and `best.ckpt` in a folder. Each is written whole, then renamed: a killed run keeps the one before.
 
     Args:
         folder: where they go, below the run folder.
@@ -35,14 +35,14 @@ class Checkpoints(L.Callback):
         self.every_seconds = every_seconds
         self.best: float | None = None
         self._saved = 0.0
-        self._judged = 0  # measurements looked at
+        self._judged = 0  # measurements compared so far
         self._tested: list[float] = []
 
     def save(self, trainer: L.Trainer, name: str) -> None:
         path = Path(trainer.default_root_dir) / self.folder / name
         with Budget.of(trainer).paused():
             if not trainer.is_global_zero:
-                trainer.save_checkpoint(path)  # writes nothing here, but the first process waits for all
+                trainer.save_checkpoint(path)  # writes nothing here, but the first process waits for the others
                 return
             with atomic(path) as temporary:
                 trainer.save_checkpoint(temporary)
@@ -77,7 +77,7 @@ class Checkpoints(L.Callback):
         self._tested.append(outputs["psnr"])
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        """The final state is a candidate too, judged on the views that the earlier ones were judged on."""
+        """The final state competes for `best.ckpt` too, on the same views as the earlier ones."""
         if not trainer.is_global_zero:
             return
         folder = Path(trainer.default_root_dir) / self.folder

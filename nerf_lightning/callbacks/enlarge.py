@@ -18,11 +18,11 @@ from nerf_lightning.utils.files import write_json
 class Enlarge(L.Callback):
     """Renders a 2D field at another scale after the test: enlarged.png alone, enlarged_panel.png beside bicubic.
 
-    Where the picture was shrunk for training (`dataset.max_side`), or is the built-in one, the true larger picture is known
-    and both are judged by it: printed, and in enlarged.json.
+    If the picture was shrunk for training (`dataset.max_side`) or is the built-in one, the true larger picture is known, and
+    both are compared with it: printed, and in enlarged.json.
 
     Args:
-        scale: times the picture's width and height; None makes nothing.
+        scale: factor on width and height; None does nothing.
 
     Raises:
         InputError: where scale is not above 0, or makes a picture beyond 2^28 pixels.

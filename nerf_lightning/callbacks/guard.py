@@ -1,4 +1,4 @@
-"""Guard: notices that training has broken down, says why, and sets it going again."""
+"""Guard: notices when training has broken down, says why, and restarts it."""
 
 import copy
 import math
@@ -20,16 +20,16 @@ from nerf_lightning.utils.options import AtLeast, Count
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 LOWER, MUCH_LOWER = 0.3, 0.2
-"""Factors on the learning rate where it is what is to blame: after something was learned, and where nothing was."""
+"""Factors on the learning rate when it is the cause: after something was learned, and when nothing was."""
 WARM = 100
-"""Steps in which the rate comes back after a new start, where it was to blame ..."""
+"""Steps of warm-up after a restart because of the rate ..."""
 COOL = 0.1
-"""... and what it has fallen to at the end besides: nobody knows how much lower it ought to be."""
+"""... and the extra factor it decays to by the end, as nobody knows how much lower it should be."""
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """One time that training was set going again, for results.json."""
+    """One restart of training, for results.json."""
 
     step: int
     seconds: float
@@ -38,27 +38,27 @@ class Recovery:
 
 
 def plain_error(data: RayDataModule | PixelDataModule, system: System) -> float:
-    """The squared error of the best single colour on training pixels: what a field that shows nothing reaches."""
+    """Mean squared error of the best single colour on training pixels: what a field that shows nothing reaches."""
     truth = system.truth(data.some_pixels().to(system.device))
     return float((truth - truth.mean(0)).square().mean())
 
 
 class Guard(L.Callback):
-    """Watches the loss, the density and the gradients, and acts where they say that nothing more will be learned.
+    """Watches the loss, the density and the gradients, and acts when nothing more will be learned.
 
-    What it notices: a loss or weights that are no longer finite; a loss that rose, and stays there; a loss that stays at that
-    of one plain colour, told apart by whether there is no density, density everywhere, or no gradient (see `Watch`); before
-    the first step, a learning rate that the field is known not to stand, which it lowers. What else it does: back to the last
-    good weights with a lower rate; or, where there was nothing good yet, a new start with fresh weights, with softplus in
-    place of a rectifier that can die, else with a lower rate. Each time is printed and stands in results.json.
+    It notices a loss or weights that are no longer finite; a loss that rose and stays high; a loss stuck at that of one plain
+    colour, because there is no density, density everywhere, or no gradient (see `Watch`). It then goes back to the last good
+    weights with a lower learning rate. If there are none yet, it starts again with fresh weights, and with softplus in place of
+    a ReLU that can die, or else a lower rate. Before the first step it lowers a rate that is known to be too high for the
+    field. Each action is printed and listed in results.json.
 
-    It looks at weights and gradients only now and then, and at gradients only until the field has begun to learn. Of several
-    processes none acts alone: there it does nothing.
+    Weights and gradients are checked only every few steps, and gradients only until the field has begun to learn. With several
+    processes it does nothing.
 
     Args:
-        attempts: how often it acts; 0 leaves training alone.
+        attempts: most times that it acts; 0 turns it off.
         every: steps between looks.
-        patience: steps in which the loss must fall below that of a plain colour, or at least fall.
+        patience: steps within which the loss must fall below that of a plain colour, or at least fall.
         keep_every: steps between copies of good weights.
     """
 
@@ -75,17 +75,17 @@ class Guard(L.Callback):
         self.recoveries: list[Recovery] = []
         self.rate = 1.0
         self.began_at = 0.0
-        """Progress at the last new start."""
+        """Progress at the last restart."""
         self.softened = False
         self._given_up = False
         self._finite = True
-        """Whether all losses so far were numbers."""
+        """Whether all losses so far were finite."""
         self._unread: list[Tensor] = []
-        """Losses since the last look: reading one makes the host wait for the device."""
+        """Losses since the last look: reading one means waiting for the device."""
         self._start: dict[str, Tensor] = {}
         self._good: dict[str, Tensor] = {}
 
-    # What Lightning calls
+    # Lightning's hooks
 
     def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
         if stage == "fit" and self.attempts:
@@ -95,7 +95,7 @@ class Guard(L.Callback):
         with Budget.of(trainer).paused():
             self.watch.plain = plain_error(data_of(trainer), pl_module)
         if self.attempts and self.watch.learning and not self.watch.risen and finite(pl_module.parameters()):
-            self._good = copied(pl_module)  # of a run that is resumed
+            self._good = copied(pl_module)  # of a resumed run
         if isinstance(pl_module, NeRF3D):
             if self.watch.began:
                 pl_module.sampler.restart(self.watch.began)
@@ -141,7 +141,7 @@ class Guard(L.Callback):
         self._read()
 
     def _read(self) -> None:
-        """Takes in the losses since the last look, all at once."""
+        """Reads the losses since the last look, all at once."""
         errors = torch.stack(self._unread).tolist() if self._unread else []
         self._unread = []
         for error in errors:
@@ -169,7 +169,7 @@ class Guard(L.Callback):
         self._given_up = state_dict["given_up"]
         self._finite = state_dict.get("finite", True)  # older checkpoints lack it
 
-    # What it does
+    # Actions
 
     def _recover(self, trainer: L.Trainer, system: System, found: Breakdown) -> None:
         step = trainer.global_step
@@ -196,16 +196,16 @@ class Guard(L.Callback):
         print(f"guard: step {step}: {cause}; {action}", flush=True)
 
     def _slow_down(self, trainer: L.Trainer, system: NeRF3D) -> None:
-        """Before the first step, where the rate is one at which the field is known to come apart."""
+        """Before the first step: lowers a rate that is known to be too high for the field."""
         optimizer = trainer.optimizers[0]
         asked, fastest = optimizer.param_groups[0]["initial_lr"], system.field.fastest
         if isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW) and asked > fastest:
             self.rate = fastest / asked
-            cause = f"a learning rate of {asked:.3g} is more than this field stands ({fastest:.3g})"
+            cause = f"a learning rate of {asked:.3g} is too high for this field, which trains at up to {fastest:.3g}"
             self._record(trainer, cause, f"{self.rate:.2g} times the learning rate")
 
     def _start_again(self, system: System, step: int, apart: bool) -> str:
-        """Fresh weights, and something else besides, as the same again would come to the same end."""
+        """Fresh weights, and one other change: the same again would fail again."""
         system.load_state_dict(self._start)
         fresh = copy.deepcopy(
             system.field
@@ -214,18 +214,18 @@ class Guard(L.Callback):
             torch.manual_seed(int(step_generator(system.seed, Stream.RESTART, step).initial_seed() & 0xFFFFFFFF))
             started_anew(fresh)
         system.field.load_state_dict(fresh.state_dict())
-        system.on_fit_start()  # what a sampler finds out about the scene is part of a start
+        system.on_fit_start()  # the sampler learns about the scene at the start
         if isinstance(system, NeRF3D):
             system.sampler.restart(step)
-        rectifiers = [module for module in system.modules() if isinstance(module, Rectifier)]
-        if rectifiers and not self.softened and not apart:
+        relus = [module for module in system.modules() if isinstance(module, Rectifier)]
+        if relus and not self.softened and not apart:
             self.softened = True
-            action = "started again with softplus in place of the rectifier that makes the density"
+            action = "started again with softplus in place of the ReLU that makes the density"
         else:
             self.rate *= LOWER if apart else MUCH_LOWER
             action = f"started again with {self.rate:.2g} times the learning rate"
         if self.softened:
-            for one in rectifiers:
+            for one in relus:
                 one.soften()
         return action
 
@@ -236,7 +236,7 @@ def copied(module: torch.nn.Module) -> dict[str, Tensor]:
 
 
 def started_anew(module: torch.nn.Module) -> None:
-    """Draws weights again, layers first: a field may have a start of its own for them."""
+    """Draws weights again, layers first: a field may initialise some of them itself."""
     for part in reversed(list(module.modules())):
         reset = getattr(part, "reset_parameters", None)
         if reset is not None:
@@ -244,12 +244,12 @@ def started_anew(module: torch.nn.Module) -> None:
 
 
 def finite(parameters: Iterable[torch.nn.Parameter]) -> bool:
-    """Whether all weights are numbers; a sum shows any that is not, and all together cost one reading."""
+    """Whether all weights are finite. A sum shows any that is not, so one value is read for all."""
     return bool(torch.stack([parameter.detach().sum() for parameter in parameters]).isfinite().all())
 
 
 def forget(trainer: L.Trainer) -> None:
-    """Empties what optimisers remember of gradients."""
+    """Clears the optimisers' state."""
     for optimizer in trainer.optimizers:
         optimizer.state.clear()
         optimizer.zero_grad()

@@ -19,8 +19,8 @@ class HeldOut(L.Callback):
 
     Args:
         at: fractions of the budget, ascending, in (0, 1).
-        views: how many held-out views, evenly chosen. None takes all, or fewer where all measurements would take longer than
-            training, and longer than half a minute. The last point is of all views in any case.
+        views: how many held-out views, evenly chosen. None takes all, or fewer if measuring them would take longer than
+            training and longer than half a minute. The last point always uses all views.
 
     Raises:
         InputError: for fractions outside (0, 1) or less than one view.
@@ -34,7 +34,7 @@ class HeldOut(L.Callback):
         self.at = list(at)
         self.views = views
         self.curve: list[list[float]] = []
-        """[training seconds, step, PSNR], one row a measurement."""
+        """[training seconds, step, PSNR], a row for each measurement."""
         self.view_seconds: float | None = None
         """Rendering time of a view at the last measurement."""
 
@@ -72,7 +72,7 @@ class HeldOut(L.Callback):
             return
         with Budget.of(trainer).paused():
             data = data_of(trainer)
-            if self.views is None and self.view_seconds is None:  # nobody knows yet how many views there is time for
+            if self.views is None and self.view_seconds is None:  # not yet known: how many views there is time for
                 self.view_seconds = next(pl_module.evaluate_held_out(data, [0])).seconds
             chosen = evenly(data.held_out_views, self.count(trainer))
             if self.views is None and len(chosen) < data.held_out_views and not self.curve:
@@ -81,7 +81,7 @@ class HeldOut(L.Callback):
                     f"{self.view_seconds:.1f} s; callbacks.heldout.views={data.held_out_views} takes all"
                 )
             results = list(pl_module.evaluate_held_out(data, chosen))
-            while len(self.curve) < due:  # a step may pass several marks at once: one measurement serves them all
+            while len(self.curve) < due:  # one step may pass several marks: one measurement counts for all
                 self.record(trainer, results)
 
     def state_dict(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from nerf_lightning.view.field_page import FieldPage
 
 SAVED = 0.2
-"""Seconds of painting that may be saved up while nobody wants a picture."""
+"""Most seconds of drawing that can be saved up while nobody is looking."""
 ONE = 0.06
 """Seconds that one picture may take."""
 
@@ -24,18 +24,18 @@ ONE = 0.06
 class Live(L.Callback):
     """Serves a page that shows the field between training steps, with the training clock stopped.
 
-    It paints only while somebody looks, and no more than a share of the time.
+    It draws only while somebody is looking, and for at most a share of the time.
 
     Args:
         host: address to listen on; 0.0.0.0 shares the page with the network.
-        port: the next free one is taken where it is taken; 0 for any.
-        share: of the time that painting may take, above 0 and below 1.
+        port: the next free one if it is in use; 0 for any.
+        share: of the time that drawing may take, above 0 and below 1.
         photo_side: longest side of the photos on the frusta, pixels.
         side: pixels along the longer side of the finest picture.
 
     Raises:
-        InputError: for another share; at the start of training where it is a picture's, Viser is not installed, or there is no
-            such address.
+        InputError: for any other share; at the start of training, if it is a picture's, Viser is not installed, or the
+            address does not exist.
     """
 
     def __init__(

@@ -20,7 +20,7 @@ from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic
 
 MOST, FEWEST, SMALLEST = 60, 12, 0.25
-"""Frames of an orbit where nobody says how many, and how small they may become."""
+"""By default: most and fewest frames of an orbit, and the smallest factor on their size."""
 
 
 class Orbit(L.Callback):
@@ -28,8 +28,8 @@ class Orbit(L.Callback):
 
     Args:
         path: the GIF, below the run folder.
-        frames: how many of the orbit's views, evenly chosen; 0 makes no GIF. None takes 60, or fewer and smaller ones where
-            drawing them would take longer than training has, and longer than half a minute.
+        frames: how many of the orbit's views, evenly chosen; 0 makes no GIF. None takes 60, or fewer and smaller ones if
+            drawing them would take longer than training took and longer than half a minute.
         fps: frames a second.
 
     Raises:
@@ -84,11 +84,11 @@ class Orbit(L.Callback):
 
 
 def affordable(frames: int, seconds: float, allowed: float) -> tuple[int, float]:
-    """How many frames to draw, and by what factor smaller, so that all take no longer than allowed.
+    """How many frames to draw, and the factor on their size, so that all fit into the time allowed.
 
     Args:
-        frames: at most so many.
-        seconds: that one takes at its full size; they go with its pixels.
+        frames: at most this many.
+        seconds: for one at full size; proportional to its pixels.
         allowed: seconds for all of them.
     """
     count = min(frames, max(int(allowed / seconds), FEWEST))

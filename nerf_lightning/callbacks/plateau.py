@@ -1,4 +1,4 @@
-"""Plateau: when more training is no longer worth its time, told from held-out quality against what was spent."""
+"""Plateau: when more training is no longer worth its time, judged by the held-out quality over time."""
 
 import math
 from typing import Any
@@ -6,21 +6,21 @@ from typing import Any
 import numpy as np
 
 SPACING = 1.15
-"""Factor between what was spent at one measurement and the next."""
+"""Each measurement comes when this factor more has been spent than at the one before."""
 FIRST = 0.01
-"""Fraction of the budget spent at the first one."""
+"""Share of the budget spent at the first measurement."""
 LOOK_BACK = 2.0
-"""The trend is that of the measurements since this factor less was spent ..."""
+"""The trend is taken over the measurements since this factor less was spent ..."""
 FEWEST = 4
-"""... at least so many."""
+"""... if there are at least this many."""
 HALF_AGAIN = 1.5
 
 
 class Plateau:
-    """Held-out quality grows with the logarithm of time, ever more slowly: its slope says what more time would bring.
+    """Held-out quality grows roughly with the logarithm of time: the slope says what more time would gain.
 
     Args:
-        patience: dB that half as much time again must bring.
+        patience: dB that 50 % more time must still gain.
     """
 
     def __init__(self, patience: float):
@@ -28,17 +28,17 @@ class Plateau:
         self.points: list[tuple[float, float]] = []
         """(fraction of the budget spent, dB)."""
         self.flat = 0
-        """Measurements in a row by which half as much time again would not be worth it."""
+        """Measurements in a row after which 50 % more time would not be worth it."""
 
     def due(self, spent: float) -> bool:
         """Whether it is time for another measurement."""
         return spent >= (self.points[-1][0] * SPACING if self.points else FIRST)
 
     def note(self, spent: float, quality: float) -> bool:
-        """Takes in a measurement.
+        """Adds a measurement.
 
         Returns:
-            Whether a plateau is reached: two measurements in a row say so, as one may be chance.
+            Whether there is a plateau: two measurements in a row say so, as one may be luck.
         """
         self.points.append((spent, quality))
         gain = self.gain(HALF_AGAIN)
@@ -46,7 +46,7 @@ class Plateau:
         return self.flat >= 2
 
     def gain(self, factor: float) -> float | None:
-        """dB that `factor` times what was spent would add, by the present trend; None where too little was measured."""
+        """dB that `factor` times the time spent would gain by the present trend; None with too few measurements."""
         last = self.points[-1][0] if self.points else 0.0
         recent = [point for point in self.points if point[0] * LOOK_BACK >= last]
         if len(recent) < FEWEST:
@@ -55,7 +55,7 @@ class Plateau:
         return float(np.polyfit(np.log(spent), quality, 1)[0]) * math.log(factor)
 
     def start(self) -> None:
-        """Forgets the trend: training has entered another stage."""
+        """Forgets the trend, as training enters another stage."""
         self.points = self.points[-1:]
         self.flat = 0
 
@@ -64,6 +64,6 @@ class Plateau:
         return {"points": [list(point) for point in self.points], "flat": self.flat}
 
     def load(self, state: dict[str, Any]) -> None:
-        """Takes up what `state` gave."""
+        """Restores what `state` returned."""
         self.points = [(spent, quality) for spent, quality in state["points"]]
         self.flat = state["flat"]

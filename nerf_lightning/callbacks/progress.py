@@ -22,13 +22,13 @@ def clock(seconds: float) -> str:
 
 
 class Progress(L.Callback):
-    """Shows how far the run is. On a terminal it is a bar; elsewhere a line now and then.
+    """Shows how far the run is: a bar on a terminal, elsewhere a line from time to time.
 
-    The time left counts what the budget still allows, and the rendering that is still to come (measurements, test, orbit) at
-    the speed of the last view rendered.
+    The time left is the rest of the budget plus the rendering still to come (measurements, test, orbit), at the speed of the
+    last view rendered.
 
     Args:
-        every_seconds: between lines where there is no terminal.
+        every_seconds: between lines, when there is no terminal.
     """
 
     def __init__(self, every_seconds: float = 15):
@@ -37,7 +37,7 @@ class Progress(L.Callback):
         self.bar: RichProgress | None = None
         self.task: TaskID | None = None
         self.later_views = 0
-        """Views that will be rendered after the test; who renders them adds them in its `setup`."""
+        """Views rendered after the test; the callback that renders them adds them in its `setup`."""
         self._shown = 0.0
         self._start = (0.0, 0)  # seconds and steps when this process began to train
         self._recent = 0.0  # seconds at the last display, and rays since
@@ -78,7 +78,7 @@ class Progress(L.Callback):
         return "  ".join(parts)
 
     def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
-        self.console.quiet = not trainer.is_global_zero  # of several processes, one speaks
+        self.console.quiet = not trainer.is_global_zero  # only the first of several processes prints
 
     def open(self, name: str) -> None:
         if self.bar is None and self.console.is_terminal and not self.console.quiet:

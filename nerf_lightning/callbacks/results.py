@@ -30,19 +30,19 @@ except ImportError:  # Windows has no such module; peak memory is then not repor
     resource = None  # type: ignore[assignment]
 
 NO_BETTER = 1.0
-"""dB above a picture of one colour below which a run has learned nothing ..."""
+"""A run has learned nothing if it is less than this many dB better than one plain colour ..."""
 SEEN_AS_EQUAL = 40.0
-"""... unless it reaches so many dB, as where one colour is all there is to learn."""
+"""... unless it reaches this many dB: then one colour may be all there is to learn."""
 WIDE_GAP = 8.0
-"""dB from training pixels down to held-out views beyond which a field has learned its photos rather than the scene ..."""
+"""A field has learned its photos rather than the scene if held-out views are this many dB worse than training pixels ..."""
 GOOD = 30.0
-"""... unless what is held out reaches so many dB: then there is little to mend."""
+"""... unless they reach this many dB: then there is little to improve."""
 
 
 def peak_memory_bytes(device: torch.device) -> int | None:
     """The most memory this process has held so far; None if unknown.
 
-    On CUDA, the most its tensors held on the device; on MPS, which keeps no such count, what its driver holds for it now.
+    On CUDA, the peak of its tensors on the device; on MPS, which keeps no such count, what its driver holds now.
     """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
@@ -55,7 +55,7 @@ def peak_memory_bytes(device: torch.device) -> int | None:
 
 
 def gap(trainer: L.Trainer, system: System, quality: float) -> str:
-    """What a held-out PSNR far below that of the training pixels means; "" where it is not, not known, or of a picture."""
+    """Explains a held-out PSNR far below that of the training pixels; "" if it is not, is unknown, or for a picture."""
     if isinstance(system, NeRF2D):
         return ""
     guard = attached(trainer, Guard)
@@ -72,7 +72,7 @@ def gap(trainer: L.Trainer, system: System, quality: float) -> str:
 
 
 def wild_between(trainer: L.Trainer, system: System, nothing: float) -> str:
-    """What it means where a 2D field shows no more than `nothing` (dB) between its pixels; "" where it shows them too."""
+    """Explains a 2D field that is below `nothing` (dB) between its pixels; "" if it is not."""
     if not isinstance(system, NeRF2D):
         return ""
     view = data_of(trainer).held_out(0).to(system.device)
@@ -126,12 +126,8 @@ class Results(L.Callback):
             diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
             self.write(trainer, pl_module, "collapsed", f"{diagnosis}: {found}" if found else diagnosis)
         else:
-            self.write(
-                trainer,
-                pl_module,
-                stopped,
-                gap(trainer, pl_module, quality) or wild_between(trainer, pl_module, nothing),
-            )
+            diagnosis = gap(trainer, pl_module, quality) or wild_between(trainer, pl_module, nothing)
+            self.write(trainer, pl_module, stopped, diagnosis)
         if trainer.logger is not None:
             scores = {"test/psnr": quality, "test/ssim": self.summary["ssim"] or 0.0}
             trainer.logger.log_metrics(scores, trainer.global_step)
@@ -143,7 +139,7 @@ class Results(L.Callback):
             self.write(trainer, pl_module, "failed", " ".join(f"{type(exception).__name__}: {exception}".split()))
 
     def write(self, trainer: L.Trainer, pl_module: System, status: str, diagnosis: str) -> None:
-        """Writes the file with what is known by now; measures not taken are null."""
+        """Writes the file with what is known so far; what was not measured is null."""
         scene, budget = data_of(trainer).scene, Budget.of(trainer)
         throughput, held_out = attached(trainer, Throughput), attached(trainer, HeldOut)
         guard = attached(trainer, Guard)
@@ -165,9 +161,8 @@ class Results(L.Callback):
             "device": str(pl_module.device),
             "threads": torch.get_num_threads(),
             "machine": describe_machine(pl_module.device),
-            "load": budget.load.cores()
-            if trainer.world_size == 1
-            else None,  # of several processes each is one of the others
+            # Several processes would count each other as other work.
+            "load": budget.load.cores() if trainer.world_size == 1 else None,
             "versions": {
                 "python": platform.python_version(),
                 "torch": torch.__version__,

@@ -12,7 +12,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 
 LOGGED_WIDTH = 640
-"""Most pixels across in TensorBoard, which takes a tenth of a second a megabyte."""
+"""Widest picture for TensorBoard, in pixels: it takes 0.1 s for each megabyte."""
 
 
 def log_spaced(step: int) -> bool:
@@ -24,7 +24,7 @@ def log_spaced(step: int) -> bool:
 class Snapshots(L.Callback):
     """Writes truth, render and depth of one held-out view as PNG and to TensorBoard, and once more at the end.
 
-    The latest render alone stands in `final`.
+    `final` is the latest render alone.
 
     Args:
         folder: where the PNGs go, below the run folder.
@@ -33,7 +33,7 @@ class Snapshots(L.Callback):
         final: the latest render, below the run folder.
 
     Raises:
-        InputError: at the start of training, where there is no such view.
+        InputError: at the start of training, if there is no such view.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Snapshots(L.Callback):
                 trainer.logger.experiment.add_image(
                     "snapshot", narrowed(picture, LOGGED_WIDTH), step, dataformats="HWC"
                 )
-                trainer.logger.experiment.flush()  # in the pause: TensorBoard's own thread would take its time from training
+                trainer.logger.experiment.flush()  # while paused: TensorBoard's thread would take time from training
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int

@@ -1,4 +1,4 @@
-"""Watch: tells from losses, gradients and opacities whether training goes on, is stuck, or comes apart."""
+"""Watch: judges from losses, gradients and opacities whether training works, is stuck, or diverges."""
 
 import math
 from dataclasses import dataclass
@@ -6,17 +6,17 @@ from itertools import pairwise
 from typing import Any
 
 MEMORY = 0.96
-"""Of the running mean of the loss, a step: it looks back about 25 steps."""
+"""Decay of the running mean of the loss: it looks back about 25 steps."""
 AS_PLAIN = 0.85
-"""Share of the error of one plain colour above which a field has not learned the scene."""
+"""A field whose error is above this share of that of one plain colour has not learned the scene."""
 STANDING, HARDLY_FALLING = 0.98, 0.9
-"""Shares of the error some steps ago above which it has not fallen since: below that of a plain colour, and above it."""
+"""An error above this share of what it was some steps ago has not fallen: below that of a plain colour, and above it."""
 RISEN, WORSE = 4.0, 1.1
-"""Times the lowest error seen, above which training is coming apart; and above which it must not stay ..."""
+"""Training diverges when the error is above the first times its lowest, or stays above the second ..."""
 HALF_LEARNED = 0.3
-"""... while the error is more than this share of that of one plain colour."""
+"""... while it is more than this share of that of one plain colour."""
 EMPTY, FULL = 1e-3, 0.999
-"""Mean opacity of rays below which there is no density, and above which there is nothing but density."""
+"""Mean opacity of rays: below the first there is no density, above the second there is density everywhere."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Breakdown:
 
     cause: str
     apart: bool
-    """Whether it moves too fast to keep what it learns; otherwise it does not move at all."""
+    """Whether training diverges; otherwise it is stuck."""
 
 
 class Watch:
@@ -33,7 +33,7 @@ class Watch:
 
     Args:
         every: steps between looks.
-        patience: steps in which the loss must fall below that of a plain colour, or at least fall.
+        patience: steps within which the loss must fall below that of a plain colour, or at least fall.
         plain: the loss of one plain colour.
     """
 
@@ -44,13 +44,13 @@ class Watch:
         self.start(0)
 
     def start(self, step: int | None = None) -> None:
-        """Forgets what it saw; with a step, training has started anew there."""
+        """Forgets everything; with a step, training has started again there."""
         if step is not None:
             self.began = step
         self.level: float | None = None
         """The loss, averaged over the last steps."""
         self.earlier: list[float] = []
-        """The same at the looks of the last `patience` steps."""
+        """The same, at the looks within the last `patience` steps."""
         self.lowest = math.inf
         self.risen = 0
         """Looks in a row at which the loss was far above its lowest."""
@@ -62,12 +62,12 @@ class Watch:
         return {key: getattr(self, key) for key in ("began", "level", "earlier", "lowest", "risen", "dead")}
 
     def load(self, state: dict[str, Any]) -> None:
-        """Takes up what `state` gave."""
+        """Restores what `state` returned."""
         for key in self.state():
             setattr(self, key, state[key])
 
     def due(self, step: int) -> bool:
-        """Whether there is a look at a step."""
+        """Whether to look at this step."""
         return step % self.every == 0
 
     @property
@@ -76,15 +76,15 @@ class Watch:
         return self.level is not None and self.level < AS_PLAIN * self.plain
 
     def note(self, error: float) -> None:
-        """Takes in a step's squared error."""
+        """Adds a step's squared error."""
         self.level = error if self.level is None else MEMORY * self.level + (1 - MEMORY) * error
 
     def note_gradient(self, alive: bool) -> None:
-        """Takes in whether any gradient came back, at a look before the field has begun to learn."""
+        """Adds whether any gradient came back, at a look before the field has begun to learn."""
         self.dead = 0 if alive else self.dead + 1
 
     def look(self, step: int, opacity: float | None) -> Breakdown | None:
-        """Judges training at a step; None where it may go on.
+        """Judges training at a step; None if it may go on.
 
         Args:
             step: since the run began.
@@ -102,27 +102,28 @@ class Watch:
         return None
 
     def _waited(self, step: int) -> bool:
-        """Whether there were looks enough to judge by."""
+        """Whether there have been enough looks to judge by."""
         return step - self.began >= self.patience and len(self.earlier) > self.patience // self.every
 
     def _coming_apart(self, step: int, level: float) -> str:
-        """How what was learned is being lost; "" where it is not."""
+        """How what was learned is being lost; "" if it is not."""
         risen = self.lowest < AS_PLAIN * self.plain and level > RISEN * self.lowest
-        # A spike that passes is none of its business.
+        # A short spike does not matter.
         stays = bool(self.earlier) and level > STANDING * self.earlier[-1]
         self.risen = self.risen + 1 if risen and stays else 0
         if self.risen >= 3:
             return f"the loss rose to {level / self.lowest:.0f} times its lowest"
         least = min([*self.earlier[1:], level])
         if self._waited(step) and least > max(WORSE * self.lowest, HALF_LEARNED * self.plain):
-            return f"the loss fell to {self.lowest / self.plain:.2f} times that of one plain colour, and stays above that since"
+            lowest = self.lowest / self.plain
+            return f"the loss fell to {lowest:.2f} times that of one plain colour, and has stayed above that since"
         return ""
 
     def _stuck(self, step: int, level: float, opacity: float | None) -> str:
-        """Why nothing is being learned; "" where something is, or was only just begun."""
+        """Why nothing is being learned; "" if something is, or training has only just begun."""
         if self.learning or not self.plain:
             return ""  # a scene of one colour is learned as soon as its colour is
-        if self.dead < 2:  # without a gradient there is nothing to wait for
+        if self.dead < 2:  # without a gradient, waiting does not help
             if not self._waited(step):
                 return ""
             falling = all(after < before for before, after in pairwise([*self.earlier, level]))

@@ -10,15 +10,15 @@ from nerf_lightning.sampler import Samples
 
 
 def distortion_loss(density: Float[Tensor, "N"], samples: Samples, scale: float) -> Float[Tensor, ""]:
-    """Mean over rays of sum_ij w_i w_j |s_i - s_j| + sum_i w_i^2 d_i / 3: how far apart a ray's weights lie.
+    """Mean over rays of sum_ij w_i w_j |s_i - s_j| + sum_i w_i^2 d_i / 3: how far a ray's weights are spread.
 
-    Barron et al. 2022, "Mip-NeRF 360", eq. 15; in linear time, since samples are sorted along their ray. Distances are told
-    as s = t / (t + scale), so that what is far away does not outweigh the rest.
+    Barron et al. 2022, "Mip-NeRF 360", eq. 15; in linear time, since samples are sorted along their ray. Distances are
+    mapped to s = t / (t + scale), so that far content does not dominate.
 
     Args:
         density: of the samples, 1 / world unit.
         samples: along R rays.
-        scale: distance that counts as half way, world units.
+        scale: distance that maps to 0.5, world units.
     """
     if not len(samples):
         return density.sum()

@@ -1,7 +1,7 @@
-"""torch.compile for what has a fixed structure in a training step: fields and the renderer, not the samplers.
+"""torch.compile for the parts of a training step with a fixed structure: fields and the renderer, not the samplers.
 
-What is compiled belongs to no module: copies, checkpoints and pickles stay as they are, and what was compiled for a copy serves
-the original.
+Compiled code belongs to no module: copies, checkpoints and pickles stay as they are, and code compiled for a copy serves the
+original.
 """
 
 import functools
@@ -19,14 +19,14 @@ from nerf_lightning.kernels.constants import KEPT
 BACKEND = "inductor"
 """What a run compiles with."""
 VARIANTS = 64
-"""How often a part is compiled anew, for sizes that a field grows through; beyond that it runs uncompiled."""
+"""Most times that a part is compiled again for another size of a growing field; after that it runs uncompiled."""
 
 
 @functools.cache
 def _prepare() -> None:
-    """What kernels keep for a device are constants rather than something to compile."""
+    """Tells the compiler that what kernels cache for a device is constant."""
     torch._dynamo.config.recompile_limit = VARIANTS
-    # Of just these functions, and of what one part hands to the next.
+    # About just these functions, and about tensors passed from one part to the next.
     for message in (".*`functools.lru_cache`-wrapped function.*", ".*a Tensor that is not a leaf Tensor.*"):
         warnings.filterwarnings("ignore", message)
     for kept in KEPT:
@@ -34,10 +34,10 @@ def _prepare() -> None:
 
 
 def _constant(kept: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function, as one whose results are constants: parameters have a fixed size, where other tensors have any."""
+    """The same function with constant results. They are parameters, as the compiler takes those to have a fixed size."""
 
     @torch._dynamo.assume_constant_result
-    def boxed(*given: Any) -> list[Any]:  # in a list, as one graph takes no two single tensors under the same name
+    def boxed(*given: Any) -> list[Any]:  # in a list: one graph cannot take two single tensors of the same name
         return [tree_map_only(torch.Tensor, lambda x: torch.nn.Parameter(x.clone(), requires_grad=False), kept(*given))]
 
     def made(*given: Any) -> Any:
@@ -47,7 +47,7 @@ def _constant(kept: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _settled(given: Any) -> Any:
-    """What is given to a compiled part, always of one kind: views of other tensors would have it compiled anew."""
+    """An argument of a compiled part in a standard form: a view of another tensor would be compiled again."""
     if isinstance(given, torch.Tensor):
         return given.contiguous() if given._base is None else given.clone(memory_format=torch.contiguous_format)
     if isinstance(given, InBounds):
@@ -68,17 +68,17 @@ def _compiled(function: Callable[..., Any], backend: str) -> Callable[..., Any]:
 
 
 def part(method: Any, backend: str | None) -> Callable[..., Any]:
-    """A module's bound method: compiled where there is a backend, taking arguments in their order alone; else as it is."""
+    """A module's bound method: compiled if there is a backend (positional arguments only), else unchanged."""
     if backend is None:
         return method
     return functools.partial(_compiled(method.__func__, backend), method.__self__)
 
 
 def check_compiler(device: torch.device, backend: str) -> None:
-    """Compiles next to nothing, to see whether that can be done.
+    """Compiles a tiny function, to see whether compiling works.
 
     Raises:
-        InputError: where it cannot: mostly there is no C++ compiler, or for CUDA no Triton.
+        InputError: if it does not, mostly for want of a C++ compiler, or of Triton for CUDA.
     """
 
     def double(x: torch.Tensor) -> torch.Tensor:
@@ -86,7 +86,7 @@ def check_compiler(device: torch.device, backend: str) -> None:
 
     try:
         with warnings.catch_warnings(), torch._inductor.config.patch(force_disable_caches=True):
-            warnings.simplefilter("ignore")  # of what is missing without caches
+            warnings.simplefilter("ignore")  # about missing caches
             torch.compile(double, backend=backend)(torch.ones(3, device=device))
     except RuntimeError as error:
         needed = "a C++ compiler" if device.type == "cpu" else f"what torch.compile needs for {device.type}"

@@ -22,11 +22,11 @@ def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> floa
 SSIM_WINDOW = 11
 """Pixels along a side of the window that torchmetrics uses with its default Gaussian of 1.5 pixels."""
 SSIM_ROWS = 32
-"""Rows judged together: the library takes a kilobyte a pixel."""
+"""Rows compared at once: the library needs a kilobyte for each pixel."""
 
 
 def ssim(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
-    """Structural similarity (Wang et al. 2004) of pictures in [0, 1]; nan where they are smaller than its window."""
+    """Structural similarity (Wang et al. 2004) of pictures in [0, 1]; nan if they are smaller than its window."""
     height, width, _ = image.shape
     if min(height, width) < SSIM_WINDOW:
         return math.nan

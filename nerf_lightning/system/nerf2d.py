@@ -11,11 +11,11 @@ from nerf_lightning.system.metrics import psnr
 from nerf_lightning.system.system import CHUNK, MakeOptimizer, Schedule, StepStats, System
 
 PIXELS = 2
-"""So many pixels are rendered together for each sample of a scene that would be."""
+"""Pixels rendered at once for each sample of `chunk`."""
 LOOKED = 1 << 16
-"""Most pixels, about, at which rectifiers are looked at."""
+"""About how many pixels ReLUs are tested at."""
 SATURATED = 1 / 255
-"""From 0 or 1, where the slope of a sigmoid is less than a fiftieth of its largest."""
+"""A sigmoid this close to 0 or 1 has less than a fiftieth of its largest slope."""
 
 
 class NeRF2D(System):
@@ -57,11 +57,11 @@ class NeRF2D(System):
 
     @torch.no_grad()
     def colours(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-        """The field's colours at any places, a chunk at a time, cut to [0, 1]."""
+        """The field's colours at any places, a chunk at a time, clamped to [0, 1]."""
         return torch.cat([self.field(part).clamp(0, 1) for part in uv.split(PIXELS * self.chunk)])
 
     def between(self, view: PictureBatch) -> float | None:
-        """PSNR where four pixels meet, against their mean: far below that of the pixels, the field runs wild between them.
+        """PSNR at the corners where four pixels meet, against their mean: if far below that of the pixels, the field overfits.
 
         None for a picture of one row or one column.
         """
@@ -77,20 +77,20 @@ class NeRF2D(System):
         if (rgb.amax(0) - rgb.amin(0)).max() > 1 / 255:
             return ""
         causes = []
-        dead = max(dead_rectifiers(self.field, view.uv), default=0.0)
+        dead = max(dead_relus(self.field, view.uv), default=0.0)
         if dead >= 0.5:
-            causes.append(f"{dead:.0%} of a layer's rectifiers are off wherever one looks, so no gradient reaches them")
+            causes.append(f"{dead:.0%} of a layer's ReLUs are off everywhere, so no gradient reaches them")
         raw = self.field(view.uv[:1])
         if ((raw - 0.5).abs() <= 0.5).all() and ((raw - 0.5).abs() > 0.5 - SATURATED).all():
-            causes.append("its parts are all at the ends of their range, where a sigmoid has hardly any slope")
+            causes.append("all its values are at the ends of their range, where a sigmoid has hardly any slope")
         if not causes:
             return "every place gets the same colour"
-        return f"every place gets the same colour: {'; '.join(causes)}; a lower learning rate keeps away from there"
+        return f"every place gets the same colour: {'; '.join(causes)}; a lower learning rate avoids that"
 
 
 @torch.no_grad()
-def dead_rectifiers(field: PictureField, uv: Float[Tensor, "N 2"]) -> list[float]:
-    """For each layer of rectifiers of a field, the share that is off at every place."""
+def dead_relus(field: PictureField, uv: Float[Tensor, "N 2"]) -> list[float]:
+    """For each ReLU layer of a field, the share of units that are off at every place."""
     alive: list[Tensor] = []
     layers = [module for module in field.modules() if isinstance(module, torch.nn.ReLU)]
     hooks = [layer.register_forward_hook(lambda _, __, out: alive.append((out > 0).any(0))) for layer in layers]

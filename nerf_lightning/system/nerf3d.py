@@ -18,7 +18,7 @@ from nerf_lightning.system.system import CHUNK, MakeOptimizer, Schedule, StepSta
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 RAYS = 8
-"""One ray is sampled for so many samples that are rendered together."""
+"""Rays sampled at once: one for this many samples of `chunk`."""
 
 
 class NeRF3D(System):
@@ -51,7 +51,7 @@ class NeRF3D(System):
 
     def take(self, smaller: System) -> None:
         super().take(smaller)
-        assert isinstance(smaller, NeRF3D)  # its field was of this kind
+        assert isinstance(smaller, NeRF3D)  # checked by the field
         self.sampler.take(smaller.sampler)
 
     @property
@@ -74,7 +74,7 @@ class NeRF3D(System):
                 self.rehearse(batch)
 
     def rehearse(self, batch: RayBatch) -> None:
-        """Runs a step on a copy with the clock stopped: what it compiles for the sizes at hand is not training."""
+        """Runs a step on a copy with the clock stopped: compiling for a new size does not count as training."""
         field, sampler = copy.deepcopy(self.field), copy.deepcopy(self.sampler)
         trial = NeRF3D(field, sampler, self.renderer, self.make_optimizer, self.schedule, self.seed, self.chunk)
         trial.backend = self.backend
@@ -82,7 +82,7 @@ class NeRF3D(System):
             trial.loss(batch, step_generator(self.seed, Stream.STEP, self.global_step, self.device), 1)[0].backward()
 
     def loss(self, batch: RayBatch, generator: torch.Generator, step: int) -> tuple[Tensor, StepStats]:
-        """What a step minimises, and what it did; `generator` is all its chance."""
+        """What a step minimises, and what it did. All its randomness comes from `generator`."""
         with torch.no_grad():
             density = part(self.field.density, self.backend)
             self.sampler.update(step, density, generator)
@@ -90,7 +90,7 @@ class NeRF3D(System):
         backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
         rendered = part(self.renderer.forward, self.backend)(batch.rays, samples, self.field, backgrounds)
         truth = over(batch.pixels, backgrounds)
-        # A ray that lacks some of its samples teaches nothing.
+        # A ray without all of its samples must not be learned from.
         rgb = rendered.rgb if samples.whole is None else torch.where(samples.whole[:, None], rendered.rgb, truth)
         loss = torch.nn.functional.mse_loss(rgb, truth)
         stats = StepStats(
@@ -106,7 +106,7 @@ class NeRF3D(System):
         if not self.stats.counted:
             return loss
         drawn = self.stats.samples
-        if self.trainer.world_size > 1:  # all processes draw from one stream, so they must adapt alike
+        if self.trainer.world_size > 1:  # all processes draw from one stream, so they must adapt in the same way
             drawn = int(self.trainer.strategy.reduce(torch.tensor(drawn, device=self.device), reduce_op="sum"))
         self.data.note_samples(drawn)
         return loss
@@ -124,7 +124,7 @@ class NeRF3D(System):
 
         Args:
             rays: on the system's device.
-            near, far: distances along each ray, scene's unit; what is nearer or farther is cut away.
+            near, far: distances along each ray, scene's unit; nothing nearer or farther is seen.
             background: colour in [0, 1]; None takes the renderer's own.
         """
         behind = self.renderer.colour if background is None else torch.tensor(background, device=self.device)

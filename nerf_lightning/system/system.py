@@ -21,7 +21,7 @@ MakeOptimizer = Callable[[Iterable[torch.nn.Parameter]], torch.optim.Optimizer]
 Schedule = Callable[[float], float]
 """Progress in [0, 1] -> factor on the learning rate."""
 CHUNK = 1 << 15
-"""What is rendered together where nobody says more, see `System`."""
+"""Default of `System`'s chunk."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class StepStats:
     """What the last training step did."""
 
     mse: Float[Tensor, ""]
-    """Where it was worked out: reading it makes the host wait for the device."""
+    """On the device: reading it means waiting for it."""
     rays: int
     """Rays, or pixels in 2D."""
     samples: int
     counted: bool = True
-    """Whether there are so many samples; otherwise there is room for so many."""
+    """Whether `samples` is their count; otherwise it is the room for them."""
     opacity: Float[Tensor, "R"] | None = None
-    """Of each ray: 0 where all is empty, 1 where nothing is seen through. Likewise."""
+    """Of each ray, on the device: 0 is empty, 1 is opaque."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,8 @@ class System(L.LightningModule):
     Args:
         optimizer: makes the optimiser from the parameters.
         schedule: factor on its learning rate by progress.
-        seed: of all chance in training steps.
-        chunk: samples rendered together without gradient: bounds the memory of a view, whatever its size.
+        seed: of all randomness in training steps.
+        chunk: samples rendered at once without gradient: bounds the memory that a view of any size takes.
     """
 
     field: Field | PictureField

@@ -119,7 +119,7 @@ def results_with(size: int, quality: float | None) -> Results:
     [
         (2000, 25.0, ["JPEG 3", "interpolation 2", "as good as the field"]),
         (2000, None, ["JPEG 3", "interpolation 2"]),
-        (100, 25.0, ["JPEG none so small", "interpolation 1"]),
+        (100, 25.0, ["JPEG none that small", "interpolation 1"]),
         (10**6, 90.0, ["interpolation without loss"]),
     ],
 )

@@ -184,7 +184,7 @@ def test_slow_but_steady_is_no_failure(tmp_path: Path):
     assert guard.recoveries == []
 
 
-def test_the_checkpoint_says_what_took_the_rectifiers_place(tmp_path: Path):
+def test_the_checkpoint_says_what_replaced_the_relu(tmp_path: Path):
     """Of the seeds 0 to 7 this one dies: its density is zero everywhere, and no gradient comes back."""
     save_npz(toy(MARBLE, (1.0, 1.0, 1.0)), tmp_path / "scene.npz")
     given = [
@@ -198,7 +198,7 @@ def test_the_checkpoint_says_what_took_the_rectifiers_place(tmp_path: Path):
     (one,) = json.loads((tmp_path / "results.json").read_text())["recoveries"]
     assert "no density anywhere" in one["cause"] and "softplus" in one["action"] and one["step"] <= 60
     activation = load_run(tmp_path).system.field.activation
-    assert activation(torch.tensor([-1.0])) > 0, "a rectifier would give zero"
+    assert activation(torch.tensor([-1.0])) > 0, "a ReLU would give zero"
 
 
 def test_after_a_new_start_the_rate_falls_to_the_end(tmp_path: Path):

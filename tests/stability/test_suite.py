@@ -84,7 +84,7 @@ def test_a_cell_is_done_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         run(replace(cell, steps=21), tmp_path)
 
 
-def test_a_rectifier_dies_without_the_guard_and_lives_with_it(tmp_path: Path):
+def test_a_relu_dies_without_the_guard_and_lives_with_it(tmp_path: Path):
     """The control: of eight seeds this one ends at the colour of the background, where its density is zero for good."""
     lost = run(Cell("white, small object", "relu mlp, no guard", 7, 200), tmp_path)
     assert lost.status == "collapsed" and lost.recoveries == 0
@@ -98,7 +98,7 @@ def test_a_rate_that_voxels_do_not_stand_is_lowered_before_the_first_step(tmp_pa
     assert outcome.status == "finished" and outcome.recoveries == 1
     results = json.loads((Cell("rate x10", "voxels", 0, 40).folder(tmp_path) / "results.json").read_text())
     (one,) = results["recoveries"]
-    assert one["step"] == 0 and "more than this field stands" in one["cause"]
+    assert one["step"] == 0 and "is too high for this field" in one["cause"]
 
 
 def test_a_picture_of_one_colour_is_learned(tmp_path: Path):

@@ -8,7 +8,7 @@ from nerf_lightning.dataset import Picture, PictureBatch, PixelDataModule
 from nerf_lightning.dataset.picture import builtin_picture
 from nerf_lightning.model import FourierField, HashGrid2DField, PictureField, PictureMLP, SirenField
 from nerf_lightning.system import NeRF2D, constant, nerf2d
-from nerf_lightning.system.nerf2d import dead_rectifiers
+from nerf_lightning.system.nerf2d import dead_relus
 
 SIZE = (20, 20)
 ADAM = functools.partial(torch.optim.Adam, lr=0.01)
@@ -32,11 +32,11 @@ def shifted(field: PictureField, layer: int, by: float) -> PictureField:
 
 @pytest.mark.parametrize("make", [PictureMLP, FourierField])
 @pytest.mark.parametrize("layer", [0, 1, 2])
-def test_a_field_whose_rectifiers_are_all_off_is_told(make, layer: int, view):
+def test_a_field_whose_relus_are_all_off_is_told(make, layer: int, view):
     field = shifted(make(SIZE, width=16), layer, -1e4)
     told = diagnosis(field, view)
-    assert "same colour" in told and "100% of a layer's rectifiers are off" in told and "lower learning rate" in told
-    shares = dead_rectifiers(field, view.uv)
+    assert "same colour" in told and "100% of a layer's ReLUs are off" in told and "lower learning rate" in told
+    shares = dead_relus(field, view.uv)
     assert len(shares) == 3 and shares[layer] == 1.0 and max(shares[:layer], default=0) < 1
 
 
@@ -47,16 +47,16 @@ def test_a_healthy_field_has_nothing_to_tell(make, view):
     assert diagnosis(make(SIZE), view) == ""
 
 
-def test_a_field_of_one_colour_without_rectifiers_is_told_as_that(view):
+def test_a_field_of_one_colour_without_relus_is_told_as_that(view):
     told = diagnosis(shifted(SirenField(SIZE, width=16), -1, 50.0), view)
     assert told == "every place gets the same colour"
     assert diagnosis(HashGrid2DField(SIZE), view) == told, "its tables start out as nearly nothing"
 
 
 @pytest.mark.parametrize("by", [100.0, -100.0])
-def test_a_saturated_field_blames_its_sigmoid_and_not_its_rectifiers(by: float, view):
+def test_a_saturated_field_blames_its_sigmoid_and_not_its_relus(by: float, view):
     told = diagnosis(shifted(PictureMLP(SIZE, width=16), -1, by), view)
-    assert "sigmoid" in told and "lower learning rate" in told and "rectifiers" not in told
+    assert "sigmoid" in told and "lower learning rate" in told and "ReLU" not in told
 
 
 class OneChannel(PictureField):
@@ -76,30 +76,30 @@ def test_what_no_picture_can_show_counts_as_one_colour(levels: float, told: bool
 
 
 class HalfDead(PictureField):
-    """Two rectifiers of four are off everywhere, one is on in the last row alone."""
+    """Two ReLUs of four are off everywhere, one is on in the last row alone."""
 
     def __init__(self):
         super().__init__(SIZE)
-        self.rectifier = torch.nn.ReLU()
+        self.relu = torch.nn.ReLU()
 
     def forward(self, uv: torch.Tensor) -> torch.Tensor:
         self.asked = len(uv)
         y = uv[:, 1:]
-        return self.rectifier(torch.cat([y - 1, -y, y - 0.96, y], dim=1))[:, 1:]
+        return self.relu(torch.cat([y - 1, -y, y - 0.96, y], dim=1))[:, 1:]
 
 
-def test_a_rectifier_is_dead_where_it_is_off_at_every_place(view, monkeypatch):
+def test_a_relu_is_dead_where_it_is_off_at_every_place(view, monkeypatch):
     field = HalfDead()
-    assert dead_rectifiers(field, view.uv) == [0.5]
-    assert dead_rectifiers(field, view.uv[:-20]) == [0.75]
-    assert dead_rectifiers(SirenField(SIZE), view.uv) == []
+    assert dead_relus(field, view.uv) == [0.5]
+    assert dead_relus(field, view.uv[:-20]) == [0.75]
+    assert dead_relus(SirenField(SIZE), view.uv) == []
     monkeypatch.setattr(nerf2d, "LOOKED", 25)
-    assert dead_rectifiers(field, view.uv)[0] >= 0.5 and field.asked == 25, "some places of a large picture are enough"
+    assert dead_relus(field, view.uv)[0] >= 0.5 and field.asked == 25, "some places of a large picture are enough"
 
 
 def test_looking_leaves_a_field_as_it_was(view):
     field = PictureMLP(SIZE, width=8)
-    dead_rectifiers(field, view.uv)
+    dead_relus(field, view.uv)
     assert not any(module._forward_hooks for module in field.modules())
     assert field(view.uv).requires_grad and all(p.grad is None for p in field.parameters())
 

@@ -1,1 +1,1 @@
-"""What a 2D run leaves beside its weights."""
+"""Charts and comparisons of 2D runs."""

@@ -1,4 +1,4 @@
-"""Baselines: what else the bytes of a 2D field could hold, so that memorising is not taken for understanding."""
+"""Baselines: what a JPEG or a smaller picture of the same bytes looks like, to judge a 2D field by."""
 
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ Image = UInt8[np.ndarray, "H W 3"]
 
 
 def quality_of(image: Image, truth: Image) -> float | None:
-    """PSNR in dB; None where the two are equal, since JSON has no infinity."""
+    """PSNR in dB; None if the two are equal, since JSON has no infinity."""
     if np.array_equal(image, truth):
         return None
     first, second = (torch.from_numpy(np.ascontiguousarray(x)).double() / 255 for x in (image, truth))
@@ -26,11 +26,11 @@ def quality_of(image: Image, truth: Image) -> float | None:
 
 
 def jpeg(image: Image, quality: int, sampling: int) -> tuple[int, Image]:
-    """Bytes of the file, and the picture that comes out of it again."""
+    """Size of the file in bytes, and the decoded picture."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
     _, coded = cv2.imencode(".jpg", image[..., ::-1], options)
     decoded = cv2.imdecode(coded, cv2.IMREAD_COLOR)
-    assert decoded is not None  # it was coded a line above
+    assert decoded is not None  # encoded one line above
     return len(coded), np.ascontiguousarray(decoded[..., ::-1])
 
 
@@ -38,10 +38,10 @@ SAMPLINGS = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420, cv2.IMWRITE_JPEG_SAMPLING_FAC
 
 
 def best_jpeg(image: Image, limit: int) -> dict[str, Any] | None:
-    """The best JPEG of at most `limit` bytes, with or without colours at half resolution; None where none is so small."""
+    """The best JPEG of at most `limit` bytes, with or without colours at half resolution; None if none is that small."""
     found: list[dict[str, Any]] = []
     for sampling in SAMPLINGS:
-        low, high = 0, 100  # the largest quality that fits lies in between; 0 stands for none
+        low, high = 0, 100  # the largest quality that fits is in between; 0 stands for none
         while low < high:
             middle = (low + high + 1) // 2
             low, high = (middle, high) if jpeg(image, middle, sampling)[0] <= limit else (low, middle - 1)
@@ -52,7 +52,7 @@ def best_jpeg(image: Image, limit: int) -> dict[str, Any] | None:
 
 
 def jpeg_as_good(image: Image, wanted: float) -> dict[str, Any] | None:
-    """The smallest JPEG of at least `wanted` dB; None where even the best falls short."""
+    """The smallest JPEG of at least `wanted` dB; None if even the best is worse."""
     found: list[dict[str, Any]] = []
     for sampling in SAMPLINGS:
         for quality in range(1, 101):
@@ -65,7 +65,7 @@ def jpeg_as_good(image: Image, wanted: float) -> dict[str, Any] | None:
 
 
 def shrunk(image: Image, limit: int) -> dict[str, Any]:
-    """The picture averaged to as many pixels as `limit` bytes hold (three a pixel), enlarged again by bicubic interpolation."""
+    """The picture shrunk to `limit` bytes at three bytes a pixel, then enlarged again by bicubic interpolation."""
     height, width = image.shape[:2]
     scale = min(1.0, (limit / image.nbytes) ** 0.5)
     down = max(1, int(height * scale))
@@ -111,7 +111,7 @@ class Baselines(L.Callback):
             "jpeg_as_good": None if quality is None else jpeg_as_good(image, quality),
         }
         write_json(Path(trainer.default_root_dir) / self.path, found)
-        coded = "none so small" if same is None else words(same["psnr"])
+        coded = "none that small" if same is None else words(same["psnr"])
         told = f"in {size_of(size)} (the picture's pixels have {size_of(image.nbytes)}): JPEG {coded}"
         told += f"; shrunk and enlarged by bicubic interpolation {words(small['psnr'])}"
         if found["jpeg_as_good"] is not None:

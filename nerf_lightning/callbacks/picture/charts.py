@@ -1,4 +1,4 @@
-"""PictureCharts: what a 2D run is looked at by, once it is done."""
+"""PictureCharts: error, spectrum and curve of a finished 2D run."""
 
 from pathlib import Path
 
@@ -17,12 +17,12 @@ from nerf_lightning.system import System
 
 
 def error_chart(rgb: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], title: str) -> Figure:
-    """The error of every pixel, mean over the colours, with its scale."""
+    """The error of every pixel, averaged over the colours, with a colour bar."""
     error = (rgb - truth).abs().mean(-1).numpy() * 255
     height, width = error.shape
     figure = Figure(figsize=(8, 1 + 7 * min(max(height / width, 0.2), 3)), dpi=DPI, layout="constrained")
     axes = figure.subplots()
-    # The brightest hundredth of a percent would darken all others.
+    # The largest errors would make all others look dark.
     top = max(float(np.percentile(error, 99.9)), 1e-3)
     shown = axes.imshow(error, vmin=0, vmax=top, cmap="inferno")
     axes.set(title=title, xlabel="column, pixels", ylabel="row, pixels")

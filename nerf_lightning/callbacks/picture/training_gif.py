@@ -1,4 +1,4 @@
-"""TrainingGif: the snapshots one after the other, as they came into being."""
+"""TrainingGif: the snapshots of a training, one after the other."""
 
 from pathlib import Path
 
@@ -19,8 +19,8 @@ class TrainingGif(L.Callback):
 
     Args:
         path: the GIF, below the run folder.
-        fps: frames a second; the last one stays three times as long.
-        width: in pixels, of snapshots that are wider.
+        fps: frames a second; the last one stays for three.
+        width: most pixels across; wider snapshots are shrunk.
 
     Raises:
         InputError: where fps <= 0 or width < 1.
