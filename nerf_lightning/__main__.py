@@ -1,4 +1,4 @@
-"""Train: compose -> build -> fit -> test -> results.json. Heavy imports wait until there is something to do."""
+"""Train: compose -> build -> fit -> test -> results.json. Heavy imports wait until they are needed."""
 
 import sys
 from pathlib import Path
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def train(cfg: "DictConfig") -> float | None:
-    """One run. Returns the held-out PSNR in dB, which is what a sweep optimises; None for a sweep's job that failed."""
+    """Trains one run. Returns the held-out PSNR in dB, which a sweep optimises; None for a sweep's job that failed."""
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         from nerf_lightning.training.sweep import job
 
@@ -25,7 +25,7 @@ def train(cfg: "DictConfig") -> float | None:
 
 
 def main() -> None:
-    """The command line. A resumed run goes on in its own folder instead of a new one."""
+    """The command line. A resumed run continues in its own folder."""
     resumed = [argument.removeprefix("resume=") for argument in sys.argv[1:] if argument.startswith("resume=")]
     if resumed and resumed[-1] not in ("", "null"):
         sys.argv.append(f"hydra.run.dir='{Path(resumed[-1]).absolute()}'")

@@ -1,4 +1,4 @@
-"""The front door in Python: scenes, trainings and runs, as the command line has them."""
+"""The Python interface: scenes, trainings and runs, with the command line's defaults."""
 
 import logging
 import math
@@ -36,7 +36,7 @@ from nerf_lightning.utils.quiet import NOISY
 
 @dataclass(frozen=True)
 class View:
-    """What a camera sees of a field, on the run's background."""
+    """A rendered view, on the run's background."""
 
     rgb: Float[Tensor, "H W 3"]
     """Colours in [0, 1]."""
@@ -59,11 +59,11 @@ class Run:
 
     @property
     def psnr(self) -> float:
-        """Mean PSNR over the held-out views, in dB; not a number where none was measured."""
+        """Mean PSNR over the held-out views, in dB; nan if none was measured."""
         return float(self.results.get("psnr") or math.nan)
 
     def render(self, camera: Cameras) -> View:
-        """What the first of some cameras sees, on the CPU; `scene.val.cameras[0]` is one."""
+        """Renders the first of some cameras, for example `scene.val.cameras[0]`; the result is on the CPU."""
         found = self.system.render(camera.view_rays(0).to(self.system.device))
         shape = (camera.height, camera.width)
         rgb, opacity, depth = (x.cpu() for x in (found.rgb, found.opacity, found.depth))
@@ -93,23 +93,23 @@ def load_scene(path: str | Path, resize: int | None = None) -> Scene:
 
     Args:
         path: an .npz file, a Blender folder, or a nerfstudio / instant-ngp capture.
-        resize: longest side in pixels, where photos are larger.
+        resize: longest side in pixels; larger photos are shrunk.
 
     Raises:
-        InputError: where there is none, or it is damaged.
+        InputError: if there is none, or it is damaged.
     """
     return open_scene(os.path.abspath(Path(path).expanduser()), resize=resize)
 
 
 def load_run(path: str | Path, device: str = "auto") -> Run:
-    """A run of a scene by its folder or its compact file; what it holds is never executed.
+    """Opens a scene's run by its folder or its compact file; nothing in it is executed.
 
     Args:
-        path: of either.
-        device: that renders: auto, cpu, cuda or mps.
+        path: of the folder or file.
+        device: to render on: auto, cpu, cuda or mps.
 
     Raises:
-        InputError: where there is none, it is broken, or a picture's, or the device is not there.
+        InputError: if there is none, it is broken or a picture's, or the device is not available.
     """
     place = Path(path).expanduser()
     with undisturbed():
@@ -133,15 +133,15 @@ def train(
     Args:
         scene: from `load_scene`, or its path.
         recipe: a model with the settings that suit it, such as tensorf_medium; None for the command line's default.
-        seconds, steps: what training ends after, whichever comes first; without both, 90 seconds.
-        seed: of weights, batches and jitter: the same seed and threads, and steps, give the same weights.
+        seconds, steps: length of the training; with both, whichever ends first; without either, 90 seconds.
+        seed: of weights, batches and jitter: the same seed, threads and steps give the same weights.
         device: auto, cpu, cuda or mps.
-        folder: of the run; None makes one below outputs/, named after the scene and the time.
-        options: whatever else the command line takes, such as ["renderer.background=white", "model.width=64"].
+        folder: of the run; None creates one below outputs/, named after the scene and the time.
+        options: anything else the command line takes, such as ["renderer.background=white", "model.width=64"].
 
     Raises:
         InputError: as the command line does, in one line.
-        FileExistsError: where the folder holds a run.
+        FileExistsError: if the folder holds a run.
     """
     if not isinstance(scene, Scene):
         scene = load_scene(scene)

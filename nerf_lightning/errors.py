@@ -1,4 +1,4 @@
-"""The one exception for bad input: a single line a user can act on."""
+"""The exception for bad input: one line that a user can act on."""
 
 
 class InputError(ValueError):
@@ -8,11 +8,11 @@ class InputError(ValueError):
     The command line prints it and exits with code 2.
 
     Args:
-        where: file, folder or config key that holds the problem.
-        key: entry inside it ("" when `where` says it all).
-        found: what stands there, in words.
-        expected: what should stand there, in words.
-        todo: what the user can do about it ("" when `expected` says it all).
+        where: file, folder or config key with the problem.
+        key: entry inside it ("" if `where` is enough).
+        found: what is there, in words.
+        expected: what should be there, in words.
+        todo: what the user can do about it ("" if `expected` is enough).
     """
 
     def __init__(self, where: object, key: str, found: str, expected: str, todo: str = ""):

@@ -27,11 +27,11 @@ from nerf_lightning.utils.device import CPU, the_device
 from nerf_lightning.utils.options import check_options
 
 KNOWN = ("cpu", "cuda", "mps")
-"""Devices that Lightning finds by itself; for any other it would take the CPU."""
+"""Devices that Lightning knows; for any other it would silently take the CPU."""
 
 
 def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
-    """Instantiates what stands at `path`, passing `extra`; the reasons it cannot be are told in terms of the config.
+    """Builds what the node at `path` describes, passing `extra`; errors name the config's keys.
 
     Raises:
         InputError: where the key is missing, or its target refuses or does not know an option.
@@ -43,7 +43,7 @@ def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
     late = bool(node.get("_partial_"))
     options = {key: value for key, value in resolved(node).items() if key not in ("_target_", "_partial_")}
     check_options(path, target, options, extra, complete=not late)
-    # Hydra would turn dataclasses among `extra` into configs: it only binds the options, the call is ours.
+    # Hydra only binds the options: it would turn dataclasses among `extra` into configs.
     bound = hydra.utils.instantiate(node, _partial_=True, _convert_="all")
     if late:
         return partial(bound, **extra)
@@ -51,7 +51,7 @@ def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
         return bound(**extra)
     except (ValueError, TypeError, MisconfigurationException) as error:
         if isinstance(error, InputError) or target.__module__.split(".")[0] == "nerf_lightning":
-            raise  # our own targets tell bad options apart from defects; libraries do not
+            raise  # our own targets raise InputError for bad options, so this is a defect
         raise InputError("config", path, str(error), f"options that {target.__name__} takes") from error
 
 
@@ -88,7 +88,7 @@ def device_of(cfg: DictConfig) -> torch.device:
 
 
 def build_data(cfg: DictConfig, path: str | None = None) -> RayDataModule | PixelDataModule:
-    """The data module, its scene loaded; from other photos than the configuration names, where a path is given."""
+    """The data module, with its scene loaded; `path` names other photos than the configuration does."""
     if path is None:
         return make(cfg, "dataset")
     elsewhere = copy.deepcopy(cfg)
@@ -110,10 +110,10 @@ def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> A
 
 
 def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) -> System:
-    """The LightningModule: NeRF3D for a scene's frame, NeRF2D for a picture's. On the CPU, with the limits of a device."""
+    """The LightningModule, NeRF3D for a scene's frame and NeRF2D for a picture's: on the CPU, with the limits of `device`."""
     optimizer = make(cfg, "optimizer")
     try:
-        optimizer([torch.zeros(1)])  # a rate below zero is told now, not when training starts
+        optimizer([torch.zeros(1)])  # so that a negative rate is reported now, not when training starts
     except (ValueError, TypeError, RuntimeError) as error:
         raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
     chunk = limits_of(cfg, device).chunk
@@ -156,7 +156,7 @@ def frame_of(data: RayDataModule | PixelDataModule) -> Frame:
 
 
 def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, system: System) -> None:
-    """Photos without alpha stand on one colour; asking for another would teach the field a wall of the first."""
+    """Photos without alpha show one background colour; with another, the field would learn that colour as a wall."""
     if isinstance(data, PixelDataModule) or data.scene.train.images.shape[-1] == 4:
         return
     assert isinstance(system, NeRF3D)  # what build_system makes for rays
@@ -171,7 +171,7 @@ def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, sys
 
 
 def budget_options(cfg: DictConfig) -> dict[str, Any]:
-    """The user's limits, or the experiment's own where the user gives none."""
+    """The user's limits, or the experiment's own if the user gives none."""
     budget = resolved(cfg.budget)
     default = budget.pop("default")
     return budget if any(budget[key] is not None for key in default) else {**budget, **default}
@@ -189,7 +189,7 @@ def build_trainer(cfg: DictConfig, folder: Path, device: torch.device, results: 
     logger: Logger | bool = make(cfg, "logger", save_dir=folder) if cfg.get("logger") is not None else False
     chosen = [name for name, node in (cfg.get("callbacks") or {}).items() if node is not None]
     callbacks = [make(cfg, f"callbacks.{name}") for name in chosen]
-    # The budget goes first: the others read its clock. Results go before the orbit: figures should not wait for a GIF.
+    # The budget comes first, as the others read its clock; results before the orbit, as figures should not wait for a GIF.
     callbacks = [build_budget(cfg), *([results] if results else []), *callbacks]
     where: dict[str, Any] = {"accelerator": device.type}
     if device.type not in KNOWN:

@@ -26,7 +26,7 @@ TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
 
 
 def by_path(arguments: Sequence[str], folder: Path) -> list[str]:
-    """A command line whose +experiment=PATH.yaml Hydra finds: as a name relative to its own experiments.
+    """Rewrites +experiment=PATH.yaml so that Hydra finds it: relative to the shipped experiments.
 
     Args:
         arguments: of the command line.
@@ -43,11 +43,11 @@ def by_path(arguments: Sequence[str], folder: Path) -> list[str]:
 
 
 def quoted(arguments: Sequence[str], keys: Sequence[str]) -> list[str]:
-    """A command line in which Hydra reads the values of some keys as texts, whatever is in them.
+    """Quotes the values of some keys, so that Hydra reads them as plain text.
 
     Args:
         arguments: of the command line.
-        keys: whose values are texts; what is quoted or in brackets already stays as it is.
+        keys: whose values are text; a value already in quotes or brackets stays as it is.
     """
     found = []
     for argument in arguments:
@@ -60,7 +60,7 @@ def quoted(arguments: Sequence[str], keys: Sequence[str]) -> list[str]:
 
 
 def given_of(cfg: DictConfig) -> dict[str, Any]:
-    """The keys of a verb on a run, as plain values: those that have one, and `dataset.path` as `photos`."""
+    """The keys of a verb on a run that have a value, as plain values; `dataset.path` becomes `photos`."""
     given = {str(key): cfg[key] for key in cfg if key != "dataset" and not OmegaConf.is_missing(cfg, key)}
     given |= {key: OmegaConf.to_container(value) for key, value in given.items() if OmegaConf.is_config(value)}
     return {**given, "photos": cfg.dataset.path}
@@ -69,9 +69,9 @@ def given_of(cfg: DictConfig) -> dict[str, Any]:
 def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] = ()) -> None:
     """Composes `conf/<config>.yaml` with the command line and calls `task`; exits with 2 on bad input.
 
-    The values of the keys in `texts` may hold commas and whatever else means something to Hydra.
+    The values of the keys in `texts` may hold commas and other characters that are special to Hydra.
 
-    Bad input is anything the user can mend: it gets one line. Everything else is a defect and keeps its traceback.
+    Bad input is anything the user can fix: it gets one line. Anything else is a defect and keeps its traceback.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
 
@@ -89,8 +89,8 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # the sweep decides what becomes of the other jobs
             folder, here = Path(HydraConfig.get().runtime.output_dir).resolve(), Path.cwd()
-            with suppress(OSError):  # a folder in which something stands stays
-                while folder != here:  # where a verb writes nothing of its own
+            with suppress(OSError):  # a folder that is not empty stays
+                while folder != here:  # a verb may write nothing of its own
                     folder.rmdir()
                     folder = folder.parent if here in folder.parents else here
             give_up(error)
@@ -98,14 +98,14 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
     except Exception as error:
-        # Before the task starts there is only Hydra at work on the command line: whatever it stumbles over is input.
+        # Before the task starts only Hydra is at work, on the command line: any error then is bad input.
         if started and not isinstance(error, InputError | HydraException | OmegaConfBaseException):
             raise
         give_up(error)
 
 
 def give_up(error: Exception) -> NoReturn:
-    """Prints the error as one line, or whole where the environment asks for it, and exits with 2."""
+    """Prints the error in one line, with its traceback if the environment asks for it, and exits with 2."""
     if os.environ.get(TRACEBACK) == "1":
         traceback.print_exception(error)
     line = " ".join(str(error).split("Config search path")[0].split())

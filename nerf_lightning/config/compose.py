@@ -1,4 +1,4 @@
-"""Configurations composed as the command line would, for code that runs without one: tests, benchmarks."""
+"""Composes configurations as the command line does, for code that runs without one: the front door, tests, benchmarks."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from nerf_lightning.config.renames import rename_given, renamed_overrides
 
 
 def composed(overrides: list[str], folder: Path, config: str = "config") -> DictConfig:
-    """The configuration a command line would give to the verb of that primary config, with `folder` as the run's."""
+    """The configuration that a command line would give to the verb `config`, with `folder` as the run's."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         cfg = compose(config, renamed_overrides(overrides), return_hydra_config=True)
     rename_given(cfg)

@@ -1,4 +1,4 @@
-"""What a device takes at once: a default for each kind of device, in conf/devices, which a run may override."""
+"""How much a device processes at once: a default for each kind of device, in conf/devices, which a run may override."""
 
 from dataclasses import dataclass
 
@@ -16,13 +16,13 @@ class Limits:
     """The keys of conf/devices/*.yaml, and of a run's `limits`."""
 
     batch: Count
-    """Times as many rays and samples a training step as the dataset asks for."""
+    """Factor on the rays and samples of a training step."""
     chunk: Count
-    """Samples rendered together."""
+    """Samples rendered at once."""
 
 
 def limits_of(cfg: DictConfig, device: torch.device) -> Limits:
-    """What a run says, else what its device takes. Runs of earlier versions say nothing.
+    """A run's own limits, or else the defaults of its device; runs of earlier versions have none.
 
     Raises:
         InputError: for an unknown limit, or one below 1.

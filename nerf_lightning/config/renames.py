@@ -1,4 +1,4 @@
-"""Options that had another name once: command lines, experiments and runs that say the old one go on to work."""
+"""Options that used to have another name: command lines, experiments and runs with the old one still work."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -10,11 +10,11 @@ RENAMED = {
     "renderer.distortion": "renderer.distortion_loss_weight",
 }
 GRIDS = ("HashGridField", "TensoRFField", "VoxelField")
-"""Models that were always as fine as asked for before they had the option `size`."""
+"""Models whose runs without the option `size` were made with a fixed size."""
 
 
 def with_new_names(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A run's configuration, as plain values, with each option under the name it has now; silent, as a run stays as it is."""
+    """A run's configuration (plain values) with each option under its present name; no warning, as runs cannot be edited."""
     renamed = dict(config)
     for old, new in RENAMED.items():
         (group, before), after = old.split("."), new.rpartition(".")[2]
@@ -28,7 +28,7 @@ def with_new_names(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def rename_given(cfg: DictConfig) -> None:
-    """Moves what an experiment of the user's own says under an old name to the new one, in place, with a warning."""
+    """Moves what a user's experiment sets under an old name to the new one, in place, with a warning."""
     for old, new in RENAMED.items():
         group, name = old.split(".")
         options = cfg.get(group)
@@ -39,7 +39,7 @@ def rename_given(cfg: DictConfig) -> None:
 
 
 def renamed_overrides(arguments: Sequence[str]) -> list[str]:
-    """A command line with each option under the name it has now, with a warning for each that was not."""
+    """A command line with each option under its present name, with a warning for each old one."""
     found = []
     for argument in arguments:
         key, equals, value = argument.partition("=")

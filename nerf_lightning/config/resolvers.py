@@ -1,4 +1,4 @@
-"""Folders named after what the user asked for, as resolvers for conf/. Imports nothing heavy."""
+"""Resolvers for conf/: folders named after the command line, and the recipe's name. Imports nothing heavy."""
 
 import hashlib
 import sys
@@ -11,11 +11,11 @@ from omegaconf import OmegaConf
 from nerf_lightning.config import conf_dir
 
 LONGEST = 120
-"""Letters of a folder's name."""
+"""Most letters in a folder's name."""
 
 
 def slug(text: str) -> str:
-    """Text as the name of a folder. What is too long for one ends in a digest of the whole, so that names stay apart."""
+    """Text as the name of a folder. Long text is cut and ends in a hash of the whole, so that names stay different."""
     plain = "".join(c if c.isalnum() or c in "=.,_-+" else "-" for c in text) or "all"
     if len(plain) <= LONGEST:
         return plain
@@ -25,8 +25,8 @@ def slug(text: str) -> str:
 def sweep_folder(arguments: Sequence[str]) -> str:
     """Where a sweep's jobs go: the same command line finds the same folder again.
 
-    It is named after the run's name or else the experiment, and after all that is varied or fixed besides; flags and Hydra's
-    own settings do not count.
+    It is named after the run's name (or else the experiment) and all other options given; flags and Hydra's own settings do
+    not count.
     """
     given: dict[str, str] = {}
     for argument in arguments:
@@ -46,15 +46,15 @@ def fixed_keys(arguments: Sequence[str]) -> list[str]:
 
 
 def job_name(overrides: Sequence[str], fixed: Sequence[str]) -> str:
-    """What sets one job apart: those of its overrides that are not the same for all."""
+    """The name of a job: its overrides, without those that are the same for all jobs."""
     return slug(",".join(sorted(one for one in overrides if one.lstrip("+~").partition("=")[0] not in fixed)))
 
 
 def recipe_of(recipe: str | None, model: str) -> str | None:
-    """A recipe that was chosen, while the model it is for is still the one: `+experiment=lego model=mlp` takes another."""
+    """The recipe, if the model chosen is the recipe's; None for another one, as in `+experiment=lego model=mlp`."""
     file = conf_dir() / "recipe" / f"{recipe}.yaml"
     if not file.is_file():
-        return recipe  # a user's own, elsewhere
+        return recipe  # a user's own, in another folder
     for entry in yaml.safe_load(file.read_text(encoding="utf-8"))["defaults"]:
         if isinstance(entry, str):
             return recipe if recipe_of(entry, model) else None
@@ -64,7 +64,7 @@ def recipe_of(recipe: str | None, model: str) -> str | None:
 
 
 def register() -> None:
-    """Makes the names known to configurations. What comes from the command line is cached: jobs take it over."""
+    """Registers the resolvers. Values from the command line are cached, so that jobs keep them."""
 
     OmegaConf.register_new_resolver("sweep_folder", lambda: sweep_folder(sys.argv[1:]), use_cache=True, replace=True)
     OmegaConf.register_new_resolver("fixed_keys", lambda: fixed_keys(sys.argv[1:]), use_cache=True, replace=True)
@@ -72,4 +72,4 @@ def register() -> None:
     OmegaConf.register_new_resolver("recipe_of", recipe_of, replace=True)
 
 
-register()  # on import: the processes of a sweep import this module, and nothing else of the command line
+register()  # on import, as the processes of a sweep import nothing else of the command line

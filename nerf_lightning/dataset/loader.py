@@ -16,16 +16,16 @@ Batch = TypeVar("Batch")
 Photos = TypeVar("Photos", Views, Tensor)
 
 ENDLESS = 2**31 - 1
-"""Reported length. Lightning reads one batch ahead of a loader without length, which would break exact resuming."""
+"""Reported length. Without one, Lightning reads a batch ahead, which would break exact resuming."""
 
 
 def share(trainer: L.Trainer | None) -> slice:
-    """Which entries of a step's draw are this process's, where several share a run: all together make the whole draw."""
+    """This process's entries of a step's draw, if several processes share a run."""
     return slice(None) if trainer is None else slice(trainer.global_rank, None, trainer.world_size)
 
 
 def drawn_on(trainer: L.Trainer | None, size: int) -> torch.device:
-    """Where batches are drawn: on the device that trains, if it has room for so many bytes of photos."""
+    """Where batches are drawn: on the training device, if it has room for `size` bytes of photos."""
     device = CPU if trainer is None else trainer.strategy.root_device
     return device if fits(size, device) else CPU
 
@@ -45,7 +45,7 @@ class StepLoader:
             yield self.draw(self.step())
 
     def state_dict(self) -> dict[str, int]:
-        """Nothing to keep: the trainer's step count says it all. Being there tells Lightning that resuming is exact."""
+        """Nothing to keep but the trainer's step. Having the method tells Lightning that resuming is exact."""
         return {}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
@@ -67,7 +67,7 @@ class HeldOutLoader:
 
 
 class StepDataModule(L.LightningDataModule, Generic[Photos]):
-    """What the data modules of rays and of pixels share.
+    """Base of the two data modules.
 
     Args:
         photos: what batches are drawn from.
@@ -81,7 +81,7 @@ class StepDataModule(L.LightningDataModule, Generic[Photos]):
         self.photos: Photos = photos
         self.seed = seed
         self._near: Photos | None = None
-        """The photos where batches are drawn."""
+        """The photos, on the device where batches are drawn."""
 
     def draw(self, step: int) -> Any:
         """The batch of a step: this process's share of it."""
@@ -104,4 +104,4 @@ class StepDataModule(L.LightningDataModule, Generic[Photos]):
         return HeldOutLoader(self.held_out, self.held_out_views)
 
     def teardown(self, stage: str) -> None:
-        self._near = None  # another trainer may have another device
+        self._near = None  # the next trainer may use another device

@@ -14,7 +14,7 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 
 
 def unknown(width: int, height: int) -> None:
-    """For pictures of which there is nothing larger."""
+    """`Picture.at` of a picture whose larger versions are unknown."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Picture:
     image: UInt8[Tensor, "H W 3"]
     """sRGB."""
     at: Callable[[int, int], UInt8[Tensor, "h w 3"] | None] = unknown
-    """Width, height -> what the picture truly looks like at that size, None where it is not known."""
+    """Width, height -> the true picture at that size, or None if unknown."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -119,7 +119,7 @@ class PixelDataModule(StepDataModule[Tensor]):
         return pixels_at(photos, index[part])
 
     def some_pixels(self) -> PixelBatch:
-        """As of `RayDataModule`: all of them."""
+        """As in `RayDataModule`; here, all pixels."""
         return self.held_out(0)
 
     def held_out(self, view: int) -> PictureBatch:

@@ -1,4 +1,4 @@
-"""RayDataModule: rays and their pixels, drawn evenly over all training photos."""
+"""RayDataModule: rays and their pixels, drawn uniformly from all training photos."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 RAYS, SAMPLES = 1024, 16384
-"""Rays of the first step, and the samples a step that their number is then adapted to."""
+"""Rays of the first step, and the samples per step that the number of rays then adapts to."""
 SOME_PIXELS = 8192
-"""Drawn to learn which colours there are."""
+"""Pixels drawn to measure the error of one plain colour."""
 
 
 @dataclass(frozen=True)
 class RayBatch:
-    """R rays and what the photos show there."""
+    """R rays and their pixels."""
 
     rays: Rays
     pixels: UInt8[Tensor, "R C"]
@@ -42,9 +42,9 @@ class ViewBatch(RayBatch):
 
 
 def draw_rays(views: Views, count: int, generator: torch.Generator, part: slice = slice(None)) -> RayBatch:  # noqa: B008
-    """`count` pixels with replacement, each as likely as any other of all views, and of these a part.
+    """Draws `count` pixels uniformly from all views, with replacement; returns a part of them.
 
-    Photos stay as bytes and rays are made for the drawn pixels alone, so the cost does not depend on how many there are.
+    Photos stay bytes, and rays are made only for the drawn pixels: the cost does not depend on the number of photos.
     """
     height, width = views.cameras.height, views.cameras.width
     whole = len(views) * height * width
@@ -87,7 +87,7 @@ class RayDataModule(StepDataModule[Views]):
         self.samples = None if self.samples is None else self.samples * batch
 
     def note_samples(self, drawn: int) -> None:
-        """Takes in how many samples a step's rays took: the number of rays moves toward the aim."""
+        """Called with the samples that a step's rays took: moves the number of rays toward the aim."""
         if self.samples is None:
             return
         # Damped, since one batch's count is noisy; bounded, since empty space would ask for endless rays.
@@ -96,7 +96,7 @@ class RayDataModule(StepDataModule[Views]):
         self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
 
     def start_again(self) -> None:
-        """For another training on the same photos: the number of rays is that of a first step."""
+        """Before another training on the same photos: back to the number of rays of a first step."""
         self.rays = self.first_rays
 
     def draw_from(self, photos: Views, step: int, part: slice) -> RayBatch:
@@ -104,7 +104,7 @@ class RayDataModule(StepDataModule[Views]):
         return draw_rays(photos, self.rays, generator, part)
 
     def some_pixels(self) -> RayBatch:
-        """Training pixels that tell which colours there are to learn."""
+        """Training pixels to measure the error of one plain colour on."""
         return draw_rays(self.scene.train, SOME_PIXELS, step_generator(self.seed, Stream.PLAIN, 0))
 
     @property
@@ -120,5 +120,5 @@ class RayDataModule(StepDataModule[Views]):
         return {"rays": self.rays, "batch": self.batch}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        before = state_dict.get("batch", 1)  # of another device, perhaps
+        before = state_dict.get("batch", 1)  # perhaps of another device
         self.rays = max(1, state_dict["rays"] * self.batch // before)

@@ -1,8 +1,8 @@
-"""The compact file: a trained system in as few bytes as it can be rendered from, in one .npz of plain arrays.
+"""The compact file: a trained system, ready to render, in few bytes: one .npz of plain arrays.
 
 header                     JSON as bytes: format, version, config, scene, and how each array is coded
-field.NAME, sampler.NAME   parameters as halves, or as bytes between the least and the most of their column; masks as bits
-NAME:range                 least and most of each column, where it is coded as bytes
+field.NAME, sampler.NAME   parameters as half floats, or as bytes between the minimum and maximum of their column; masks as bits
+NAME:range                 minimum and maximum of each column that is coded as bytes
 """
 
 import io
@@ -25,17 +25,17 @@ from nerf_lightning.utils.device import CPU
 
 FORMAT, VERSION = "nerf_lightning compact", 1
 WORTH_BYTES = 2048
-"""Numbers from which a table is coded as bytes; smaller arrays, those of networks, stay halves."""
+"""Arrays with at least this many numbers are coded as bytes; smaller ones, such as networks, stay half floats."""
 Arrays = dict[str, Any]  # of numpy arrays
 
 
 def encode(system: System, precision: str, config: dict[str, Any], scene: dict[str, Any]) -> bytes:
-    """A system as the content of a compact file.
+    """Codes a system as the content of a compact file.
 
     Args:
-        system: trained; `confine` it before to leave out what no camera sees.
+        system: trained; `confine` it first to leave out what no camera sees.
         precision: "half" or "byte".
-        config, scene: of its run, see `run_folder`.
+        config, scene: of its run, see `runs.folder`.
     """
     arrays: Arrays = {}
     codes: dict[str, Any] = {}
@@ -56,7 +56,7 @@ def encode(system: System, precision: str, config: dict[str, Any], scene: dict[s
 
 
 def parts(system: System) -> dict[str, dict[str, Tensor]]:
-    """What there is to keep of each part of a system."""
+    """The tensors to keep of each part of a system."""
     packed = {"field": system.field.packed()}
     if isinstance(system, NeRF3D):
         packed["sampler"] = system.sampler.packed()
@@ -71,13 +71,13 @@ def _coded(name: str, array: np.ndarray, code: str) -> Arrays:
         return {name: array.clip(-most, most).astype(np.float16)}
     if code == "exact":
         return {name: array}
-    # What was pruned is zero and would only widen the range.
+    # Pruned entries are zero and would only widen the range.
     rows = array.reshape(len(array), -1) if array.ndim < 3 else array.reshape(-1, array.shape[-1])
     used = rows[rows.any(1)] if rows.any() else rows
     low, high = used.min(0), used.max(0)
     step = np.where(high > low, (high - low) / 255, 1)
     codes = np.rint((rows.clip(low, high) - low) / step).astype(np.uint8)
-    codes[~rows.any(1)] = 0  # one value compresses to nothing
+    codes[~rows.any(1)] = 0  # equal values compress well
     return {name: codes, f"{name}:range": np.stack([low, high]).astype(np.float32)}
 
 
@@ -104,7 +104,7 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
         device: where to render.
 
     Raises:
-        InputError: where it is no compact file, or not whole, or of another version, or names what is not trusted.
+        InputError: if it is not a compact file, is damaged, of another version, or names something not trusted.
     """
     expected = "a compact file of this package"
     try:

@@ -1,4 +1,4 @@
-"""The photos or the picture of a run that is read back: what it was trained on, or others, and nothing fetched anew."""
+"""The photos or picture for a run that is read back: those it was trained on, or others. Nothing is downloaded."""
 
 import copy
 import inspect
@@ -13,15 +13,15 @@ from nerf_lightning.errors import InputError
 
 
 def data_again(cfg: DictConfig, scene: Mapping[str, Any], photos: str | None = None) -> RayDataModule | PixelDataModule:
-    """The data module of a run. As the run may be a stranger's, the network is not asked.
+    """The data module of a run. The network is never used, as the run may be a stranger's.
 
     Args:
         cfg: the run's configuration.
         scene: what its scene.json says.
-        photos: others to take, a file or folder; None takes those it was trained on.
+        photos: a file or folder of others; None takes those it was trained on.
 
     Raises:
-        InputError: where they are not there any more, or are others by now.
+        InputError: if they are gone, or have changed.
     """
     source = scene.get("source", BUILT_IN)
     at_hand = copy.deepcopy(cfg)

@@ -1,4 +1,4 @@
-"""The run folder: what a run leaves, and how it is read back without trusting it.
+"""The run folder: what a run writes, and how it is read back without trusting it.
 
 config.yaml            the resolved configuration
 scene.json             bounds, background and orbit of the scene, so that rendering needs no photos
@@ -30,13 +30,13 @@ from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.files import atomic, write_json
 
 FORMAT = 1
-"""Of run folders. Goes up when an older version of this package could no longer make sense of a newer one's runs."""
+"""Version of run folders. Goes up when older versions of this package can no longer read newer runs."""
 GROUPS = ("dataset", "model", "optimizer", "schedule", "trainer")
-"""Of a configuration, in the order written: the last one at least is missing where a file was cut short."""
+"""Groups of a configuration, in the order written: if a file was cut short, at least the last is missing."""
 
 
 def plain_config(cfg: DictConfig) -> dict[str, Any]:
-    """The resolved configuration; a relative dataset path becomes absolute, so that it holds from anywhere."""
+    """The resolved configuration; a relative dataset path becomes absolute, so that it is valid from any folder."""
     plain = resolved(cfg)
     path = plain["dataset"].get("path")
     if path is not None:
@@ -51,10 +51,10 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
 
 
 def load_config(folder: Path) -> DictConfig:
-    """Reads a run's configuration, refusing anything that would run code from outside the package.
+    """Reads a run's configuration; refuses anything that would run code from outside the package.
 
     Raises:
-        InputError: where the file is missing, broken or cut short, holds interpolations, or names a target that is not trusted.
+        InputError: if the file is missing, broken or cut short, holds interpolations, or names a target that is not trusted.
     """
     path = folder / "config.yaml"
     try:
@@ -71,7 +71,7 @@ def load_config(folder: Path) -> DictConfig:
 
 
 def save_scene(data: RayDataModule | PixelDataModule, folder: Path) -> None:
-    """Writes what rendering needs to know about the scene, without its photos."""
+    """Writes what rendering needs of the scene, without its photos."""
     write_json(folder / "scene.json", scene_content(data))
 
 
@@ -109,16 +109,16 @@ class RunFolder:
     orbit: Cameras | None
     """None for a picture."""
     to_source: Float[Tensor, "4 4"] | None
-    """Similarity from the world frame to that of the photos' own file; None for a picture."""
+    """Similarity transform from the world frame to that of the photos' file; None for a picture."""
     scene: dict[str, Any]
-    """What scene.json says."""
+    """The content of scene.json."""
 
 
 def frame_from(scene: dict[str, Any]) -> tuple[Frame, Cameras | None, Tensor | None]:
-    """What `scene_content` gave, as a system takes it, then the orbit and the similarity to the source; None for a picture.
+    """Reads what `scene_content` wrote: a system's frame, the orbit, and the transform to the source; None for a picture.
 
     Raises:
-        ValueError, KeyError, TypeError: where it is not whole.
+        ValueError, KeyError, TypeError: if it is incomplete.
     """
     if "aabb" not in scene:
         return PictureFrame(*map(int, scene["resolution"])), None, None
@@ -135,7 +135,7 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device =
     """Rebuilds a trained system from its folder alone, on a device.
 
     Raises:
-        InputError: where a file is missing, broken, or does not fit the others.
+        InputError: if a file is missing, broken, or does not match the others.
     """
     cfg = load_config(folder)
     scene, (frame, orbit, to_source) = load_scene(folder)
@@ -151,7 +151,7 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device =
 
 
 def load_scene(folder: Path) -> tuple[dict[str, Any], tuple[Frame, Cameras | None, Tensor | None]]:
-    """What a run's scene.json says, and what `frame_from` makes of it.
+    """The content of a run's scene.json, and what `frame_from` makes of it.
 
     Raises:
         InputError: where it is missing, broken, or of another version.
@@ -172,7 +172,7 @@ def load_scene(folder: Path) -> tuple[dict[str, Any], tuple[Frame, Cameras | Non
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Reads tensors and plain values, never code.
+    """Reads a checkpoint: tensors and plain values, never code.
 
     Raises:
         InputError: where the file is missing, truncated, or holds anything else.

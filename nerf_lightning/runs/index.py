@@ -1,4 +1,4 @@
-"""Run folders as tables and charts read them: tolerant of broken ones, and never executing what they hold."""
+"""Run folders as tables and charts read them: tolerant of broken ones, never executing what they hold."""
 
 import json
 import math
@@ -14,7 +14,7 @@ from nerf_lightning.config.renames import with_new_names
 from nerf_lightning.errors import InputError
 
 FINISHED = ("finished", "collapsed")
-"""Status of runs that came to their end."""
+"""Status of completed runs."""
 
 
 @dataclass(frozen=True)
@@ -23,22 +23,22 @@ class Run:
 
     folder: Path
     config: dict[str, Any]
-    """As it was resolved; empty where it cannot be read."""
+    """Resolved; empty if it cannot be read."""
     results: dict[str, Any]
-    """results.json; empty where it is missing or broken."""
+    """Content of results.json; empty if it is missing or broken."""
     status: str
-    """That of results.json, or "unfinished" without one, or "unreadable"."""
+    """As in results.json; "unfinished" without one; or "unreadable"."""
     diagnosis: str
 
     def option(self, key: str) -> Any:
-        """What stands at a dotted key of the configuration; None where nothing does."""
+        """The value at a dotted key of the configuration, or None."""
         node: Any = self.config
         for part in key.split("."):
             node = node.get(part) if isinstance(node, dict) else None
         return node
 
     def figure(self, key: str) -> float | None:
-        """A number from the results; None where there is none, or none that is finite."""
+        """A finite number from the results, or None."""
         value = self.results.get(key)
         return float(value) if _finite(value) else None
 
@@ -59,7 +59,7 @@ def _finite(value: Any) -> TypeGuard[float]:
 
 
 def read_run(folder: Path) -> Run:
-    """Reads one folder; what is missing or broken becomes the run's status and diagnosis."""
+    """Reads one folder; its status and diagnosis say what is missing or broken."""
     config: Any = None
     try:
         config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
@@ -112,7 +112,7 @@ def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def varied(runs: Sequence[Run]) -> list[str]:
-    """The options in which runs differ, as dotted keys; `recipe` and `method` alone stand for what they bring along."""
+    """The options in which runs differ, as dotted keys; `recipe` and `method` stand for all that they set."""
     options = [flat(run.config) for run in runs if run.config]
     common = [key for key in (options[0] if options else {}) if all(key in other for other in options)]
     keys = [key for key in common if any(other[key] != options[0][key] for other in options)]
@@ -138,11 +138,11 @@ FIGURES = (
     "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "plateau", "recoveries", "status",
     "diagnosis",
 )  # fmt: skip
-"""What stands in every results.json."""
+"""The keys of every results.json."""
 
 
 def failed_results(method: Any, seed: Any, diagnosis: str) -> dict[str, Any]:
-    """A results.json for a run that failed before it could write its own: nothing was measured."""
+    """A results.json for a run that failed before it could write its own."""
     nothing: dict[str, Any] = dict.fromkeys(FIGURES)
     empty: dict[str, Any] = {"curve": [], "warnings": [], "recoveries": []}
     return nothing | empty | {"method": method, "seed": seed, "status": "failed", "diagnosis": diagnosis}

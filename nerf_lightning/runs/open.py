@@ -1,4 +1,4 @@
-"""A run by its path: a folder, or the compact file that was made of one."""
+"""Opens a run by its path: a folder, or the compact file made from one."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ from nerf_lightning.utils.quiet import quiet
 
 @dataclass(frozen=True)
 class SceneRun:
-    """A run of a scene, as `RunFolder` has it."""
+    """As `RunFolder`, for a scene."""
 
     cfg: DictConfig
     system: NeRF3D
@@ -38,7 +38,7 @@ def open_run(path: Path, device: torch.device) -> RunFolder:
     """Reads a trained system, ready to render on a device with the kernels it was trained with.
 
     Raises:
-        InputError: where there is none, or it is broken, of another version, or names what is not trusted.
+        InputError: if there is none, or it is broken, of another version, or names something not trusted.
     """
     quiet()
     found = load_compact(path, device) if path.suffix == ".npz" else load_run(path, device=device)
@@ -50,7 +50,7 @@ def open_scene_run(path: Path, device: torch.device) -> SceneRun:
     """As `open_run`, of a scene.
 
     Raises:
-        InputError: as said, and for a picture's run.
+        InputError: as there, and for a picture's run.
     """
     found = open_run(path, device)
     if not isinstance(found.system, NeRF3D) or found.orbit is None or found.to_source is None:
@@ -59,5 +59,5 @@ def open_scene_run(path: Path, device: torch.device) -> SceneRun:
 
 
 def beside(path: Path) -> Path:
-    """The folder that what is made of a run goes to: the run's own, or that of its compact file."""
+    """Where to write what is made from a run: its folder, or the one its compact file is in."""
     return path.parent if path.suffix == ".npz" else path

@@ -1,4 +1,4 @@
-"""What a configuration from outside may name: a run folder or compact file of a stranger's must not execute code."""
+"""What a configuration from outside may name: a stranger's run folder or compact file must not execute code."""
 
 import importlib
 import os
@@ -28,20 +28,21 @@ TARGETS = {
     "nerf_lightning.system": ("constant", "cosine", "exponential"),
     "torch.optim": ("Adam", "AdamW"),
 }
-"""What a run folder may name: a module's names that configurations are made of. Anything else could be called with a
-stranger's arguments."""
+"""What a run folder may name, by module. Anything else could be called with a stranger's arguments."""
 
 
 def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
-    """A configuration from outside under the names that options have now; refuses one that is not plain, or names a target
-    that is not trusted.
+    """Checks a configuration from outside: plain values, and only trusted targets.
 
     Args:
         plain: as it was read.
-        path: where from, for the message.
+        path: where it came from, for messages.
+
+    Returns:
+        The configuration, with each option under its present name.
 
     Raises:
-        InputError: as said.
+        InputError: if it holds anything else.
     """
     if not isinstance(plain, dict):
         raise InputError(path, "", type(plain).__name__, "a mapping")

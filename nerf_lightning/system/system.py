@@ -1,4 +1,4 @@
-"""What NeRF2D and NeRF3D share: the optimiser, its schedule, and how a whole view is judged."""
+"""What NeRF2D and NeRF3D share: the optimiser, its schedule, and the evaluation of whole views."""
 
 import math
 import time
@@ -72,17 +72,17 @@ class System(L.LightningModule):
         self.seed = seed
         self.chunk = chunk
         self.progress = 0.0
-        """Fraction of the training done: the Budget callback keeps it; without one, the share of the trainer's max_steps."""
+        """Share of the training done: set by the Budget callback; without one, the share of the trainer's max_steps."""
         self.paused: Callable[[], AbstractContextManager[None]] | None = None
-        """Stops the clock of the Budget callback, which sets it; None without one."""
+        """Stops the Budget callback's clock; None without one."""
         self.rate = 1.0
-        """Factor on the learning rate beside the schedule's; the Guard callback lowers it where training broke down."""
+        """Further factor on the learning rate: the Guard callback lowers it when training breaks down."""
         self.backend: str | None = None
-        """What compiles the parts of a training step, see `compiled.part`; None leaves them as they are."""
+        """Compiler of the parts of a training step, see `compiled.part`; None does not compile."""
         self.stats = StepStats(torch.tensor(math.nan), 0, 0)
 
     def take(self, smaller: "System") -> None:
-        """Goes on from what a system with a smaller field of the same kind has learned."""
+        """Continues from what a system with a smaller field of the same kind has learned."""
         field: Any = self.field
         field.take(smaller.field)
 
@@ -101,7 +101,7 @@ class System(L.LightningModule):
 
     @property
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """The optimiser's groups, each with its present learning rate `lr`."""
+        """The optimiser's groups, with their present learning rates `lr`."""
         optimizer = self.optimizers(use_pl_optimizer=False)
         assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one
         return optimizer.param_groups
@@ -111,21 +111,21 @@ class System(L.LightningModule):
         raise TypeError(f"{type(self).__name__} must define truth(batch)")
 
     def show(self, view: Any) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"] | None, Float[Tensor, "N"] | None]:
-        """The colours the field gives a whole-view batch, with depth and opacity where it has them."""
+        """The field's colours of a whole view, with depth and opacity if it has them."""
         raise TypeError(f"{type(self).__name__} must define show(view)")
 
     @property
     def background(self) -> list[float] | None:
-        """The colour on which views are judged; None where there is nothing behind what is seen."""
+        """The background of evaluated views; None for a picture."""
         return None
 
     def diagnose(self, view: Any) -> str:
-        """What is wrong with a field that has learned nothing, in words; "" where nothing is known."""
+        """What is wrong with a field that has learned nothing, in words; "" if unknown."""
         return ""
 
     @torch.no_grad()
     def evaluate(self, view: Any) -> ViewResult:
-        """Renders a whole view and judges it."""
+        """Renders a whole view and measures it."""
         view = view.to(self.device)
         synchronize(self.device)
         start = time.perf_counter()
@@ -141,7 +141,7 @@ class System(L.LightningModule):
         return ViewResult(rgb, truth, psnr(rgb, truth), ssim(rgb, truth), seconds, depth, opacity)
 
     def evaluate_held_out(self, data: StepDataModule, views: Iterable[int]) -> Iterator[ViewResult]:
-        """Some of the held-out views, one after the other."""
+        """Evaluates some of the held-out views, one after the other."""
         return (self.evaluate(data.held_out(view)) for view in views)
 
     def test_step(self, batch: Any, batch_idx: int) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Sweeps: each job is done once, a failing one stops no other, and a table at the root tells what became of all."""
+"""Sweeps: each job runs once, a failing one does not stop the others, and a table lists them all."""
 
 import csv
 import shutil
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 TABLE = "sweep.csv"
 COLUMNS = ("psnr", "ssim", "train_seconds", "steps", "parameters", "artifact_bytes")
 OUTCOME = ("results.json", "error.txt")
-"""What says how a job ended, which is open once it starts again."""
+"""Files that say how a job ended; removed when it starts again."""
 STATE = ("final.png", "checkpoints", "snapshots")
-"""What of an earlier run with other options would be taken for a new one's."""
+"""Files of an earlier run with other options, which could be mistaken for the new one's."""
 
 
 def job(cfg: "DictConfig") -> float | None:
-    """One job of a sweep: skipped when it is done already, taken up where it stopped, and never raising.
+    """One job of a sweep: skipped if it is done, resumed if it was stopped. Never raises.
 
     Returns:
         The held-out PSNR in dB; None for a job that failed.
@@ -41,7 +41,7 @@ def job(cfg: "DictConfig") -> float | None:
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     root = Path(HydraConfig.get().sweep.dir)
-    leader = getattr(rank_zero_only, "rank", 0) == 0  # of several processes that share a job, the one that writes
+    leader = getattr(rank_zero_only, "rank", 0) == 0  # if several processes share a job, only the first writes
     try:
         from nerf_lightning.runs.folder import plain_config
         from nerf_lightning.training.train import train
@@ -64,13 +64,13 @@ def job(cfg: "DictConfig") -> float | None:
             record(folder, cfg, error)
         return None
     finally:
-        with suppress(InputError):  # interrupted before any job left something
+        with suppress(InputError):  # interrupted before any job wrote something
             if leader:
                 write_table(root, find_runs(root))
 
 
 def usable(checkpoint: Path) -> bool:
-    """Whether a checkpoint is there and whole."""
+    """Whether a checkpoint exists and is complete."""
     from nerf_lightning.runs.folder import read_checkpoint
 
     try:
@@ -88,14 +88,14 @@ def remove(path: Path) -> None:
 
 
 def record(folder: Path, cfg: "DictConfig", error: Exception) -> None:
-    """Leaves behind what went wrong: in results.json, unless the run wrote one itself, and whole in error.txt."""
+    """Writes what went wrong: to results.json, unless the run wrote one itself, and with its traceback to error.txt."""
     from nerf_lightning.runs.folder import save_config
 
     diagnosis = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     diagnosis = " ".join(diagnosis.split())
     print(f"{folder.name}: failed: {diagnosis}", file=sys.stderr, flush=True)
     if not (folder / "config.yaml").exists():
-        with suppress(OmegaConfBaseException):  # a configuration that cannot be resolved may be what failed
+        with suppress(OmegaConfBaseException):  # the configuration itself may be what failed
             save_config(cfg, folder)
     with atomic(folder / "error.txt") as temporary:
         temporary.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
@@ -104,7 +104,7 @@ def record(folder: Path, cfg: "DictConfig", error: Exception) -> None:
 
 
 def write_table(root: Path, runs: Sequence[Run]) -> None:
-    """sweep.csv: a line for each job."""
+    """Writes sweep.csv, a line for each job."""
     with atomic(root / TABLE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         options = varied(runs)
@@ -116,7 +116,7 @@ def write_table(root: Path, runs: Sequence[Run]) -> None:
 
 
 def print_table(root: Path, runs: Sequence[Run]) -> None:
-    """The same on the terminal, best first."""
+    """Prints the same table, best first."""
     from rich.console import Console
     from rich.table import Table
 
@@ -140,7 +140,7 @@ def print_table(root: Path, runs: Sequence[Run]) -> None:
 
 
 class SweepReport(Callback):
-    """What Hydra calls before the first job and after the last: table, figure, and exit code 1 where a job failed."""
+    """Hydra's hooks around the jobs: progress, then table, figure, and exit code 1 if a job failed."""
 
     def __init__(self) -> None:
         self.progress: SweepProgress | None = None
@@ -152,9 +152,9 @@ class SweepReport(Callback):
         try:
             for name in devices_asked(config):
                 the_device(name)
-        except InputError as error:  # which Hydra would only remark on
+        except InputError as error:  # Hydra would only warn
             cli.give_up(error)
-        # Names come from this process's command line: resolved here once, jobs in other processes find them cached.
+        # Names come from this process's command line: resolved here, they are cached for jobs in other processes.
         print(f"sweep: {config.hydra.sweep.dir}, one folder a job, such as {config.hydra.sweep.subdir}", flush=True)
         jobs = planned(config)
         self.progress = SweepProgress(Path(config.hydra.sweep.dir), jobs) if jobs else None

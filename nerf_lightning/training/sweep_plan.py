@@ -26,16 +26,16 @@ HERE = ("BasicLauncher", "JoblibLauncher", "LocalLauncher")
 
 @dataclass(frozen=True)
 class PlannedJob:
-    """One job that a sweep will start."""
+    """A job of a sweep that has not started yet."""
 
     folder: str
-    """Below the sweep's."""
+    """Below the sweep's folder."""
     seconds: float | None
-    """Its training budget; None where that is not in seconds."""
+    """Its training budget; None if that is not in seconds."""
 
 
 def planned(config: "DictConfig") -> list[PlannedJob]:
-    """All jobs of a sweep in their order; none where a sweeper thinks of them on the way, or a launcher starts several."""
+    """All jobs of a sweep in order; empty if the sweeper chooses them as it goes, or the launcher runs several at once."""
     if config.hydra.sweeper._target_ != GRID or config.hydra.launcher._target_ != IN_TURN:
         return []
     choices = []
@@ -53,7 +53,7 @@ def planned(config: "DictConfig") -> list[PlannedJob]:
 
 
 def devices_asked(config: "DictConfig") -> list[str]:
-    """The devices that the jobs of a sweep ask for, as far as its command line says, where they run on this machine."""
+    """The devices that jobs on this machine ask for, as far as the command line tells."""
     if config.hydra.launcher._target_.rsplit(".", 1)[-1] not in HERE:
         return []
     swept = [
@@ -66,7 +66,7 @@ def devices_asked(config: "DictConfig") -> list[str]:
 
 
 def _overrides(config: "DictConfig") -> list[Override]:
-    """Of a sweep's configuration and its command line."""
+    """All overrides of a sweep, from its configuration and its command line."""
     swept = [f"{key}={value}" for key, value in (config.hydra.sweeper.get("params") or {}).items()]
     return OverridesParser.create().parse_overrides([*swept, *config.hydra.overrides.task])
 
@@ -87,7 +87,7 @@ def _seconds(config: "DictConfig", overrides: dict[str, str]) -> float | None:
 
 @dataclass
 class SweepProgress:
-    """Follows a sweep whose jobs are known beforehand."""
+    """The progress of a sweep whose jobs are known in advance."""
 
     root: Path
     jobs: Sequence[PlannedJob]
@@ -97,7 +97,7 @@ class SweepProgress:
     _open: bool = True
 
     def begin(self, number: int) -> str:
-        """Called before a job. Returns where the sweep stands, in words."""
+        """Called before a job. Returns a line on how far the sweep is."""
         self._since = time.monotonic()
         self._open = read_run(self.root / self.jobs[number].folder).status not in FINISHED
         left = self.seconds_left(number)
@@ -105,14 +105,14 @@ class SweepProgress:
         return f"job {number + 1} of {len(self.jobs)}{told}"
 
     def end(self, number: int) -> None:
-        """Called after a job; one that failed, or was skipped because it was done before, says nothing about time."""
+        """Called after a job; the time of a failed or skipped one does not count."""
         if self._open and read_run(self.root / self.jobs[number].folder).status in FINISHED:
             self.spent.append((self.jobs[number].seconds, time.monotonic() - self._since))
 
     def seconds_left(self, number: int) -> float | None:
-        """Seconds that this job and the later ones will take; None before there is anything to go by.
+        """Seconds that this job and the later ones will take; None if nothing is known yet.
 
-        A job takes its budget and what was needed besides on average so far; without a budget, what jobs took on average.
+        A job takes its budget plus the average overhead so far; without a budget, the average time of a job.
         """
         left = [job for job in self.jobs[number:] if read_run(self.root / job.folder).status not in FINISHED]
         extra = [wall - (seconds or 0.0) for seconds, wall in self.spent]

@@ -40,10 +40,10 @@ from nerf_lightning.utils.quiet import quiet
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
-"""What stands beside the options in TensorBoard's HParams tab."""
+"""Figures shown beside the options in TensorBoard's HParams tab."""
 log = logging.getLogger(__name__)
 LATER = {"device": "auto", "compile": False, "limits": {"batch": None, "chunk": None}}
-"""What runs of earlier versions do not have, and may be given when they are resumed."""
+"""Options that runs of earlier versions lack, and that may be given when they are resumed."""
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
@@ -53,13 +53,13 @@ def train(
     """Builds, fits, tests, writes. Returns the held-out PSNR in dB.
 
     Args:
-        cfg: the configuration; with `resume`, that of the run resumed takes its place.
-        checkpoint: state of a run with the same configuration, to go on from.
-        folder: where to write; None takes the one that Hydra made.
-        scene: to train on, where it is at hand; None reads what the configuration says.
+        cfg: the configuration; with `resume`, the resumed run's takes its place.
+        checkpoint: state of a run with the same configuration, to continue from.
+        folder: where to write; None takes Hydra's.
+        scene: to train on, if already loaded; None loads the configuration's.
 
     Raises:
-        InputError: on bad input, most of it before anything is written into the run's folder.
+        InputError: for bad input, mostly before anything is written into the run's folder.
     """
     folder = folder or Path(HydraConfig.get().runtime.output_dir)
     resumed = cfg.resume is not None
@@ -109,7 +109,7 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     saved = OmegaConf.create(LATER)
     saved.merge_with(load_config(folder))
     checkpoint = folder / "checkpoints" / "last.ckpt"
-    read_checkpoint(checkpoint)  # a broken one is told in one line, before anything starts
+    read_checkpoint(checkpoint)  # fails in one line before anything starts, if it is broken
     given = [override.partition("=")[0] for override in HydraConfig.get().overrides.task]
     for key in given:
         if key == "resume":
@@ -117,7 +117,7 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
         if OmegaConf.select(saved, key, default=key) is key:
             raise InputError("resume", key, "an option the run does not have", f"one of those in {folder}/config.yaml")
         OmegaConf.update(saved, key, OmegaConf.select(cfg, key))
-    if "device" in given:  # its trainer's was resolved when the run began
+    if "device" in given:  # the trainer's was resolved when the run began
         OmegaConf.update(saved, "trainer.accelerator", cfg.trainer.accelerator)
     return saved, checkpoint
 
@@ -125,20 +125,20 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
 def prepare_process(
     seed: Annotated[int, AtLeast(0)], threads: Count | None, kernels: str, compile: bool = False
 ) -> None:
-    """What a run sets for its whole process."""
+    """Sets what applies to the whole process."""
     if threads is not None:
         torch.set_num_threads(threads)
     use_kernels("reference" if compile else kernels)
     keep_freed_memory()
-    torch.set_flush_denormal(True)  # dying weights otherwise slow the CPU down many times over
+    torch.set_flush_denormal(True)  # tiny weights otherwise slow the CPU down many times
     L.seed_everything(seed, verbose=False)
 
 
 def check_processes(trainer: L.Trainer, system: System) -> None:
-    """Refuses what several processes cannot do together.
+    """Refuses what several processes cannot share.
 
     Raises:
-        InputError: for a field that changes its size, and for a sweep whose jobs would start processes of their own.
+        InputError: for a field that grows, and for a sweep whose jobs would start further processes.
     """
     if trainer.world_size == 1:
         return
@@ -164,9 +164,9 @@ def check_processes(trainer: L.Trainer, system: System) -> None:
 
 
 def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch.device) -> None:
-    """Runs a small step on a copy, so that kernels are ready before the clock starts.
+    """Runs a small step on a copy, so that kernels are compiled before the clock starts.
 
-    A CPU's are compiled the first time, those of `compile` in every process.
+    A CPU's kernels are compiled once and cached; those of `compile`, in every process.
     """
     compiled = device.type == "cpu" or system.backend is not None
     told = " (the first time they are compiled: half a minute)" if compiled else ""
@@ -175,7 +175,7 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
         if isinstance(trial, NeRF3D):
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
             batch = draw_rays(data.scene.train, 64, step_generator(0, Stream.BATCH, 0)).to(device)
-            # Step 1: without a look at the whole grid.
+            # Step 1: step 0 would update the whole occupancy grid.
             loss, _ = trial.loss(batch, step_generator(0, Stream.STEP, 0, device), 1)
             loss.backward()
         elif isinstance(trial, NeRF2D):
@@ -184,7 +184,7 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
 
 
 def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, results: dict) -> None:
-    """Puts the run's options beside its final figures in TensorBoard's HParams tab."""
+    """Writes the run's options and final figures to TensorBoard's HParams tab."""
     plain = resolved(cfg)
     options = {group: plain[group] for group in GROUPS if plain.get(group) is not None}
     params = {**options, "method": cfg.method, "scene": results["scene"]["name"], "seed": cfg.seed}
@@ -195,7 +195,7 @@ def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, resul
 
 
 def report(results: dict, folder: Path) -> None:
-    """The last words on the terminal."""
+    """Prints the outcome."""
     for one in results["recoveries"]:
         print(f"guard: at step {one['step']}: {one['cause']}; {one['action']}")
     scene, seconds = results["scene"]["name"], results["train_seconds"]
@@ -205,6 +205,6 @@ def report(results: dict, folder: Path) -> None:
     crowded = crowding(results)
     if crowded is not None and crowded > CROWDED:
         print(f"the machine was busy with something else, which took {crowded:.0%} of this run's threads")
-    with suppress(ValueError):  # where the run's folder lies elsewhere, its full path it is
+    with suppress(ValueError):  # a folder elsewhere is printed with its full path
         folder = folder.relative_to(Path.cwd())
     print(f"everything is in {folder}; curves: tensorboard --logdir {folder.parent}")

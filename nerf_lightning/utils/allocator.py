@@ -9,16 +9,16 @@ _LARGEST_MMAP_THRESHOLD = 32 << 20
 def keep_freed_memory() -> bool:
     """Tells the C library to keep freed memory instead of returning it to the system after each step.
 
-    By default every tensor above 128 kB is mapped anew and its pages faulted in one by one: a fifth of a training step.
+    By default every tensor above 128 kB gets newly mapped memory, with a fault for each page: a fifth of a training step.
 
     Returns:
-        Whether the C library took it; it does not where it is not the GNU one.
+        Whether the C library accepted it; only the GNU one does.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, TypeError, AttributeError):  # Windows, macOS, musl: their allocators have no such knob
         return False
-    # One arena: what the backward pass frees in its own thread serves the next forward pass.
+    # One arena, so that the next forward pass reuses what the backward pass's thread frees.
     settings = ((_M_MMAP_THRESHOLD, _LARGEST_MMAP_THRESHOLD), (_M_TRIM_THRESHOLD, 1 << 30), (_M_ARENA_MAX, 1))
     taken = [mallopt(setting, value) for setting, value in settings]
     return all(taken)

@@ -1,4 +1,4 @@
-"""Which device does the work, and when it has done it."""
+"""Which device to use, and waiting for it."""
 
 import torch
 
@@ -8,7 +8,7 @@ CPU = torch.device("cpu")
 
 
 def devices() -> list[str]:
-    """The kinds of devices that are there, best first; the CPU always is. Last comes what somebody registered with torch."""
+    """The kinds of devices available, best first, then any that is registered with torch. The CPU is always there."""
     found = [name for name, kind in (("cuda", torch.cuda), ("mps", torch.backends.mps)) if kind.is_available()]
     own = torch._C._get_privateuse1_backend_name()
     module = getattr(torch, own, None)
@@ -17,13 +17,13 @@ def devices() -> list[str]:
 
 
 def the_device(name: str) -> torch.device:
-    """The device of a name.
+    """The device with a name.
 
     Args:
-        name: "auto" for the best that is there, or cpu, cuda, mps, or the name of a backend registered with torch.
+        name: "auto" for the best one available, or cpu, cuda, mps, or the name of a backend registered with torch.
 
     Raises:
-        InputError: for another name, or one that is not there.
+        InputError: for another name, or a device that is not available.
     """
     found = devices()
     if name == "auto":
@@ -48,7 +48,7 @@ def _advice(name: str) -> str:
 
 
 def fits(size: int, device: torch.device) -> bool:
-    """Whether so many bytes take at most half of the memory that a device has left."""
+    """Whether `size` bytes take at most half of a device's free memory."""
     if device.type == "cuda":
         return size <= torch.cuda.mem_get_info(device)[0] // 2
     if device.type == "mps":
@@ -57,6 +57,6 @@ def fits(size: int, device: torch.device) -> bool:
 
 
 def synchronize(device: torch.device) -> None:
-    """Waits until a device has done all it was given, so that a clock can be read; a CPU always has."""
+    """Waits until a device has finished its queue, so that the clock is right; a CPU has none."""
     if device.type != "cpu":
         torch.get_device_module(device).synchronize()

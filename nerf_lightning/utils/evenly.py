@@ -1,4 +1,4 @@
-"""Which of many views to look at."""
+"""Picks a few of many views."""
 
 
 def evenly(total: int, count: int | None) -> list[int]:

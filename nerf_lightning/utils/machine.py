@@ -1,4 +1,4 @@
-"""The machine a run has, and how much of it other work took: without either, seconds mean little."""
+"""The machine of a run, and how much of it other work used: without them, seconds mean little."""
 
 import os
 import platform
@@ -12,9 +12,9 @@ import psutil
 import torch
 
 CROWDED = 0.1
-"""Share of a run's threads that other work may take before its seconds are called those of a busy machine."""
+"""A machine counts as busy if other work took more than this share of a run's threads."""
 SHORTEST = 0.5
-"""Seconds below which the system's clock, which counts in hundredths, tells nothing about a load."""
+"""Shortest time, in seconds, over which the load can be measured: the system counts in hundredths."""
 
 
 def cores() -> int:
@@ -25,17 +25,17 @@ def cores() -> int:
 
 
 def processor() -> str:
-    """The processor's name, as far as the system tells it."""
+    """The processor's name, if the system knows it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:  # there is none beyond Linux
+    except OSError:  # only Linux has it
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
 
 
 def accelerator(device: torch.device) -> str | None:
-    """The name of the chip that does the work, or of its kind where nothing tells more; None for the processor itself."""
+    """The name of the accelerator, or of its kind if unknown; None for a CPU."""
     if device.type == "cpu":
         return None
     if device.type == "cuda":
@@ -46,23 +46,23 @@ def accelerator(device: torch.device) -> str | None:
 
 
 def device_in_words(device: torch.device) -> str:
-    """For people: cpu, or such as cuda (NVIDIA H100)."""
+    """For messages: "cpu", or for example "cuda (NVIDIA H100)"."""
     name = accelerator(device)
     return device.type if name in (None, device.type) else f"{device.type} ({name})"
 
 
 def describe_machine(device: torch.device) -> dict[str, Any]:
-    """What seconds depend on, for results.json."""
+    """The machine, for results.json."""
     return {"processor": processor(), "cores": cores(), "accelerator": accelerator(device)}
 
 
 def taken(cores: float, threads: float, others: float) -> float:
-    """The share of a run's threads that other work took: what it used beyond the cores that the run left free."""
+    """Share of a run's threads taken by other work: what that used beyond the cores the run left free."""
     return max(0.0, others - max(0.0, cores - threads)) / max(threads, 1.0)
 
 
 def crowding(results: Mapping[str, Any]) -> float | None:
-    """`taken` of a run, from its results.json; None where that does not tell it."""
+    """`taken`, from a run's results.json; None if it is not in there."""
     load, machine = results.get("load"), results.get("machine")
     if not isinstance(load, Mapping) or not isinstance(machine, Mapping):
         return None
@@ -72,10 +72,10 @@ def crowding(results: Mapping[str, Any]) -> float | None:
 
 
 def _busy_seconds() -> float:
-    """CPU seconds of all cores since the machine started that were not idle."""
+    """CPU seconds of all cores since the machine started, without idle time."""
     times = psutil.cpu_times()
     idle = times.idle + getattr(times, "iowait", 0.0)
-    guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)  # counted in user time already
+    guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)  # already part of the user time
     return sum(times) - idle - guests
 
 
@@ -97,17 +97,17 @@ class Load:
         self._since = self._now()
 
     def stop(self) -> None:
-        """Adds what has passed since `start`; without one, nothing."""
+        """Adds the time since `start`, if it was called."""
         if self._since is None:
             return
         wall, own, busy = (now - then for now, then in zip(self._now(), self._since, strict=True))
         self._since = None
         self.seconds += wall
         self.own += own
-        self.others += busy - own  # may be below zero for a moment: the system counts in hundredths
+        self.others += busy - own  # briefly below zero, as the system counts in hundredths
 
     def cores(self) -> dict[str, float] | None:
-        """Cores in use on average; None where too little time has passed to tell."""
+        """Cores in use on average; None if too little time has passed."""
         if self.seconds < SHORTEST:
             return None
         return {"own": round(self.own / self.seconds, 3), "others": round(max(0.0, self.others) / self.seconds, 3)}

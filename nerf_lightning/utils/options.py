@@ -1,4 +1,4 @@
-"""Checks options against the signature of what they configure, so that a wrong one is told in the config's words."""
+"""Checks options against the signature they configure, so that errors name the config's keys."""
 
 import difflib
 import inspect
@@ -19,20 +19,20 @@ class AtLeast:
 
 
 Count = Annotated[int, AtLeast(1)]
-"""How many of something there must be some of."""
+"""A whole number of at least one."""
 
 
 def check_options(
     where: str, target: Callable, options: Mapping[str, Any], given: Container[str] = (), complete: bool = True
 ) -> None:
-    """Raises InputError where an option is unknown, missing, of the wrong type or below its bound.
+    """Raises InputError if an option is unknown, missing, of the wrong type or below its bound.
 
     Args:
         where: the config group, for the message; "" for the top level.
-        target: the class or function that will take the options.
+        target: the class or function that takes the options.
         options: names and plain values.
-        given: names that will be passed besides.
-        complete: whether these are all the arguments the target will get.
+        given: names of further arguments that will be passed.
+        complete: whether the target gets no other arguments later.
     """
     parameters = inspect.signature(target).parameters
     hints = typing.get_type_hints(target.__init__ if inspect.isclass(target) else target, include_extras=True)
@@ -66,7 +66,7 @@ def check_options(
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value read from YAML can be what an annotation asks for; annotations beyond plain values always fit."""
+    """Whether a value from YAML fits an annotation; annotations other than plain values always fit."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         bounds = [bound.value for bound in arguments[1:] if isinstance(bound, AtLeast)]
@@ -83,7 +83,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, int) and not isinstance(value, bool)
     if hint in (str, bool, type(None)):
         return isinstance(value, hint)
-    # Any other class is nothing that YAML holds; a mapping may stand for one (it names a target of its own).
+    # YAML cannot hold other classes, but a mapping may describe one (with a target of its own).
     return not inspect.isclass(hint) or isinstance(value, Mapping | list)
 
 

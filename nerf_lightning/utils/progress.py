@@ -1,4 +1,4 @@
-"""A progress bar for work on many things, one after the other."""
+"""A progress bar for a loop."""
 
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 def tracked(items: Iterable[T], total: int, words: str) -> Iterator[T]:
-    """Passes items on while a bar with the time left shows how many have come; on terminals alone."""
+    """Yields the items while a bar shows their count and the time left; on terminals only."""
     console = Console(stderr=True)
     columns = TextColumn(words), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

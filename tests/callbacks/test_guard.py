@@ -132,7 +132,7 @@ def test_without_good_weights_it_starts_again(tmp_path: Path):
 @pytest.mark.parametrize(
     ("how", "words", "action"),
     [
-        ("rise a little", "times that of one plain colour, and stays above that since", "last good weights"),
+        ("rise a little", "times that of one plain colour, and has stayed above that since", "last good weights"),
         ("hover", "times that of one plain colour", "started again with 0.2 times"),
     ],
 )
