@@ -20,7 +20,7 @@ from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
 from nerf_lightning.dataset import PictureBatch
-from nerf_lightning.system import NeRF2D, System, decibels
+from nerf_lightning.system import NeRF2D, System, mse_to_psnr
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.machine import describe_machine
 
@@ -62,7 +62,7 @@ def gap(trainer: L.Trainer, system: System, quality: float) -> str:
     level = guard.watch.level if guard is not None else None
     if not level:
         return ""
-    trained = decibels(level)
+    trained = mse_to_psnr(level)
     if trained < quality + WIDE_GAP or quality >= GOOD:
         return ""
     return (

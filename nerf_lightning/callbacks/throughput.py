@@ -6,7 +6,7 @@ import lightning as L
 
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.errors import InputError
-from nerf_lightning.system import System, decibels
+from nerf_lightning.system import System, mse_to_psnr
 
 
 class Throughput(L.Callback):
@@ -45,7 +45,7 @@ class Throughput(L.Callback):
             mse = float(stats.mse)
             scalars = {
                 "train/loss": mse,
-                "train/psnr": decibels(mse),
+                "train/psnr": mse_to_psnr(mse),
                 "train/learning_rate": pl_module.parameter_groups[0]["lr"],
                 "speed/rays_per_second": rays / max(seconds - self._mark[0], 1e-9),
                 "speed/samples_per_ray": self._samples / max(rays, 1),

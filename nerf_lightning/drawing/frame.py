@@ -12,7 +12,7 @@ from nerf_lightning.cameras import Cameras
 from nerf_lightning.drawing.panels import near_bright
 from nerf_lightning.renderer import Rendered
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.system.metrics import decibels
+from nerf_lightning.system.metrics import mse_to_psnr
 from nerf_lightning.utils.evenly import evenly
 
 CHANNELS = ("rgb", "depth", "opacity")
@@ -87,4 +87,4 @@ def error_picture(
     """The difference, magnified, and the PSNR in dB of the two as bytes."""
     difference = np.abs(shown.astype(np.float64) - truth)
     mse = float(np.mean((difference / 255) ** 2))
-    return (ERROR_TIMES * difference).clip(0, 255).astype(np.uint8), decibels(mse)
+    return (ERROR_TIMES * difference).clip(0, 255).astype(np.uint8), mse_to_psnr(mse)

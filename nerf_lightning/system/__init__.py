@@ -1,6 +1,6 @@
 """Stage 6, systems: LightningModules that hold step, loss, metrics and optimiser, and nothing else."""
 
-from nerf_lightning.system.metrics import decibels, psnr, ssim
+from nerf_lightning.system.metrics import mse_to_psnr, psnr, ssim
 from nerf_lightning.system.nerf2d import NeRF2D
 from nerf_lightning.system.nerf3d import NeRF3D
 from nerf_lightning.system.schedule import constant, cosine, exponential
@@ -14,7 +14,7 @@ __all__ = [
     "ViewResult",
     "constant",
     "cosine",
-    "decibels",
+    "mse_to_psnr",
     "exponential",
     "psnr",
     "ssim",

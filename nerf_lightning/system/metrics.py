@@ -8,7 +8,7 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 
-def decibels(mse: float) -> float:
+def mse_to_psnr(mse: float) -> float:
     """10 log10(1 / MSE), at most 120 dB."""
     return -10 * math.log10(max(mse, 1e-12))
 
@@ -16,7 +16,7 @@ def decibels(mse: float) -> float:
 def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> float:
     """Peak signal-to-noise ratio in dB, 10 log10(1 / MSE), of pictures in [0, 1]."""
     first, second = (x.cpu().double() for x in (image, truth))  # not every device has doubles
-    return decibels(float(torch.mean((first - second) ** 2)))
+    return mse_to_psnr(float(torch.mean((first - second) ** 2)))
 
 
 SSIM_WINDOW = 11
