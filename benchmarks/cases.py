@@ -101,12 +101,8 @@ def roughness(values: Tensor, vertex: Tensor, index: Tensor) -> Tensor:
     return kernels.roughness(values, vertex, index, 1, len(vertex))
 
 
-def hash_interpolate(resolutions: list[int], sizes: list[int], tables: Tensor, unit: Tensor) -> Tensor:
-    return kernels.hash_interpolate(tables, unit, resolutions, sizes)
-
-
-def hash_interpolate_2d(resolutions: list[tuple[int, int]], sizes: list[int], tables: Tensor, unit: Tensor) -> Tensor:
-    return kernels.hash_interpolate_2d(tables, unit, resolutions, sizes)
+def hash_interpolate(cells: Sequence[tuple[int, ...]], sizes: list[int], tables: Tensor, unit: Tensor) -> Tensor:
+    return kernels.hash_interpolate(tables, unit, cells, sizes)
 
 
 def toward_a_ball(unbounded: bool) -> tuple[Tensor, ...]:
@@ -177,11 +173,9 @@ def _cases() -> dict[str, Case]:
             partial(keep_visible, room), (density[torch.arange(room) % len(t)] * roomy[1], *roomy), kind="packed"
         ),
         "mark_cells": Case(mark_cells, (marks, aabb, kernels.points(origins, directions, ray, t))),
-        "hash_interpolate": Case(
-            partial(hash_interpolate, grid.resolutions, grid.sizes), (grid.tables, unit), learns=1
-        ),
+        "hash_interpolate": Case(partial(hash_interpolate, grid.cells, grid.sizes), (grid.tables, unit), learns=1),
         "hash_interpolate_2d": Case(
-            partial(hash_interpolate_2d, picture.resolutions, picture.sizes),
+            partial(hash_interpolate, picture.resolutions, picture.sizes),
             (picture.tables, torch.rand(SAMPLES, 2)),
             learns=1,
         ),

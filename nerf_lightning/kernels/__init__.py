@@ -13,7 +13,6 @@ from nerf_lightning.kernels.composite import (
 )
 from nerf_lightning.kernels.harmonics import spherical_harmonics, spherical_harmonics_reference
 from nerf_lightning.kernels.hashgrid import hash_interpolate, hash_interpolate_reference
-from nerf_lightning.kernels.hashgrid2d import hash_interpolate_2d
 from nerf_lightning.kernels.march import (
     cell_index,
     march,
@@ -51,7 +50,6 @@ __all__ = [
     "composite_reference",
     "fast",
     "hash_interpolate",
-    "hash_interpolate_2d",
     "hash_interpolate_reference",
     "interpolate_rows",
     "keep_visible",

@@ -1,4 +1,4 @@
-"""Trilinear interpolation on nested grids with hashed entries (Instant-NGP, Müller et al. 2022, section 3)."""
+"""Linear interpolation on nested grids with hashed entries, in 2D or 3D (Instant-NGP, Müller et al. 2022, section 3)."""
 
 import functools
 import itertools
@@ -21,17 +21,19 @@ Cells = tuple[int, ...]
 """Cells of a grid along each of D axes."""
 
 
+def corner_count(cells: Cells) -> int:
+    """Corners of all cells of a grid."""
+    return math.prod(side + 1 for side in cells)
+
+
 def is_dense(cells: Cells, entries: int) -> bool:
     """Whether all corners of a grid fit in a table, which then holds them row by row; else they are hashed."""
-    return math.prod(side + 1 for side in cells) <= entries
+    return corner_count(cells) <= entries
 
 
 def factors(cells: Cells, entries: int) -> Cells:
     """What each axis' place is multiplied by in the number of a corner's entry."""
-    return tuple(
-        math.prod(side + 1 for side in cells[:axis]) if is_dense(cells, entries) else PRIMES[axis]
-        for axis in range(len(cells))
-    )
+    return tuple(corner_count(cells[:axis]) if is_dense(cells, entries) else PRIMES[axis] for axis in range(len(cells)))
 
 
 def joined(parts: Sequence[Tensor], dense: bool, last: int | Tensor) -> Tensor:
@@ -130,45 +132,41 @@ def hash_interpolate_reference(
     return (entries * weight.view(*rows.shape, 1)).sum(1).transpose(0, 1).flatten(1)
 
 
-class HashInterpolate(torch.autograd.Function):
-    """The fast version, in two or three dimensions."""
-
+class _HashInterpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, tables: Tensor, unit: Tensor, resolutions: list, sizes: list[int]) -> Tensor:
-        from nerf_lightning.kernels.cpu import hashgrid, hashgrid2d, workers
+    def forward(ctx, tables: Tensor, unit: Tensor, resolutions: Sequence[Cells], sizes: Sequence[int]) -> Tensor:
+        from nerf_lightning.kernels.cpu import hashgrid, workers
 
-        kernels = ctx.kernels = hashgrid if unit.shape[1] == 3 else hashgrid2d
         places = unit.T.contiguous()
+        cells = np.array(resolutions, np.int32).reshape(len(sizes), len(places))
         ctx.save_for_backward(places)
-        ctx.levels = np.array(resolutions, np.int32), np.array(sizes, np.int64)
-        ctx.shape = tuple(tables.shape)
-        features = (0,) * tables.shape[1]
+        ctx.levels, ctx.shape = (cells, np.array(sizes, np.int64)), tuple(tables.shape)
+        ctx.widths = (0,) * len(places), (0,) * tables.shape[1]
         out = torch.empty(len(sizes) * tables.shape[1], len(unit))
-        kernels.interpolate(tables.detach().numpy(), places.numpy(), *ctx.levels, out.numpy(), features, workers())
+        hashgrid.interpolate(tables.detach().numpy(), places.numpy(), *ctx.levels, out.numpy(), *ctx.widths, workers())
         return out.T
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        from nerf_lightning.kernels.cpu import workers
+        from nerf_lightning.kernels.cpu import hashgrid, workers
 
         (places,) = ctx.saved_tensors
-        tables = torch.empty(ctx.shape)
-        above, features = grad.T.contiguous().numpy(), (0,) * ctx.shape[1]
-        ctx.kernels.scatter(tables.numpy(), places.numpy(), *ctx.levels, above, features, workers())
+        tables, above = torch.empty(ctx.shape), grad.T.contiguous().numpy()
+        hashgrid.scatter(tables.numpy(), places.numpy(), *ctx.levels, above, *ctx.widths, workers())
         return tables, None, None, None
 
 
 def hash_interpolate(
-    tables: Float[Tensor, "T F"], unit: Float[Tensor, "N 3"], resolutions: list[int], sizes: list[int]
+    tables: Float[Tensor, "T F"], unit: Float[Tensor, "N D"], resolutions: Sequence[Cells], sizes: Sequence[int]
 ) -> Float[Tensor, "N LF"]:
-    """Trilinear interpolation at every level, features side by side.
+    """Bilinear or trilinear interpolation at every level, features side by side.
 
     Args:
         tables: the levels' entries, one level after the other.
-        unit: positions in [0, 1]^3; outside they are clamped.
-        resolutions: cells along each side, a level.
+        unit: positions in [0, 1]^D, D = 2 or 3; outside they are clamped.
+        resolutions: each level's cells along every axis.
         sizes: entries of each level's table: all corners of its grid, or a power of two to hash into.
     """
     if fast(tables, unit) and not unit.requires_grad:
-        return HashInterpolate.apply(tables, unit, resolutions, sizes)
-    return hash_interpolate_reference(tables, unit, [(side,) * 3 for side in resolutions], sizes)
+        return _HashInterpolate.apply(tables, unit, resolutions, sizes)
+    return hash_interpolate_reference(tables, unit, resolutions, sizes)

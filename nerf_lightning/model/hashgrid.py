@@ -1,5 +1,6 @@
 """Multiresolution hash grid (Instant-NGP, Müller et al. 2022) and the field that reads from it."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import hash_interpolate, mlp, mlp_heads
-from nerf_lightning.kernels.hashgrid import entry_of
+from nerf_lightning.kernels.hashgrid import Cells, corner_count, entry_of
 from nerf_lightning.model.field import Field
 from nerf_lightning.model.layers.activation import density_activation
 from nerf_lightning.model.layers.pruning import vertices_in
@@ -22,6 +23,11 @@ def level_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
     """Cells along each side of every level, growing geometrically from coarsest to finest (Instant-NGP, eq. 2 and 3)."""
     growth = (finest / coarsest) ** (1 / max(levels - 1, 1))
     return [round(coarsest * growth**level) for level in range(levels)]
+
+
+def table_sizes(cells: Sequence[Cells], entries: int) -> list[int]:
+    """Entries of each level's table: all corners of its grid where they fit."""
+    return [min(corner_count(level), entries) for level in cells]
 
 
 class HashGrid(torch.nn.Module):
@@ -46,18 +52,17 @@ class HashGrid(torch.nn.Module):
         if not 0 < coarsest <= finest:
             raise InputError("model.coarsest", "", f"{coarsest} with model.finest={finest}", "0 < coarsest <= finest")
         self.resolutions = level_resolutions(levels, coarsest, finest)
-        entries = 2**log2_entries
-        # A dense level needs no more entries than corners; a hashed one takes them all.
-        self.sizes = [(r + 1) ** 3 if (r + 1) ** 3 <= entries else entries for r in self.resolutions]
+        self.cells = [(side,) * 3 for side in self.resolutions]
+        self.sizes = table_sizes(self.cells, 2**log2_entries)
         self.tables = torch.nn.Parameter(torch.empty(sum(self.sizes), features).uniform_(-1e-4, 1e-4))
         self.width = levels * features
 
     def forward(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N LF"]:
-        return hash_interpolate(self.tables, unit, self.resolutions, self.sizes)
+        return hash_interpolate(self.tables, unit, self.cells, self.sizes)
 
     def rows(self, vertices: Int[Tensor, "3 N"], level: int) -> Int[Tensor, "N"]:
         """Rows of `tables` that a level keeps its vertices in."""
-        return sum(self.sizes[:level]) + entry_of(vertices, (self.resolutions[level],) * 3, self.sizes[level])
+        return sum(self.sizes[:level]) + entry_of(vertices, self.cells[level], self.sizes[level])
 
     @torch.no_grad()
     def take(self, smaller: "HashGrid") -> Int[Tensor, "I"]:

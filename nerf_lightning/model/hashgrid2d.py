@@ -5,19 +5,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import hash_interpolate_2d, mlp
+from nerf_lightning.kernels import hash_interpolate, mlp
 from nerf_lightning.model.field import PictureField
-from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
+from nerf_lightning.model.hashgrid import layers, level_resolutions, table_sizes, weights
 from nerf_lightning.model.layers.widening import widen_all
 from nerf_lightning.utils.options import Count
 
 SHARE = 0.5
 """Numbers of the grids for each number of the picture, unless the table size is given."""
-
-
-def level_sizes(resolutions: list[tuple[int, int]], entries: int) -> list[int]:
-    """Entries of each level's table: all its corners where they fit."""
-    return [min((across + 1) * (down + 1), entries) for across, down in resolutions]
 
 
 class HashGrid2DField(PictureField):
@@ -56,7 +51,7 @@ class HashGrid2DField(PictureField):
         self.resolutions = list(dict.fromkeys((across, down) for across, down in scaled))  # a small picture has fewer
         if log2_entries is None:
             numbers = SHARE * 3 * size[0] * size[1]
-            fitting = [e for e in range(4, 25) if sum(level_sizes(self.resolutions, 2**e)) * features <= numbers]
+            fitting = [e for e in range(4, 25) if sum(table_sizes(self.resolutions, 2**e)) * features <= numbers]
             log2_entries = max(fitting, default=4)
             self.sizing = (
                 f"grids up to the picture's {size[0]} x {size[1]} pixels, of at most 2^{log2_entries} entries: together half"
@@ -64,7 +59,7 @@ class HashGrid2DField(PictureField):
             )
         if log2_entries > 24:
             raise InputError("model.log2_entries", "", str(log2_entries), "at most 24")
-        self.sizes = level_sizes(self.resolutions, 2**log2_entries)
+        self.sizes = table_sizes(self.resolutions, 2**log2_entries)
         self.tables = torch.nn.Parameter(torch.empty(sum(self.sizes), features).uniform_(-1e-4, 1e-4))
         self.net = layers(len(self.sizes) * features, width, 3)
 
@@ -88,5 +83,5 @@ class HashGrid2DField(PictureField):
         width, height = self.size
         pixels = uv * uv.new_tensor([width, height]) - 0.5
         unit = pixels / uv.new_tensor([max(width - 1, 1), max(height - 1, 1)])
-        features = hash_interpolate_2d(self.tables, unit, self.resolutions, self.sizes)
+        features = hash_interpolate(self.tables, unit, self.resolutions, self.sizes)
         return torch.sigmoid(mlp(features, weights(self.net)))

@@ -18,6 +18,7 @@ from nerf_lightning.kernels import (
     voxel_value,
 )
 from nerf_lightning.model.field import Field, replace_data
+from nerf_lightning.model.hashgrid import level_resolutions
 from nerf_lightning.model.layers.activation import truncated_exp
 from nerf_lightning.model.layers.pruning import vertices_in, widened
 from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
@@ -34,11 +35,6 @@ COUNTS = {"stage": torch.int64, "steps": torch.int32, "started": torch.int32}
 """Whole numbers in checkpoints."""
 CHUNK = 1 << 16
 """Vertices interpolated together when growing: bounds the memory."""
-
-
-def stage_sizes(coarsest: int, finest: int, stages: int) -> list[int]:
-    """Cells along a side at each stage, growing geometrically."""
-    return [round(coarsest * (finest / coarsest) ** (i / max(stages - 1, 1))) for i in range(stages)]
 
 
 class VoxelField(Field):
@@ -89,7 +85,7 @@ class VoxelField(Field):
         if not smoothness >= 0:
             raise InputError("model.smoothness", "", str(smoothness), "at least 0")
         intervals = max(stages - 1, 1)
-        self.resolutions = stage_sizes(coarsest, finest, stages)
+        self.resolutions = level_resolutions(stages, coarsest, finest)
         # Early stages are short: a coarse grid learns what it can in a few steps a vertex.
         self.times = [grown * (i / intervals) ** 2 for i in range(stages)]
         self.grown_after = self.times[-1]
@@ -182,7 +178,7 @@ class VoxelField(Field):
         cells = smaller.side - 1
         if cells > self.resolutions[-1]:
             return
-        self.resolutions = stage_sizes(cells, self.resolutions[-1], len(self.resolutions))
+        self.resolutions = level_resolutions(len(self.resolutions), cells, self.resolutions[-1])
         views = smaller.views.view(len(smaller.views), 3, smaller.terms)[..., : self.terms]
         wider = views.new_zeros(len(views), 3, self.terms)
         wider[..., : views.shape[2]] = views

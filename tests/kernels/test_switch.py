@@ -36,8 +36,8 @@ def mark_cells(x: Tensor, c: Tensor):
 
 # What to call with numbers x [4, 3] and c, the same as constants; the entry point it runs; whether that gives all gradients.
 CASES: dict[str, tuple[Callable[[Tensor, Tensor], object], str, bool]] = {
-    "tables": (lambda x, c: k.hash_interpolate(x, c, [1], [4]), "hashgrid.interpolate", True),
-    "positions": (lambda x, c: k.hash_interpolate(c, x, [1], [4]), "hashgrid.interpolate", False),
+    "tables": (lambda x, c: k.hash_interpolate(x, c, [(1, 1, 1)], [4]), "hashgrid.interpolate", True),
+    "positions": (lambda x, c: k.hash_interpolate(c, x, [(1, 1, 1)], [4]), "hashgrid.interpolate", False),
     "mlp": (lambda x, c: k.mlp(x, layers(c), c), "mlp.forward", True),
     "mlp_heads": (lambda x, c: k.mlp_heads(x, layers(c), 1, c), "mlp.forward", True),
     "density": (lambda x, c: k.composite(x[:, 0], x, c[:, 1], c[:, 2], RAY, OFFSETS), "composite.forward", True),

@@ -21,7 +21,7 @@ def test_a_grid_has_no_more_entries_than_it_needs():
     assert grid.tables.shape == (125 + 512 + 512, 4) and grid.width == 12
     assert 0 < grid.tables.abs().max() <= 1e-4
     unit = torch.rand(7, 3)
-    assert torch.equal(grid(unit), hash_interpolate(grid.tables, unit, grid.resolutions, grid.sizes))
+    assert torch.equal(grid(unit), hash_interpolate(grid.tables, unit, grid.cells, grid.sizes))
 
 
 @pytest.mark.parametrize(("coarsest", "finest"), [(0, 16), (17, 16)])

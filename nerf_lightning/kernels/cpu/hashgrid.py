@@ -1,4 +1,7 @@
-"""Hash-grid interpolation and its gradient, a level after the other: one level's table fits a core's cache."""
+"""Hash-grid interpolation and its gradient in two or three dimensions, level by level: one level's table fits a core's cache.
+
+`axes` and `features` are tuples whose lengths, the dimensions and the numbers in an entry, are known when compiling.
+"""
 
 import numpy as np
 from numba import float32, int32, prange, uint32
@@ -10,106 +13,111 @@ PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)  # Instant-NGP, e
 
 @inner(inline="always")
 def cell_of(x, resolution):
-    """Lower corner and fraction of one coordinate in [0, 1]; clamped outside. What is not a number stays so, in some cell."""
+    """Lower corner and fraction of one coordinate in [0, 1]; clamped outside. NaN stays NaN, in some cell."""
     scaled = min(max(x, float32(0)), float32(1)) * float32(resolution)
     cell = int32(min(uint32(int32(scaled)), uint32(resolution - 1)))
     return uint32(cell), scaled - float32(cell)
 
 
 @inner(inline="always")
-def corners(x, y, z, resolution, entries):
-    """Entries of the eight corners, the last coordinate fastest; row-major where they fit, else hashed."""
-    side = uint32(resolution + 1)
-    if np.int64(side) * side * side <= entries:
-        x1 = x + uint32(1)
-        y0 = y * side
-        y1 = y0 + side
-        z0 = z * (side * side)
-        z1 = z0 + side * side
-        return (
-            x + y0 + z0, x + y0 + z1, x + y1 + z0, x + y1 + z1,
-            x1 + y0 + z0, x1 + y0 + z1, x1 + y1 + z0, x1 + y1 + z1,
-        )  # fmt: skip
-    mask = uint32(entries - 1)
-    x1 = x + uint32(1)
-    y0 = y * PRIME_Y
+def square(x, y, side, dense):
+    """What two coordinates contribute to the numbers of the four corners' entries, the second coordinate fastest."""
+    if dense:
+        first = x + y * side
+        return first, first + side, first + uint32(1), first + side + uint32(1)
+    x1, y0 = x + uint32(1), y * PRIME_Y
     y1 = y0 + PRIME_Y
+    return x ^ y0, x ^ y1, x1 ^ y0, x1 ^ y1
+
+
+@inner(forceinline=True)
+def corners(unit, n, cells, entries, axes):
+    """Entries and weights of the corners around place n, the last coordinate fastest; row-major where they fit, else hashed."""
+    x, fx = cell_of(unit[0, n], cells[0])
+    y, fy = cell_of(unit[1, n], cells[1])
+    gx, gy, side, mask = float32(1) - fx, float32(1) - fy, uint32(cells[0] + 1), uint32(entries - 1)
+    corners_2d = np.int64(side) * np.int64(cells[1] + 1)
+    wa, wb, wc, wd = gx * gy, gx * fy, fx * gy, fx * fy
+    if len(axes) == 2:
+        dense = corners_2d <= entries
+        a, b, c, d = square(x, y, side, dense)
+        if dense:
+            return (a, b, c, d), (wa, wb, wc, wd)
+        return (a & mask, b & mask, c & mask, d & mask), (wa, wb, wc, wd)
+    z, fz = cell_of(unit[2, n], cells[2])
+    gz = float32(1) - fz
+    weights = wa * gz, wa * fz, wb * gz, wb * fz, wc * gz, wc * fz, wd * gz, wd * fz
+    dense = corners_2d * np.int64(cells[2] + 1) <= entries
+    a, b, c, d = square(x, y, side, dense)
+    if dense:
+        z0 = z * uint32(corners_2d)
+        z1 = z0 + uint32(corners_2d)
+        return (a + z0, a + z1, b + z0, b + z1, c + z0, c + z1, d + z0, d + z1), weights
     z0 = z * PRIME_Z
     z1 = z0 + PRIME_Z
     return (
-        (x ^ y0 ^ z0) & mask, (x ^ y0 ^ z1) & mask, (x ^ y1 ^ z0) & mask, (x ^ y1 ^ z1) & mask,
-        (x1 ^ y0 ^ z0) & mask, (x1 ^ y0 ^ z1) & mask, (x1 ^ y1 ^ z0) & mask, (x1 ^ y1 ^ z1) & mask,
-    )  # fmt: skip
+        (a ^ z0) & mask, (a ^ z1) & mask, (b ^ z0) & mask, (b ^ z1) & mask,
+        (c ^ z0) & mask, (c ^ z1) & mask, (d ^ z0) & mask, (d ^ z1) & mask,
+    ), weights  # fmt: skip
+
+
+@inner(forceinline=True)
+def cells_of(resolutions, level, axes):
+    """A level's cells along each axis, as numbers that stay in registers."""
+    return resolutions[level, 0], resolutions[level, 1], resolutions[level, len(axes) - 1]
 
 
 @inner
-def interpolate_level(table, unit, first, last, resolution, out, features):
-    """Fills out[:, first:last]. `features` is a tuple as long as an entry, so that its length is known when compiling."""
-    entries = len(table)
+def interpolate_level(table, unit, first, last, cells, out, axes, features):
+    """Fills out[:, first:last]."""
     for n in range(first, last):
-        cx, fx = cell_of(unit[0, n], resolution)
-        cy, fy = cell_of(unit[1, n], resolution)
-        cz, fz = cell_of(unit[2, n], resolution)
-        i0, i1, i2, i3, i4, i5, i6, i7 = corners(cx, cy, cz, resolution, entries)
-        gx, gy, gz = float32(1) - fx, float32(1) - fy, float32(1) - fz
-        w0, w1, w2, w3 = gx * gy * gz, gx * gy * fz, gx * fy * gz, gx * fy * fz
-        w4, w5, w6, w7 = fx * gy * gz, fx * gy * fz, fx * fy * gz, fx * fy * fz
+        i, w = corners(unit, n, cells, len(table), axes)
         for f in range(len(features)):
-            out[f, n] = (
-                (w0 * table[i0, f] + w1 * table[i1, f]) + (w2 * table[i2, f] + w3 * table[i3, f])
-            ) + ((w4 * table[i4, f] + w5 * table[i5, f]) + (w6 * table[i6, f] + w7 * table[i7, f]))  # fmt: skip
+            value = (w[0] * table[i[0], f] + w[1] * table[i[1], f]) + (w[2] * table[i[2], f] + w[3] * table[i[3], f])
+            if len(axes) == 3:
+                above = w[4] * table[i[4], f] + w[5] * table[i[5], f]
+                value += above + (w[6] * table[i[6], f] + w[7] * table[i[7], f])
+            out[f, n] = value
 
 
 @inner
-def scatter_level(grad, unit, resolution, above, features):
+def scatter_level(grad, unit, cells, above, axes, features):
     """Adds the gradient of one level's features, `above` [F, N], to the gradient of its table."""
-    entries = len(grad)
     for n in range(unit.shape[1]):
-        cx, fx = cell_of(unit[0, n], resolution)
-        cy, fy = cell_of(unit[1, n], resolution)
-        cz, fz = cell_of(unit[2, n], resolution)
-        i0, i1, i2, i3, i4, i5, i6, i7 = corners(cx, cy, cz, resolution, entries)
-        gx, gy, gz = float32(1) - fx, float32(1) - fy, float32(1) - fz
-        w0, w1, w2, w3 = gx * gy * gz, gx * gy * fz, gx * fy * gz, gx * fy * fz
-        w4, w5, w6, w7 = fx * gy * gz, fx * gy * fz, fx * fy * gz, fx * fy * fz
+        i, w = corners(unit, n, cells, len(grad), axes)
         for f in range(len(features)):
             g = above[f, n]
-            grad[i0, f] += w0 * g
-            grad[i1, f] += w1 * g
-            grad[i2, f] += w2 * g
-            grad[i3, f] += w3 * g
-            grad[i4, f] += w4 * g
-            grad[i5, f] += w5 * g
-            grad[i6, f] += w6 * g
-            grad[i7, f] += w7 * g
+            for corner in range(len(w)):
+                grad[i[corner], f] += w[corner] * g
 
 
 @kernel
-def interpolate(tables, unit, resolutions, sizes, out, features, workers):
-    """out [LF, N] from tables [T, F] and unit [3, N]. A level belongs to few workers: its table then stays in their cache."""
+def interpolate(tables, unit, resolutions, sizes, out, axes, features, workers):
+    """out [LF, N] from tables [T, F], unit [D, N] and resolutions [L, D]. A level belongs to few workers: its table then
+    stays in their cache."""
     samples, levels, width = unit.shape[1], len(resolutions), len(features)
     parts = max(1, workers // levels)
     for worker in prange(workers):
         start = 0
         for level in range(levels):
-            table = tables[start : start + sizes[level]]
+            table, cells = tables[start : start + sizes[level]], cells_of(resolutions, level, axes)
             rows = out[level * width : (level + 1) * width]
             for part in range(parts):
                 if (level * parts + part) % workers == worker:
                     first, last = samples * part // parts, samples * (part + 1) // parts
-                    interpolate_level(table, unit, first, last, resolutions[level], rows, features)
+                    interpolate_level(table, unit, first, last, cells, rows, axes, features)
             start += sizes[level]
 
 
 @kernel
-def scatter(grad, unit, resolutions, sizes, above, features, workers):
+def scatter(grad, unit, resolutions, sizes, above, axes, features, workers):
     """Fills grad [T, F]. A level belongs to one worker, so no two add to the same entry."""
     levels, width = len(resolutions), len(features)
     for worker in prange(workers):
         start = 0
         for level in range(levels):
             if level % workers == worker:
-                part = grad[start : start + sizes[level]]
+                part, cells = grad[start : start + sizes[level]], cells_of(resolutions, level, axes)
                 part[:] = float32(0)
-                scatter_level(part, unit, resolutions[level], above[level * width : (level + 1) * width], features)
+                scatter_level(part, unit, cells, above[level * width : (level + 1) * width], axes, features)
             start += sizes[level]
