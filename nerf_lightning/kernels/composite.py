@@ -44,14 +44,7 @@ def accumulate(
     return values.new_zeros(rays, values.shape[1]).index_add(0, ray, weights[:, None] * values)
 
 
-def composite_reference(
-    density: Float[Tensor, "N"],
-    rgb: Float[Tensor, "N 3"],
-    t: Float[Tensor, "N"],
-    dt: Float[Tensor, "N"],
-    ray: Int[Tensor, "N"],
-    offsets: Int[Tensor, "R_plus_1"],
-) -> Pixels:
+def composite_reference(density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, ray: Tensor, offsets: Tensor) -> Pixels:
     """`composite` in plain torch, for every device."""
     weights = volume_weights(density, dt, ray, offsets)
     values = torch.cat([rgb, torch.ones_like(weights)[:, None], t[:, None]], dim=1)
@@ -63,26 +56,24 @@ def composite_reference(
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, offsets: Tensor) -> Pixels:
-        from nerf_lightning.kernels.cpu import composite as cpu
-        from nerf_lightning.kernels.cpu import workers
+        from nerf_lightning.kernels.cpu import composite, workers
 
         rays = len(offsets) - 1
         density, rgb = density.contiguous(), rgb.T.contiguous()
         colour, opacity, depth, before = torch.empty(3, rays), torch.empty(rays), torch.empty(rays), torch.empty(len(t))
         given = [x.detach().numpy() for x in (density, rgb, t, dt, offsets)]
-        cpu.forward(*given, colour.numpy(), opacity.numpy(), depth.numpy(), before.numpy(), workers())
+        composite.forward(*given, colour.numpy(), opacity.numpy(), depth.numpy(), before.numpy(), workers())
         ctx.save_for_backward(density, rgb, t, dt, offsets, before)
         return colour.T, opacity, depth
 
     @staticmethod
     def backward(ctx, colour: Tensor, opacity: Tensor, depth: Tensor) -> tuple[Tensor | None, ...]:
-        from nerf_lightning.kernels.cpu import composite as cpu
-        from nerf_lightning.kernels.cpu import workers
+        from nerf_lightning.kernels.cpu import composite, workers
 
         saved = [x.numpy() for x in ctx.saved_tensors]
         above = colour.T.contiguous().numpy(), opacity.contiguous().numpy(), depth.contiguous().numpy()
         density, rgb = torch.empty(saved[0].shape), torch.empty(saved[1].shape)
-        cpu.backward(*saved, *above, density.numpy(), rgb.numpy(), workers())
+        composite.backward(*saved, *above, density.numpy(), rgb.numpy(), workers())
         return density, rgb.T, None, None, None
 
 
@@ -110,11 +101,7 @@ def composite(
 
 
 def keep_visible_reference(
-    thickness: Float[Tensor, "N"],
-    packed: Packed,
-    transparent: float,
-    thin: float | Float[Tensor, ""],
-    room: int | None = None,
+    thickness: Tensor, packed: Packed, transparent: float, thin: float | Tensor, room: int | None = None
 ) -> Kept:
     """`keep_visible` in plain torch, for every device."""
     t, dt, ray, offsets = packed
@@ -150,11 +137,10 @@ def keep_visible(
     t, dt, ray, offsets = packed
     if room is not None or not fast(thickness, t, dt) or t.requires_grad or dt.requires_grad:
         return keep_visible_reference(thickness, packed, transparent, thin, room)
-    from nerf_lightning.kernels.cpu import composite as cpu
-    from nerf_lightning.kernels.cpu import workers
+    from nerf_lightning.kernels.cpu import composite, workers
 
     threads, keep, counts = workers(), np.empty(len(t), np.bool_), np.empty(len(offsets) - 1, np.int64)
-    cpu.visible(
+    composite.visible(
         thickness.detach().contiguous().numpy(),
         offsets.numpy(),
         transparent,
@@ -167,5 +153,5 @@ def keep_visible(
     np.cumsum(counts, out=kept.numpy()[1:])
     total = int(kept[-1])
     out = torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
-    cpu.gather(keep, offsets.numpy(), kept.numpy(), t.numpy(), dt.numpy(), *(x.numpy() for x in out), threads)
+    composite.gather(keep, offsets.numpy(), kept.numpy(), t.numpy(), dt.numpy(), *(x.numpy() for x in out), threads)
     return *out, kept

@@ -72,17 +72,9 @@ def pack_intervals(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]
 
 
 def march_reference(
-    rays: Rays,
-    bounds: Bounds,
-    near: Float[Tensor, "R"],
-    far: Float[Tensor, "R"],
-    shift: Float[Tensor, "R"],
-    occupied: Bool[Tensor, "cells"],
-    samples: int,
-    step: float,
-    room: int | None = None,
-    most: int = MOST,
-) -> Packed:
+    rays: Rays, bounds: Bounds, near: Tensor, far: Tensor, shift: Tensor, occupied: Tensor,
+    samples: int, step: float, room: int | None = None, most: int = MOST,
+) -> Packed:  # fmt: skip
     """`march` in plain torch, for every device."""
     resolution = round(len(occupied) ** (1 / 3))
     # One more than the steps: the first one may be cut short by the shift, and the last must reach the far end.
@@ -130,35 +122,32 @@ def march(
     constants = not any(x.requires_grad for x in (rays.origins, rays.directions, near, far, shift))
     if room is not None or not (constants and fast(rays.origins, near, shift)):
         return march_reference(rays, bounds, near, far, shift, occupied, samples, step, room, most)
-    from nerf_lightning.kernels.cpu import march as cpu
-    from nerf_lightning.kernels.cpu import workers
+    from nerf_lightning.kernels.cpu import march, workers
 
     threads, count, resolution = workers(), len(rays), round(len(occupied) ** (1 / 3))
     cells = resolution // BLOCK if resolution % BLOCK == 0 else resolution
     blocks = np.empty(cells**3, np.bool_)
-    cpu.coarsen(occupied.numpy(), resolution, blocks, cells, threads)
+    march.coarsen(occupied.numpy(), resolution, blocks, cells, threads)
     found, counts = np.empty((count, samples + 1), np.int32), np.empty(count, np.int64)
     origins, directions = rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy()
     inside = bounds.inside(rays) if bounds.unbounded else torch.empty(0, 2)
     ends = tuple(x.contiguous().numpy() for x in (near, far, inside, shift))
     half, length = bounds.half_size.numpy(), np.float32(step)
     box = bounds.centre.numpy(), half, bounds.unbounded
-    cpu.walk(
+    march.walk(
         origins, directions, *ends, occupied.numpy(), resolution, blocks, cells, *box, samples, length, found, counts, threads
     )  # fmt: skip
     offsets = torch.zeros(count + 1, dtype=torch.int64)
     np.cumsum(counts, out=offsets.numpy()[1:])
     total = int(offsets[-1])
     t, dt, ray = torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
-    cpu.pack(
+    march.pack(
         *ends, half, bounds.unbounded, samples, length, found, offsets.numpy(), t.numpy(), dt.numpy(), ray.numpy(), threads
     )  # fmt: skip
     return t, dt, ray, offsets
 
 
-def points_reference(
-    origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
-) -> Float[Tensor, "N 3"]:
+def points_reference(origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor) -> Float[Tensor, "N 3"]:
     """`points` in plain torch, for every device."""
     return origins.index_select(0, ray) + t[:, None] * directions.index_select(0, ray)
 
@@ -169,18 +158,15 @@ def points(
     """Positions at distances `t` along the rays that `ray` numbers."""
     if not fast(origins, directions, t) or any(x.requires_grad for x in (origins, directions, t)):
         return points_reference(origins, directions, ray, t)
-    from nerf_lightning.kernels.cpu import march as cpu
-    from nerf_lightning.kernels.cpu import workers
+    from nerf_lightning.kernels.cpu import march, workers
 
     out = torch.empty(3, len(t))
     arrays = (x.contiguous().numpy() for x in (origins, directions, ray, t))
-    cpu.points(*arrays, out.numpy(), workers())
+    march.points(*arrays, out.numpy(), workers())
     return out.T
 
 
-def mark_cells_reference(
-    marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions: Float[Tensor, "N 3"]
-) -> None:
+def mark_cells_reference(marks: Tensor, mark: int, bounds: Bounds, positions: Tensor) -> None:
     """`mark_cells` in plain torch, for every device."""
     marks.index_fill_(0, cell_index(bounds.to_unit(positions), round(len(marks) ** (1 / 3))), mark)
 
@@ -189,9 +175,8 @@ def mark_cells(marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions
     """Writes `mark` into each cell of a cubic grid over the bounds that holds one of some positions, world units."""
     if not fast(positions):
         return mark_cells_reference(marks, mark, bounds, positions)
-    from nerf_lightning.kernels.cpu import march as cpu
-    from nerf_lightning.kernels.cpu import workers
+    from nerf_lightning.kernels.cpu import march, workers
 
     box = bounds.centre.numpy(), bounds.half_size.numpy(), bounds.unbounded
     places = positions.detach().T.contiguous().numpy()
-    cpu.mark(places, *box, marks.numpy(), round(len(marks) ** (1 / 3)), mark, workers())
+    march.mark(places, *box, marks.numpy(), round(len(marks) ** (1 / 3)), mark, workers())

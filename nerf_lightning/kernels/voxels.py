@@ -122,12 +122,7 @@ class _Read(torch.autograd.Function):
 
 
 def read_voxels_reference(
-    density: Float[Tensor, "V"],
-    colour: Float[Tensor, "V 3"],
-    views: Float[Tensor, "V C"],
-    rows: Int[Tensor, "N 8"],
-    weights: Float[Tensor, "N 8"],
-    basis: Float[Tensor, "N B"],
+    density: Tensor, colour: Tensor, views: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
     """`read_voxels` in plain torch, for every device and differentiable in weights and basis too."""
     # One table, so that all is gathered at once.
@@ -183,9 +178,7 @@ def _neighbours(side: int, device: torch.device) -> tuple[Int[Tensor, "6 1"], ..
     return strides, strides * signs, (signs > 0) * (side - 1)
 
 
-def roughness_reference(
-    values: Float[Tensor, "V"], vertex: Int[Tensor, "V"], index: Int[Tensor, "cells"], first: int, last: int
-) -> Float[Tensor, ""]:
+def roughness_reference(values: Tensor, vertex: Tensor, index: Tensor, first: int, last: int) -> Float[Tensor, ""]:
     """`roughness` in plain torch, for every device."""
     side, at = side_of(index), vertex[first:last].long()
     strides, ways, ends = _neighbours(side, index.device)

@@ -29,13 +29,26 @@ def unwarp(y, enter, leave, unit):
     return enter + unit * y
 
 
-@inner
-def edge(k, shift, near, far, step, samples, unbounded, low, span, enter, leave, unit):
+@inner(forceinline=True)
+def span_of(near, far, inside, ray, half, unbounded):
+    """What `edge` needs to know of a ray: where it begins and ends, and of an unbounded one its warped distances."""
+    first, last, unit = near[ray], max(far[ray], near[ray]), max(half[0], max(half[1], half[2]))
+    enter, leave, low, length = float32(0), float32(0), float32(0), float32(0)
+    if unbounded:
+        enter, leave = inside[ray, 0], inside[ray, 1]
+        low = warp(first, enter, leave, unit)
+        length = warp(last, enter, leave, unit) - low
+    return first, last, enter, leave, unit, low, length
+
+
+@inner(forceinline=True)
+def edge(k, shift, span, step, samples, unbounded):
     """Distance at which interval k begins."""
+    first, last, enter, leave, unit, low, length = span
     steps = (float32(k) - float32(0.5)) + shift
     if not unbounded:
-        return min(near + max(steps, float32(0)) * step, far)
-    return unwarp(low + span * min(max(steps / float32(samples), float32(0)), float32(1)), enter, leave, unit)
+        return min(first + max(steps, float32(0)) * step, last)
+    return unwarp(low + length * min(max(steps / float32(samples), float32(0)), float32(1)), enter, leave, unit)
 
 
 @inner
@@ -65,6 +78,12 @@ def cell(u, resolution):
 
 
 @inner
+def flat_cell(u, v, w, resolution):
+    """Number of the cell of a cubic grid that holds a place in the unit cube."""
+    return (cell(u, resolution) * resolution + cell(v, resolution)) * resolution + cell(w, resolution)
+
+
+@inner
 def steps_to_leave(origin, direction, centre, half, cells, u, v, w, t, step):
     """How many steps surely stay within the present cell of a cells^3 grid over the box (0 if unsure)."""
     nearest = float32(1e30)
@@ -89,45 +108,29 @@ def walk(origins, directions, near, far, inside, shift, occupied, resolution, bl
         occupied: [resolution^3], row by row.
         blocks: [cells^3], whether any cell of a block is occupied: empty blocks are crossed in one leap.
     """
-    rays, unit = len(near), max(half[0], max(half[1], half[2]))
+    rays = len(near)
     for worker in prange(workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
-            first, last, kept = near[ray], max(far[ray], near[ray]), 0
-            enter, leave, low, span = float32(0), float32(0), float32(0), float32(0)
-            if unbounded:
-                enter, leave = inside[ray, 0], inside[ray, 1]
-                low = warp(first, enter, leave, unit)
-                span = warp(last, enter, leave, unit) - low
-            k = 0
-            start = edge(0, shift[ray], first, last, step, samples, unbounded, low, span, enter, leave, unit)
+            span, k, kept = span_of(near, far, inside, ray, half, unbounded), 0, 0
+            start = edge(0, shift[ray], span, step, samples, unbounded)
             while k <= samples:
-                end = edge(k + 1, shift[ray], first, last, step, samples, unbounded, low, span, enter, leave, unit)
+                end = edge(k + 1, shift[ray], span, step, samples, unbounded)
                 if not end > start:
-                    if start >= last:
+                    if start >= span[1]:
                         break
                     k, start = k + 1, end
                     continue
                 t = (start + end) / float32(2)
-                u, v, w = to_unit(
-                    origins[ray, 0] + t * directions[ray, 0],
-                    origins[ray, 1] + t * directions[ray, 1],
-                    origins[ray, 2] + t * directions[ray, 2],
-                    centre,
-                    half,
-                    unbounded,
-                )
-                if not blocks[(cell(u, cells) * cells + cell(v, cells)) * cells + cell(w, cells)]:
+                x, y = origins[ray, 0] + t * directions[ray, 0], origins[ray, 1] + t * directions[ray, 1]
+                u, v, w = to_unit(x, y, origins[ray, 2] + t * directions[ray, 2], centre, half, unbounded)
+                if not blocks[flat_cell(u, v, w, cells)]:
                     leap = 0
                     if not unbounded:
                         leap = steps_to_leave(origins[ray], directions[ray], centre, half, cells, u, v, w, t, step)
                     if leap > 0:
                         k += leap
-                        end = edge(
-                            k + 1, shift[ray], first, last, step, samples, unbounded, low, span, enter, leave, unit
-                        )
-                elif occupied[
-                    (cell(u, resolution) * resolution + cell(v, resolution)) * resolution + cell(w, resolution)
-                ]:
+                        end = edge(k + 1, shift[ray], span, step, samples, unbounded)
+                elif occupied[flat_cell(u, v, w, resolution)]:
                     found[ray, kept] = k
                     kept += 1
                 k, start = k + 1, end
@@ -137,19 +140,14 @@ def walk(origins, directions, near, far, inside, shift, occupied, resolution, bl
 @kernel
 def pack(near, far, inside, shift, half, unbounded, samples, step, found, offsets, t, dt, ray_of, workers):
     """Distances and lengths of the intervals that `walk` noted, one ray after the other."""
-    rays, unit = len(near), max(half[0], max(half[1], half[2]))
+    rays = len(near)
     for worker in prange(workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
-            first, last = near[ray], max(far[ray], near[ray])
-            enter, leave, low, span = float32(0), float32(0), float32(0), float32(0)
-            if unbounded:
-                enter, leave = inside[ray, 0], inside[ray, 1]
-                low = warp(first, enter, leave, unit)
-                span = warp(last, enter, leave, unit) - low
+            span = span_of(near, far, inside, ray, half, unbounded)
             for n in range(offsets[ray], offsets[ray + 1]):
                 k = found[ray, n - offsets[ray]]
-                start = edge(k, shift[ray], first, last, step, samples, unbounded, low, span, enter, leave, unit)
-                end = edge(k + 1, shift[ray], first, last, step, samples, unbounded, low, span, enter, leave, unit)
+                start = edge(k, shift[ray], span, step, samples, unbounded)
+                end = edge(k + 1, shift[ray], span, step, samples, unbounded)
                 t[n], dt[n], ray_of[n] = (start + end) / float32(2), end - start, ray
 
 
@@ -188,4 +186,4 @@ def mark(places, centre, half, unbounded, marks, resolution, value, workers):
     for worker in prange(workers):
         for n in range(samples * worker // workers, samples * (worker + 1) // workers):
             u, v, w = to_unit(places[0, n], places[1, n], places[2, n], centre, half, unbounded)
-            marks[(cell(u, resolution) * resolution + cell(v, resolution)) * resolution + cell(w, resolution)] = value
+            marks[flat_cell(u, v, w, resolution)] = value

@@ -17,34 +17,46 @@ RUN = (0,) * 8
 
 
 @inner(inline="always")
-def sum4(a0, b0, a1, b1, a2, b2, a3, b3, start):
-    """start + a0 b0 + a1 b1 + a2 b2 + a3 b3, from the last to the first."""
-    return fused(a0, b0, fused(a1, b1, fused(a2, b2, fused(a3, b3, start))))
+def sum4(w, a0, a1, a2, a3, start):
+    """start + w0 a0 + w1 a1 + w2 a2 + w3 a3, from the last to the first."""
+    return fused(w[0], a0, fused(w[1], a1, fused(w[2], a2, fused(w[3], a3, start))))
+
+
+@inner(inline="always")
+def add_product(w0, w1, w2, w3, x, i, y, o):
+    """Adds to four rows of y, from o on, what four rows of weights make of the rows of x from i on."""
+    for n in range(TILE):
+        x0, x1, x2, x3 = x[i, n], x[i + 1, n], x[i + 2, n], x[i + 3, n]
+        y[o, n] = sum4(w0, x0, x1, x2, x3, y[o, n])
+        y[o + 1, n] = sum4(w1, x0, x1, x2, x3, y[o + 1, n])
+        y[o + 2, n] = sum4(w2, x0, x1, x2, x3, y[o + 2, n])
+        y[o + 3, n] = sum4(w3, x0, x1, x2, x3, y[o + 3, n])
+
+
+@inner(inline="always")
+def row4(W, o, i):
+    return W[o, i], W[o, i + 1], W[o, i + 2], W[o, i + 3]
+
+
+@inner(inline="always")
+def column4(W, o, i):
+    return W[o, i], W[o + 1, i], W[o + 2, i], W[o + 3, i]
 
 
 @inner
-def affine(W, b, x, y, rectify):
-    """y = W x + b, rectified or not."""
+def affine(W, b, x, y, relu):
+    """y = W x + b, or its ReLU."""
     outputs, inputs = W.shape
     for o in range(0, outputs, 4):
         for k in range(o, o + 4):
             for n in range(TILE):
                 y[k, n] = b[k]
         for i in range(0, inputs, 4):
-            w00, w01, w02, w03 = W[o, i], W[o, i + 1], W[o, i + 2], W[o, i + 3]
-            w10, w11, w12, w13 = W[o + 1, i], W[o + 1, i + 1], W[o + 1, i + 2], W[o + 1, i + 3]
-            w20, w21, w22, w23 = W[o + 2, i], W[o + 2, i + 1], W[o + 2, i + 2], W[o + 2, i + 3]
-            w30, w31, w32, w33 = W[o + 3, i], W[o + 3, i + 1], W[o + 3, i + 2], W[o + 3, i + 3]
-            for n in range(TILE):
-                x0, x1, x2, x3 = x[i, n], x[i + 1, n], x[i + 2, n], x[i + 3, n]
-                y[o, n] = sum4(w00, x0, w01, x1, w02, x2, w03, x3, y[o, n])
-                y[o + 1, n] = sum4(w10, x0, w11, x1, w12, x2, w13, x3, y[o + 1, n])
-                y[o + 2, n] = sum4(w20, x0, w21, x1, w22, x2, w23, x3, y[o + 2, n])
-                y[o + 3, n] = sum4(w30, x0, w31, x1, w32, x2, w33, x3, y[o + 3, n])
-        if rectify:
+            add_product(row4(W, o, i), row4(W, o + 1, i), row4(W, o + 2, i), row4(W, o + 3, i), x, i, y, o)
+        if relu:
             for k in range(o, o + 4):
                 for n in range(TILE):
-                    y[k, n] = float32(0) if y[k, n] < float32(0) else y[k, n]  # keeps what is not a number
+                    y[k, n] = float32(0) if y[k, n] < float32(0) else y[k, n]  # keeps NaN
 
 
 @inner
@@ -54,16 +66,8 @@ def back_input(W, dy, dx):
     for i in range(0, inputs, 4):
         dx[i : i + 4] = float32(0)
         for o in range(0, outputs, 4):
-            w00, w01, w02, w03 = W[o, i], W[o, i + 1], W[o, i + 2], W[o, i + 3]
-            w10, w11, w12, w13 = W[o + 1, i], W[o + 1, i + 1], W[o + 1, i + 2], W[o + 1, i + 3]
-            w20, w21, w22, w23 = W[o + 2, i], W[o + 2, i + 1], W[o + 2, i + 2], W[o + 2, i + 3]
-            w30, w31, w32, w33 = W[o + 3, i], W[o + 3, i + 1], W[o + 3, i + 2], W[o + 3, i + 3]
-            for n in range(TILE):
-                y0, y1, y2, y3 = dy[o, n], dy[o + 1, n], dy[o + 2, n], dy[o + 3, n]
-                dx[i, n] = sum4(w00, y0, w10, y1, w20, y2, w30, y3, dx[i, n])
-                dx[i + 1, n] = sum4(w01, y0, w11, y1, w21, y2, w31, y3, dx[i + 1, n])
-                dx[i + 2, n] = sum4(w02, y0, w12, y1, w22, y2, w32, y3, dx[i + 2, n])
-                dx[i + 3, n] = sum4(w03, y0, w13, y1, w23, y2, w33, y3, dx[i + 3, n])
+            w0, w1, w2, w3 = column4(W, o, i), column4(W, o, i + 1), column4(W, o, i + 2), column4(W, o, i + 3)
+            add_product(w0, w1, w2, w3, dy, o, dx, i)
 
 
 @inner
