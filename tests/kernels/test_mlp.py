@@ -1,6 +1,5 @@
 from itertools import pairwise
 
-import jaxtyping
 import pytest
 import torch
 from agreement import agree, outcome, with_threads
@@ -45,11 +44,17 @@ def test_a_network_agrees_with_a_loop_over_neurons(widths: tuple[int, ...], furt
 
 
 @pytest.mark.parametrize("widths", WIDTHS)
-@pytest.mark.parametrize("further", [0, 1, 16])
-@pytest.mark.parametrize("samples", [0, 1, 127, 128, 129, 1000])
+@pytest.mark.parametrize("further", [0, 3])
+@pytest.mark.parametrize("samples", [0, 1, 128, 1000])
 def test_a_network_agrees_with_the_reference(widths: tuple[int, ...], further: int, samples: int):
     inputs = [torch.randn(samples, further), torch.randn(samples, widths[0]), *network(widths, further)]
-    agree(lambda extra, x, *flat: mlp(x, pairs(flat), extra if further else None), inputs, constants=(0,), atol=1e-5)
+    agree(
+        lambda extra, x, *flat: mlp(x, pairs(flat), extra if further else None),
+        inputs,
+        constants=(0,),
+        atol=1e-5,
+        any_threads=False,
+    )
 
 
 @pytest.mark.parametrize("first", [0, 1, 3])
@@ -62,10 +67,10 @@ def test_heads_are_the_outputs_taken_apart(first: int, kernels: str):
 @pytest.mark.parametrize("samples", [0, 300])
 def test_gradients_of_heads_agree_with_the_reference(samples: int):
     inputs = [torch.randn(samples, 12), *network((12, 32, 7))]
-    agree(lambda x, *flat: mlp_heads(x, pairs(flat), 3), inputs, atol=1e-5)
+    agree(lambda x, *flat: mlp_heads(x, pairs(flat), 3), inputs, atol=1e-5, any_threads=False)
     # One of them alone: the other has no gradient to hand down.
-    agree(lambda x, *flat: mlp_heads(x, pairs(flat), 3)[0], inputs, atol=1e-5)
-    agree(lambda x, *flat: mlp_heads(x, pairs(flat), 3)[1], inputs, atol=1e-5)
+    agree(lambda x, *flat: mlp_heads(x, pairs(flat), 3)[0], inputs, atol=1e-5, any_threads=False)
+    agree(lambda x, *flat: mlp_heads(x, pairs(flat), 3)[1], inputs, atol=1e-5, any_threads=False)
 
 
 def test_strides_do_not_matter(kernels: str):
@@ -117,11 +122,3 @@ def test_a_weight_that_is_not_a_number_shows(which: int, kernels: str):
     flat = network((5, 6, 3))
     flat[which].view(-1)[-1] = float("nan")
     assert mlp(torch.randn(10, 5), pairs(flat)).isnan().any(1).all()
-
-
-def test_a_wrong_shape_is_refused_in_tests():
-    flat = network((5, 6, 3))
-    with pytest.raises(jaxtyping.TypeCheckError):
-        mlp(torch.zeros(5), pairs(flat))
-    with pytest.raises(jaxtyping.TypeCheckError):
-        mlp(torch.zeros(4, 5), pairs(flat), torch.zeros(3, 1))

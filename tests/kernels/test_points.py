@@ -1,9 +1,8 @@
 from dataclasses import replace
 
-import jaxtyping
 import pytest
 import torch
-from agreement import agree, with_threads
+from agreement import agree
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Rays
@@ -23,8 +22,6 @@ def test_points_lie_on_their_rays(count: int):
         points(origins, directions, ray, t), torch.tensor(expected).view(-1, 3), rtol=1e-5, atol=1e-5
     )
     agree(points, [origins, directions, ray, t])  # with gradients
-    one = with_threads(lambda: [points(origins, directions, ray, t)], 1)[0]
-    assert torch.equal(one, points(origins, directions, ray, t))
 
 
 def test_a_distance_or_a_ray_that_is_not_a_number_shows(kernels: str):
@@ -48,8 +45,3 @@ def test_marked_cells_are_those_that_hold_samples(unbounded: bool, box: Bounds, 
     assert torch.equal(marks, expected) and {3, 7} == set(marks.tolist())
     mark_cells(marks, 9, bounds, positions[:0])
     assert torch.equal(marks, expected), "no samples, no marks"
-
-
-def test_a_wrong_shape_is_refused_in_tests(rays: Rays):
-    with pytest.raises(jaxtyping.TypeCheckError):
-        points(rays.origins, rays.directions[:, :2], torch.zeros(3).long(), torch.zeros(3))

@@ -1,6 +1,5 @@
 import math
 
-import jaxtyping
 import pytest
 import torch
 from agreement import with_threads
@@ -74,9 +73,3 @@ def test_a_density_that_is_not_a_number_stays(kernels: str):
     density[5] = float("nan")
     t, _, ray, _ = keep_visible(density * samples.dt, packed(samples), 1e-4, 0.01)
     assert float(samples.t[5]) in t.tolist() and (ray == 1).any()
-
-
-def test_a_wrong_shape_is_refused_in_tests():
-    n, ray, offsets = torch.zeros(3), torch.zeros(3).long(), torch.tensor([0, 3])
-    with pytest.raises(jaxtyping.TypeCheckError):
-        keep_visible(torch.zeros(2), (n, n, ray, offsets), 1e-4, 0.0)

@@ -1,7 +1,6 @@
-import jaxtyping
 import pytest
 import torch
-from agreement import agree, outcome, with_threads
+from agreement import agree
 from torch import Tensor
 
 from nerf_lightning.kernels import (
@@ -11,7 +10,6 @@ from nerf_lightning.kernels import (
     read_voxels,
     roughness,
     spherical_harmonics,
-    use_kernels,
     voxel_value,
 )
 
@@ -86,21 +84,13 @@ def test_fast_value_agrees_with_the_reference(count: int):
     agree(voxel_value, [values, index, unit], constants=(2,))
 
 
-@pytest.mark.parametrize("terms", [0, 3, 8, 15])
-@pytest.mark.parametrize("count", [0, 1, 64, 700])
+@pytest.mark.parametrize("terms", [0, 3, 15])
+@pytest.mark.parametrize("count", [0, 1, 700])
 def test_fast_reading_agrees_with_the_reference(terms: int, count: int):
     index, unit = sparse_index(), places(count)
     rows, weights = locate(index, unit)
     inputs = [*tables(index, terms), rows, weights, basis_of(len(unit), terms)]
     agree(read_voxels, inputs, constants=(4, 5), atol=3e-6)
-
-
-def test_any_number_of_threads_gives_the_same():
-    index, unit = sparse_index(9), places(3001)
-    rows, weights = locate(index, unit)
-    inputs = [*tables(index, 3), rows, weights, basis_of(len(unit), 3)]
-    one, two = (with_threads(lambda: outcome(read_voxels, inputs, (4, 5)), threads) for threads in (1, 2))
-    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
 
 
 def test_what_is_not_kept_gets_no_gradient(kernels: str):
@@ -213,13 +203,3 @@ def test_all_kept_vertices_count_as_rows():
     rows, weights = locate(index, unit)
     expected = torch.stack([by_hand(values, index, p) for p in unit.tolist()])
     torch.testing.assert_close(interpolate_rows(values, rows, weights).double(), expected, atol=1e-5, rtol=1e-5)
-
-
-def test_a_wrong_shape_is_refused_in_tests():
-    use_kernels("reference")
-    index, unit = sparse_index(), places(4)
-    density, colour, views = tables(index, 3)
-    rows, weights = locate(index, unit)
-    for wrong in ((density[1:], colour, views), (density, colour[:, :2], views), (density, colour, views[1:])):
-        with pytest.raises(jaxtyping.TypeCheckError):
-            read_voxels(*wrong, rows, weights, basis_of(len(unit), 3))
