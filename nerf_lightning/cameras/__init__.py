@@ -1,4 +1,4 @@
-"""Stage 1, cameras: pixels -> Rays, and the Bounds that say where along them the content is."""
+"""Stage 1, cameras: pixels -> Rays, and the Bounds of the content along them."""
 
 from nerf_lightning.cameras.bounds import Bounds, InBounds
 from nerf_lightning.cameras.cameras import Cameras, Rays

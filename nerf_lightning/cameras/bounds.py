@@ -13,11 +13,11 @@ from torch import Tensor
 from nerf_lightning.cameras.cameras import Rays
 
 UNBOUNDED_REACH = 50.0
-"""An unbounded scene is sampled out to this many box half-sizes; what is beyond looks like a picture at infinity."""
+"""An unbounded scene is sampled out to this many half-sizes of the box; beyond, it looks like a picture at infinity."""
 
 
 def once(of: Callable[[Any], Tensor]) -> cached_property:
-    """A tensor that is worked out when it is first asked for, and serves with gradients too if that was without."""
+    """A cached property whose tensor works with gradients even if first read in inference mode."""
 
     def made(self: Any) -> Tensor:
         with torch.inference_mode(False):
@@ -30,7 +30,7 @@ def once(of: Callable[[Any], Tensor]) -> cached_property:
 class Bounds:
     """An axis-aligned box around the content, in world units.
 
-    A bounded scene has nothing outside the box. An unbounded one keeps the box at full detail and contracts all that is
+    A bounded scene has nothing outside the box. An unbounded one keeps the box at full detail and contracts everything
     outside it into a shell of the unit cube (mip-NeRF 360, eq. 10, with the max norm).
     """
 
@@ -41,7 +41,7 @@ class Bounds:
     """Overrides the distance along the ray where sampling starts; None takes it from the box."""
     far: float | None = None
     pixel: float | None = None
-    """Width of what one pixel of the photos shows at the content, world units; None where that is not known."""
+    """Width of what one pixel of the photos shows at the content, world units; None if unknown."""
 
     @once
     def centre(self) -> Float[Tensor, "3"]:
@@ -66,14 +66,14 @@ class Bounds:
 
     @property
     def pixels_across(self) -> float:
-        """How many pixels lie side by side along the unit cube's longest edge, if all showed what those in the box show."""
+        """Pixels along the unit cube's longest edge, at the size they have in the box."""
         if self.pixel is None:
             return math.inf
         # The contraction leaves the middle half of the unit cube to the box.
         return (4 if self.unbounded else 2) * self.longest / self.pixel
 
     def settle(self) -> None:
-        """Works out at once what else would be worked out when it is first asked for."""
+        """Computes all cached properties now."""
         _ = self.centre, self.half_size, self._low, self._size, self.longest
 
     def to(self, device: torch.device | str) -> "Bounds":
@@ -97,7 +97,7 @@ class Bounds:
         return torch.where(norm <= 1, contracted, outside) * self.half_size + self.centre
 
     def near_far(self, rays: Rays) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
-        """Distances along each ray between which it can meet content; near >= far where it misses.
+        """Distances along each ray between which it can meet content; near >= far if it misses.
 
         Bounded: the slab test against the box. Unbounded: from a small clearance to `UNBOUNDED_REACH` half-sizes.
         """
@@ -110,15 +110,15 @@ class Bounds:
         return near, leave if self.far is None else leave.clamp_max(self.far)
 
     def _crossing(self, rays: Rays) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
-        """Where each ray's line enters and leaves the box, by the slab test: leave < enter where it misses."""
-        # A zero component never crosses its slab: nudge it, so that the division gives +-huge instead of nan.
+        """Where each ray's line enters and leaves the box, by the slab test: leave < enter if it misses."""
+        # A zero component never crosses its slab: nudged, the division gives +-huge instead of NaN.
         safe = rays.directions.masked_fill(rays.directions.abs() < 1e-9, 1e-9)
         crossings = (self.aabb[:, None] - rays.origins) / safe
         return crossings.amin(0).amax(-1), crossings.amax(0).amin(-1)
 
     def inside(self, rays: Rays) -> Float[Tensor, "R 2"]:
-        """Distances between which each ray is at its closest to the content: those in the box, or twice where it passes the
-        box's centre. They may be negative."""
+        """Distances between which each ray is closest to the content: inside the box, or if it misses, twice the point nearest
+        to the box's centre. They may be negative."""
         enter, leave = self._crossing(rays)
         closest = ((self.centre - rays.origins) * rays.directions).sum(-1)
         return torch.stack([torch.where(enter < leave, end, closest) for end in (enter, leave)], dim=-1)
@@ -128,8 +128,8 @@ class Bounds:
     ) -> Float[Tensor, "R S"]:
         """Maps s in [0, 1] to distances: linear when bounded; when not, linear inside the box, thinning out from it.
 
-        The unbounded map is even in `warp`, as samples are in the contracted space of mip-NeRF 360 (section 3): before the
-        box and behind it a step grows with the square of 1 + the distance to the box in half-sizes.
+        The unbounded map is even in `warp`, as mip-NeRF 360's samples are in contracted space (section 3): in front of the box
+        and behind it, a step grows with the square of 1 + the distance to the box in half-sizes.
         """
         near, far = near[:, None], torch.maximum(far, near)[:, None]
         if not self.unbounded:
@@ -140,8 +140,8 @@ class Bounds:
 
 
 def warp(t: Float[Tensor, "R S"], inside: Float[Tensor, "R 2"], unit: float) -> Float[Tensor, "R S"]:
-    """Distances along rays as numbers that are even where samples shall be: 0 at the nearer end of `inside`, growing by 1 a
-    `unit` up to its other end, and by x / (1 + x) in all over x units beyond either end."""
+    """Distances along rays as coordinates in which samples are even: 0 at the near end of `inside`, growing by 1 per `unit`
+    up to its far end, and by x / (1 + x) in total over x units beyond either end."""
     enter, leave = inside[:, :1], inside[:, 1:]
     before, behind = ((enter - t) / unit).clamp_min(0), ((t - leave) / unit).clamp_min(0)
     within = (torch.minimum(torch.maximum(t, enter), leave) - enter) / unit

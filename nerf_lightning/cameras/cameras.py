@@ -1,4 +1,4 @@
-"""Cameras and Rays, the currency of the first stages."""
+"""Cameras and Rays, the data of the first stages."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -42,7 +42,7 @@ class Cameras:
         return self.c2w.shape[0]
 
     def __getitem__(self, index: int | slice | Tensor) -> "Cameras":
-        """Some of the views; of one number that view, as cameras still."""
+        """Some of the views; an integer gives Cameras with that one view."""
         if isinstance(index, int):
             index = torch.tensor([index])
         return replace(self, K=self.K[index], c2w=self.c2w[index])
@@ -72,7 +72,7 @@ class Cameras:
 
     @cached_property
     def pixel_axes(self) -> Float[Tensor, "V 3 3"]:
-        """World vectors a, b, c of each view: pixel (u, v) looks along u a + v b + c, as `pixel_to_ray` says of one pixel."""
+        """World vectors a, b, c of each view: pixel (u, v) looks along u a + v b + c, as in `pixel_to_ray`."""
         K, rotation = self.K.cpu().double(), self.c2w[:, :3, :3].cpu().double()  # not every device has doubles
         identity = torch.eye(3, dtype=torch.float64).expand_as(K)
         inverse = torch.linalg.solve_triangular(K, identity, upper=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.cameras.cameras import Cameras
 
 ONE_SIDED = 0.35
-"""Length of the mean viewing direction, less its vertical part, beyond which cameras stand on one side of the subject."""
+"""Length of the mean viewing direction's horizontal part above which the cameras are all on one side of the subject."""
 
 
 def look_at(
@@ -17,7 +17,7 @@ def look_at(
 ) -> Float[Tensor, "*batch 4 4"]:
     """Poses at `eye` whose z axis points at `target` and whose y axis points away from `up` (OpenCV, camera to world).
 
-    Looking along `up` itself, any roll would do; one is chosen.
+    When looking along `up` itself, the roll is arbitrary.
     """
     forward = torch.nn.functional.normalize(target - eye, dim=-1)
     right = torch.linalg.cross(forward, up.expand_as(forward))
@@ -35,7 +35,7 @@ def focus_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
     """The point nearest to all optical axes in the least-squares sense: what the cameras look at.
 
     Solves sum_v (I - d_v d_v^T) (x - o_v) = 0; a small ridge pulls toward the mean centre, so that parallel axes
-    (one view, a flat sweep) still give a finite answer.
+    (one view, a flat sweep) still give a finite point.
     """
     centres = c2w[:, :3, 3].double()
     axes = torch.nn.functional.normalize(c2w[:, :3, 2].double(), dim=-1)
@@ -57,7 +57,7 @@ def orbit_around(
         up: unit vector, the circle's axis.
         radius: distance to the subject, scene's unit.
         elevation: angle above the plane through `centre` orthogonal to `up`, radians.
-        frames: how many poses; the last stops one step short of the first, so that a loop is smooth.
+        frames: number of poses; the last stops one step short of the first, so that a loop is smooth.
     """
     helper = torch.eye(3, dtype=up.dtype, device=up.device)[int(up.abs().argmin())]
     a = torch.nn.functional.normalize(torch.linalg.cross(up, helper), dim=-1)
@@ -80,20 +80,20 @@ def loop_before(
     Args:
         centre: the subject, world frame.
         axis: unit vector from the subject to the middle of the circle.
-        up: unit vector, what is up in the pictures.
+        up: unit vector, up in the pictures.
         radius: distance to the subject, scene's unit.
         angle: between the axis and each line of sight, radians.
-        frames: how many poses; the last stops one step short of the first.
+        frames: number of poses; the last stops one step short of the first.
     """
     circle = orbit_around(centre, axis, radius, math.pi / 2 - angle, frames)
     return look_at(circle[:, :3, 3], centre, up)
 
 
 def orbit_like(cameras: Cameras, frames: int = 60) -> Cameras:
-    """A closed path around what `cameras` look at, where they have seen it, with their size and first intrinsics.
+    """A closed path around what `cameras` look at, on the sides they saw, with their size and first intrinsics.
 
-    Cameras all around give a full turn at their mean distance and height; cameras on one side give a loop on that side, as
-    wide as they are spread.
+    Cameras all around give a full turn at their mean distance and height; cameras on one side give a loop there, as wide as
+    their spread.
     """
     centre = focus_point(cameras.c2w)
     up = torch.nn.functional.normalize(-cameras.c2w[:, :3, 1].mean(0), dim=-1)
@@ -113,16 +113,16 @@ def orbit_like(cameras: Cameras, frames: int = 60) -> Cameras:
 
 
 SPIRAL_TURNS, SPIRAL_CLIMB = 2, 0.75
-"""Turns of a spiral, and the share of the way to its axis that it climbs."""
+"""Turns of a spiral, and how much of the way to its axis it climbs."""
 
 
 def spiral_like(orbit: Cameras, frames: int = 60) -> Cameras:
     """A closed path that winds from an orbit up to its axis and back, at the same distance, with the same size and intrinsics.
 
     Args:
-        orbit: a circle of cameras that look at its middle or beside it, as `orbit_like` gives; of a path of another shape,
-            the circle that it resembles counts.
-        frames: how many poses; the last stops one step short of the first.
+        orbit: a circle of cameras that look at its middle or beside it, as `orbit_like` gives; a path of another shape
+            counts as the circle it resembles.
+        frames: number of poses; the last stops one step short of the first.
     """
     centre = focus_point(orbit.c2w)
     up = torch.nn.functional.normalize(-orbit.c2w[:, :3, 1].mean(0), dim=-1)
@@ -130,7 +130,7 @@ def spiral_like(orbit: Cameras, frames: int = 60) -> Cameras:
     radius = offset.norm(dim=-1).mean()
     mean = offset.mean(0)
     axis = torch.linalg.svd(offset - mean).Vh[2]  # across the circle's plane
-    side = mean if mean.norm() > 1e-3 * radius else up  # a circle around the subject's own height has no mean
+    side = mean if mean.norm() > 1e-3 * radius else up  # a circle at the subject's own height has no mean offset
     axis = axis * torch.where(axis @ side < 0, -1.0, 1.0)
     angle = torch.acos((torch.nn.functional.normalize(offset, dim=-1) @ axis).clamp(-1, 1)).mean()
     first = torch.nn.functional.normalize(offset[0] - (offset[0] @ axis) * axis, dim=-1)

@@ -14,7 +14,7 @@ from nerf_lightning.kernels.switch import fast
 Pixels = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
 """Colour, opacity and depth summed along each ray, each sample by its weight."""
 Kept = tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
-"""`Packed`, of the K samples that are left of N."""
+"""As `Packed`, for the K of N samples that are kept."""
 
 
 def volume_weights(
@@ -37,18 +37,11 @@ def volume_weights(
     return -torch.exp(before(thinner, ray, offsets)) * torch.expm1(thinner)
 
 
-def accumulate(
-    weights: Float[Tensor, "N"], values: Float[Tensor, "N D"], ray: Int[Tensor, "N"], rays: int
-) -> Float[Tensor, "R D"]:
-    """Weighted sum of the samples' values over each of `rays` rays; zero where a ray has none."""
-    return values.new_zeros(rays, values.shape[1]).index_add(0, ray, weights[:, None] * values)
-
-
 def composite_reference(density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, ray: Tensor, offsets: Tensor) -> Pixels:
-    """`composite` in plain torch, for every device."""
+    """`composite` in plain PyTorch, for every device."""
     weights = volume_weights(density, dt, ray, offsets)
     values = torch.cat([rgb, torch.ones_like(weights)[:, None], t[:, None]], dim=1)
-    summed = accumulate(weights, values, ray, len(offsets) - 1)
+    summed = values.new_zeros(len(offsets) - 1, 5).index_add(0, ray, weights[:, None] * values)
     colour, opacity, distance = summed.split([3, 1, 1], dim=1)
     return colour, opacity.squeeze(1), distance.squeeze(1)
 
@@ -103,18 +96,18 @@ def composite(
 def keep_visible_reference(
     thickness: Tensor, packed: Packed, transparent: float, thin: float | Tensor, room: int | None = None
 ) -> Kept:
-    """`keep_visible` in plain torch, for every device."""
+    """`keep_visible` in plain PyTorch, for every device."""
     t, dt, ray, offsets = packed
-    # What is not a number stays.
+    # NaN stays, so that somebody notices.
     keep = ~((before(thickness, ray, offsets) > -math.log(transparent)) | (thickness < thin))
-    if room is not None:  # what was repeated to fill the room before stays behind
+    if room is not None:  # drops what an earlier call repeated to fill its room
         keep = keep & (dt > 0)
     counts = counted(keep)
     if room is None:
         index, kept = keep.nonzero()[:, 0], counts.index_select(0, offsets)
         return t.index_select(0, index), dt.index_select(0, index), ray.index_select(0, index), kept
     index, there = within(room, counts)
-    kept = counts.index_select(0, offsets.clamp_max(len(keep)))  # rays may have ended beyond the room before
+    kept = counts.index_select(0, offsets.clamp_max(len(keep)))  # a ray may end beyond the room of the earlier call
     return t.index_select(0, index), dt.index_select(0, index) * there, ray.index_select(0, index), kept
 
 
@@ -128,10 +121,10 @@ def keep_visible(
     """Drops samples that light cannot reach, and those that hold nothing.
 
     Args:
-        thickness: optical, of each sample: density times length.
+        thickness: optical thickness of each sample, density times length.
         packed: midpoints, lengths, rays and offsets of N samples.
-        transparent: transmittance below which a ray has ended, above 0.
-        thin: optical thickness of a sample below which it holds nothing.
+        transparent: early-stop transmittance, above 0: below it a ray has ended.
+        thin: alpha threshold, as an optical thickness: a sample below it holds nothing.
         room: see `march`.
     """
     t, dt, ray, offsets = packed

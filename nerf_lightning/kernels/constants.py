@@ -1,4 +1,4 @@
-"""Constant tensors that kernels read: made once for each device, as every one costs a copy to it and a wait."""
+"""Constant tensors that kernels read: made once for each device, as each costs a copy to the device and a wait."""
 
 import functools
 from collections.abc import Callable
@@ -9,11 +9,11 @@ import torch
 Made = TypeVar("Made")
 
 KEPT: list[Callable[..., Any]] = []
-"""All functions whose results are kept."""
+"""All functions whose results are cached."""
 
 
 def constant(make: Callable[..., Made]) -> Callable[..., Made]:
-    """Keeps what a function made of arguments that can be compared. It serves with gradients too, whoever asks first."""
+    """Caches a function's results by its arguments. They work with gradients too, even if made in inference mode."""
 
     @functools.lru_cache(maxsize=64)
     @functools.wraps(make)

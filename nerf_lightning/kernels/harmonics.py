@@ -7,7 +7,7 @@ from torch import Tensor
 from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import fast
 
-# Powers of (x, y, z) that the harmonics are made of: squares and products of two coordinates, then of three.
+# Products of coordinates that the harmonics are made of: of two coordinates, then of three.
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 TRIPLES = tuple((pair, axis) for pair in (0, 1, 2) for axis in (0, 1, 2)) + ((3, 2),)
 _XX, _YY, _ZZ, _XY, _YZ, _XZ = range(3, 9)
@@ -17,7 +17,7 @@ def _cubic(pair: int, axis: int) -> int:
     return 9 + TRIPLES.index((pair - 3, axis))
 
 
-# Each function as factors of those powers; the first one is a constant.
+# Each function as factors of those products; the first one is a constant.
 TERMS: tuple[dict[int, float], ...] = (
     {},
     {1: -0.48860251190291987},
@@ -54,7 +54,7 @@ def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, l
 
 
 def spherical_harmonics_reference(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:
-    """`spherical_harmonics` in plain torch, for every device and precision: one product with the powers of the coordinates."""
+    """`spherical_harmonics` in plain PyTorch, for every device and precision, as one matrix product."""
     factors, constants, (places, pair) = _tables(d.dtype, d.device)
     first, second, axis = d.index_select(1, places).split([len(PAIRS), len(PAIRS), len(TRIPLES)], dim=1)
     pairs = first * second

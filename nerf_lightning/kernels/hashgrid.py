@@ -32,17 +32,17 @@ def is_dense(cells: Cells, entries: int) -> bool:
 
 
 def factors(cells: Cells, entries: int) -> Cells:
-    """What each axis' place is multiplied by in the number of a corner's entry."""
+    """What the coordinate along each axis is multiplied by in the number of a corner's entry."""
     return tuple(corner_count(cells[:axis]) if is_dense(cells, entries) else PRIMES[axis] for axis in range(len(cells)))
 
 
 def joined(parts: Sequence[Tensor], dense: bool, last: int | Tensor) -> Tensor:
-    """Numbers of entries: the sum of what the axes contribute, or the bits of their hash that fit in a table.
+    """Numbers of entries: the sum of what the axes contribute, or as many bits of their hash as fit in a table.
 
     Args:
         parts: places along each axis times its factor, 32-bit; they broadcast.
         dense: see `is_dense`.
-        last: of the table's entries, one less than a power of two where they are hashed.
+        last: number of the table's last entry, one less than a power of two where entries are hashed.
     """
     if dense:
         return functools.reduce(torch.add, parts)
@@ -50,13 +50,13 @@ def joined(parts: Sequence[Tensor], dense: bool, last: int | Tensor) -> Tensor:
 
 
 def entry_of(vertices: Int[Tensor, "D N"], cells: Cells, entries: int) -> Int[Tensor, "N"]:
-    """Entry of a table that each vertex of a grid is kept in."""
+    """The entry of a table that holds each vertex of a grid."""
     parts = [place * factor for place, factor in zip(vertices, factors(cells, entries), strict=True)]
     return joined(parts, is_dense(cells, entries), entries - 1)
 
 
 class _Levels(NamedTuple):
-    """All levels' constants on a device."""
+    """The constants of all levels, on a device."""
 
     cells: Float[Tensor, "L D 1"]
     least: Int[Tensor, "1"]
@@ -68,14 +68,14 @@ class _Levels(NamedTuple):
     first: Int[Tensor, "L 1 1"]
     """Where each level's table begins."""
     runs: list[tuple[slice, bool, Int[Tensor, "l *ones"]]]
-    """Levels in a row that are all dense, or all hashed, and the last entries of their tables."""
+    """Consecutive levels that are all dense or all hashed, and the last entries of their tables."""
 
 
 @constant
 def _levels(
     resolutions: tuple[Cells, ...], sizes: tuple[int, ...], dtype: torch.dtype, device: torch.device
 ) -> _Levels:
-    """What all levels are, for `hash_interpolate_reference`."""
+    """The constants that `hash_interpolate_reference` reads."""
 
     def whole(values: object) -> Tensor:
         return torch.tensor(values, dtype=torch.int32, device=device)
@@ -101,7 +101,7 @@ def _levels(
 
 
 def _across(x: Tensor, axis: int, dimensions: int) -> Tensor:
-    """[L, D, 2, N] -> one axis, so that what is true of its two ends broadcasts over the corners: [L, 1 or 2 an axis, N]."""
+    """[L, D, 2, N] -> one axis, shaped so that its two ends broadcast over all corners: [L, 1 or 2 for each axis, N]."""
     one = x[:, axis]
     return one.view(len(one), *(2 if axis == other else 1 for other in range(dimensions)), one.shape[-1])
 
@@ -109,14 +109,14 @@ def _across(x: Tensor, axis: int, dimensions: int) -> Tensor:
 def hash_interpolate_reference(
     tables: Float[Tensor, "T F"], unit: Float[Tensor, "N D"], resolutions: Sequence[Cells], sizes: Sequence[int]
 ) -> Float[Tensor, "N LF"]:
-    """`hash_interpolate` in plain torch, for every device and differentiable in the positions too; in D dimensions.
+    """`hash_interpolate` in plain PyTorch, for every device and differentiable in the positions too; in D dimensions.
 
-    All levels and corners together: on a GPU the number of operations is what counts.
+    All levels and corners together: on a GPU the number of operations counts.
     """
     count, dimensions = unit.shape
     levels = _levels(tuple(resolutions), tuple(sizes), unit.dtype, unit.device)
     scaled = unit.clamp(0, 1).T * levels.cells  # positions run last: long, contiguous vector operations
-    # What is not a number stays so, in some cell.
+    # NaN stays NaN, in some cell.
     cell = scaled.to(torch.int32).clamp_(levels.least, levels.most)
     fraction = scaled - cell
     ends = (cell * levels.factors)[:, :, None] + levels.steps
@@ -125,7 +125,7 @@ def hash_interpolate_reference(
     index = torch.cat([joined([part[run] for part in parts], dense, last) for run, dense, last in levels.runs])
     weight = functools.reduce(torch.mul, [_across(shares, axis, dimensions) for axis in range(dimensions)])
     corners = 2**dimensions
-    # int64, for which alone the CPU's index_add (the gather's gradient) is fast: 7 against 105 ms for two million.
+    # The CPU's index_add (the gather's gradient) is fast for int64 alone: 7 against 105 ms for two million.
     rows = (index.view(len(sizes), corners, count) + levels.first).long()
     # One gather for all levels: each gather's gradient is as large as the whole of `tables`.
     entries = tables.index_select(0, rows.flatten()).view(*rows.shape, tables.shape[1])

@@ -10,9 +10,9 @@ from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import fast
 
 MOST = 1 << 20
-"""Intervals the reference looks at together where nobody says more."""
+"""Intervals that the reference tests at a time, unless told otherwise."""
 BLOCK = 4
-"""Cells along a side of the blocks that the fast version crosses in one leap where they are empty."""
+"""Cells along a side of a block; the fast version crosses an empty block in one leap."""
 
 Packed = tuple[Float[Tensor, "N"], Float[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "R_plus_1"]]
 """Midpoint and length of each interval, its ray, and where each ray's intervals begin."""
@@ -27,7 +27,7 @@ def cell_index(
 
 
 def counted(mask: Bool[Tensor, "M"]) -> Int[Tensor, "M_plus_1"]:
-    """How many entries before each one are true, and how many in all."""
+    """How many entries are true before each one, and in total."""
     return torch.cat([_nothing(mask.device), mask.cumsum(0)])
 
 
@@ -43,9 +43,9 @@ def _numbers(bits: int, device: torch.device) -> Int[Tensor, "numbers"]:
 
 
 def within(room: int, counts: Int[Tensor, "M_plus_1"]) -> tuple[Int[Tensor, "room"], Bool[Tensor, "room"]]:
-    """Which entries are true, by what `counted` says, and which of these places hold one, without a wait for how many.
+    """Indices of the first `room` true entries, given `counted`, and which are real: the host need not wait for a count.
 
-    Where there are fewer than room, the last one stands again.
+    Where fewer than `room` are true, the last one is repeated.
     """
     order, total = _numbers(room.bit_length(), counts.device)[:room], counts[-1:]
     return torch.searchsorted(counts[1:], torch.minimum(order, total)), order <= total
@@ -75,9 +75,9 @@ def march_reference(
     rays: Rays, bounds: Bounds, near: Tensor, far: Tensor, shift: Tensor, occupied: Tensor,
     samples: int, step: float, room: int | None = None, most: int = MOST,
 ) -> Packed:  # fmt: skip
-    """`march` in plain torch, for every device."""
+    """`march` in plain PyTorch, for every device."""
     resolution = round(len(occupied) ** (1 / 3))
-    # One more than the steps: the first one may be cut short by the shift, and the last must reach the far end.
+    # One more than `samples`: the shift may cut the first one short, and the last must reach the far end.
     steps = torch.arange(-0.5, samples + 1, device=near.device) + shift[:, None]
     if bounds.unbounded:
         edges = bounds.distances(rays, near, far, (steps / samples).clamp(0, 1))
@@ -89,7 +89,7 @@ def march_reference(
     for first in range(0, len(rays), rows):
         part = slice(first, first + rows)
         places = (t[part, :, None] * rays.directions[part, None]).add_(rays.origins[part, None])
-        cells = cell_index(bounds.to_unit(places), resolution, torch.int32)  # made in half the time
+        cells = cell_index(bounds.to_unit(places), resolution, torch.int32)  # half the time of int64
         keep[part].logical_and_(occupied.index_select(0, cells.flatten()).view(cells.shape))
     return _pack(t, end - start, keep, room)
 
@@ -106,18 +106,18 @@ def march(
     room: int | None = None,
     most: int = MOST,
 ) -> Packed:
-    """Equal steps from near to far, of which those are kept whose midpoint lies in an occupied cell.
+    """Equal steps from near to far; keeps those whose midpoint lies in an occupied cell.
 
     Args:
         rays, bounds: in world units.
         near, far: distances along each ray; a ray with near >= far gets nothing.
         shift: moves each ray's steps along it, as a share of a step, in [0, 1).
         occupied: cells of a cubic grid over the bounds' unit cube, last axis fastest.
-        samples: steps of an unbounded ray, where they are as long as `Bounds.distances` says; otherwise at most so many.
+        samples: steps of an unbounded ray, spaced as `Bounds.distances` says; at most this many (and one) inside bounds.
         step: length of a step inside bounds.
-        room: entries to make, whatever is found, so that no host waits to learn how much that is. Where less is found, the
-            last interval is repeated with length 0; where more is found, rays that end beyond it in `offsets` lack some.
-        most: intervals the reference looks at together: bounds the memory of one call, whatever the number of rays.
+        room: how many entries to make whatever is found, so that the host need not wait for a count. If fewer are found, the
+            last interval is repeated with length 0; if more, rays whose `offsets` end beyond `room` lack some.
+        most: intervals that the reference tests at a time, which bounds its memory.
     """
     constants = not any(x.requires_grad for x in (rays.origins, rays.directions, near, far, shift))
     if room is not None or not (constants and fast(rays.origins, near, shift)):
@@ -148,14 +148,14 @@ def march(
 
 
 def points_reference(origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor) -> Float[Tensor, "N 3"]:
-    """`points` in plain torch, for every device."""
+    """`points` in plain PyTorch, for every device."""
     return origins.index_select(0, ray) + t[:, None] * directions.index_select(0, ray)
 
 
 def points(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
 ) -> Float[Tensor, "N 3"]:
-    """Positions at distances `t` along the rays that `ray` numbers."""
+    """Positions at distances `t` along rays; `ray` holds each position's ray."""
     if not fast(origins, directions, t) or any(x.requires_grad for x in (origins, directions, t)):
         return points_reference(origins, directions, ray, t)
     from nerf_lightning.kernels.cpu import march, workers
@@ -167,12 +167,12 @@ def points(
 
 
 def mark_cells_reference(marks: Tensor, mark: int, bounds: Bounds, positions: Tensor) -> None:
-    """`mark_cells` in plain torch, for every device."""
+    """`mark_cells` in plain PyTorch, for every device."""
     marks.index_fill_(0, cell_index(bounds.to_unit(positions), round(len(marks) ** (1 / 3))), mark)
 
 
 def mark_cells(marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions: Float[Tensor, "N 3"]) -> None:
-    """Writes `mark` into each cell of a cubic grid over the bounds that holds one of some positions, world units."""
+    """Writes `mark` into each cell of a cubic grid over the bounds that holds any of the positions (world units)."""
     if not fast(positions):
         return mark_cells_reference(marks, mark, bounds, positions)
     from nerf_lightning.kernels.cpu import march, workers

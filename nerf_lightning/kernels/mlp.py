@@ -15,7 +15,7 @@ Layers = Sequence[tuple[Float[Tensor, "_ _"], Float[Tensor, "_"]]]
 
 
 def mlp_reference(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None) -> Tensor:
-    """`mlp` in plain torch, for every device and precision; `extra` may have gradients too."""
+    """`mlp` in plain PyTorch, for every device and precision; `extra` may have gradients too."""
     h = x if extra is None else torch.cat([x, extra], dim=1)
     for matrix, bias in layers[:-1]:
         h = torch.relu(linear(h, matrix, bias))
@@ -27,7 +27,7 @@ def _padded(width: int) -> int:
 
 
 def _blocks(shapes: list[tuple[int, int]], row: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Views of the layers' matrices and biases in a row of numbers where every width is filled up to a multiple of 4."""
+    """Views of the layers' matrices and biases in a flat array where every width is padded to a multiple of 4."""
     blocks, start = [], 0
     for outputs, inputs in shapes:
         o, i = _padded(outputs), _padded(inputs)
@@ -70,7 +70,7 @@ class _MLP(torch.autograd.Function):
 def mlp_heads(
     x: Float[Tensor, "N I"], layers: Layers, first: int, extra: Float[Tensor, "N E"] | None = None
 ) -> tuple[Float[Tensor, "N first"], Float[Tensor, "N rest"]]:
-    """Like `mlp`, with the first outputs apart from the others, which spares taking them apart."""
+    """Like `mlp`, with the first outputs returned apart from the others, which saves splitting them."""
     parameters = [parameter for layer in layers for parameter in layer]
     if not fast(x, *parameters, *(() if extra is None else (extra,))):
         out = mlp_reference(x, layers, None if extra is None else extra.detach())
@@ -80,13 +80,11 @@ def mlp_heads(
 
 
 def mlp(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None) -> Float[Tensor, "N O"]:
-    """Linear layers with rectifiers between them.
+    """Linear layers with ReLU between them.
 
     Args:
         x: inputs.
-        layers: of each layer the matrix [outputs, inputs] and the bias.
-        extra: further inputs after `x`, taken as constants: they get no gradient.
+        layers: matrix [outputs, inputs] and bias of each layer.
+        extra: further inputs after `x`; they are constants and get no gradient.
     """
-    if not fast(x, *(parameter for layer in layers for parameter in layer), *(() if extra is None else (extra,))):
-        return mlp_reference(x, layers, None if extra is None else extra.detach())
     return mlp_heads(x, layers, 0, extra)[1]

@@ -1,4 +1,4 @@
-"""Planes times lines: a volume as a sum of products (vector-matrix decomposition; TensoRF, Chen et al. 2022, eq. 3)."""
+"""TensoRF: a volume as a sum of planes times lines (vector-matrix decomposition; Chen et al. 2022, eq. 3)."""
 
 from typing import NamedTuple
 
@@ -10,11 +10,11 @@ from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import fast
 
 PLANE_AXES = ((1, 2), (0, 2), (0, 1))
-"""Axes of each mode's plane; its line runs along the axis that is left: 0, 1, 2."""
+"""Axes of each mode's plane; its line runs along the remaining axis: 0, 1, 2."""
 
 
 class Footprint(NamedTuple):
-    """What positions read: rows of all planes and of all lines, one mode after the other, and their shares."""
+    """What positions read: rows of all planes and lines, one mode after the other, and their weights."""
 
     plane_rows: Int[Tensor, "twelveN"]
     plane_shares: Float[Tensor, "4 N 3 1"]
@@ -24,7 +24,7 @@ class Footprint(NamedTuple):
 
 @constant
 def _axes_and_steps(side: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """The first axes of all planes, then the second ones; and what modes, corners and ends add to a row."""
+    """The first axes of all planes, then the second ones; and the row offsets of modes, corners and ends."""
     axes = torch.tensor(PLANE_AXES, device=device).T.flatten()
     mode, end = torch.arange(3, device=device), torch.arange(2, device=device)
     corner = (end[:, None] * side + end).flatten()
@@ -32,7 +32,7 @@ def _axes_and_steps(side: int, device: torch.device) -> tuple[Tensor, Tensor, Te
 
 
 def footprint(unit: Float[Tensor, "N 3"], side: int) -> Footprint:
-    """Where positions in [0, 1]^3 read in planes and lines of so many vertices along a side; outside they are clamped."""
+    """Where positions in [0, 1]^3 (clamped outside) read in planes and lines with `side` vertices along each axis."""
     axes, plane_steps, line_steps = _axes_and_steps(side, unit.device)
     scaled = unit.clamp(0, 1) * (side - 1)
     low = scaled.long().clamp_(0, side - 2)
@@ -48,7 +48,7 @@ def footprint(unit: Float[Tensor, "N 3"], side: int) -> Footprint:
 
 
 def _products(planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], at: Footprint) -> Float[Tensor, "N 3 C"]:
-    """One gather for all planes and one for all lines: on a GPU the number of operations is what counts."""
+    """One gather for all planes and one for all lines: on a GPU the number of operations counts."""
     channels = lines.shape[2]
     corners = planes.flatten(0, 2).index_select(0, at.plane_rows).view(*at.plane_shares.shape[:3], channels)
     ends = lines.flatten(0, 1).index_select(0, at.line_rows).view(*at.line_shares.shape[:3], channels)
@@ -58,12 +58,12 @@ def _products(planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], a
 def plane_line_products_reference(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N threeC"]:
-    """`plane_line_products` in plain torch, for every device and differentiable in the positions too."""
+    """`plane_line_products` in plain PyTorch, for every device and differentiable in the positions too."""
     return _products(planes, lines, footprint(unit, lines.shape[1])).flatten(1)
 
 
 def _block(channels: int) -> int:
-    """Channels that one worker adds up together: few enough that all workers find some, enough to fill a register."""
+    """Channels that one worker adds up together: enough to fill a register, few enough that every worker gets some."""
     return next(width for width in (8, 4, 2, 1) if channels % width == 0)
 
 
@@ -104,7 +104,7 @@ def plane_line_products(
     """Each plane's channels, interpolated bilinearly, times those of the line across it, interpolated linearly.
 
     Args:
-        planes: over the axes (1, 2), (0, 2) and (0, 1), vertices from 0 to 1 with both ends, S at least 2.
+        planes: over the axes (1, 2), (0, 2) and (0, 1); S >= 2 vertices from 0 to 1, both included.
         lines: along the axes 0, 1 and 2.
         unit: positions in [0, 1]^3; outside they are clamped.
     """

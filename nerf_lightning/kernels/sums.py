@@ -1,11 +1,11 @@
-"""Sums along rays that stay exact over many rays, also where a device has no double precision."""
+"""Sums along rays that stay exact over many rays, even on devices without double precision."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 WITHOUT_DOUBLE = ("mps",)
-"""Kinds of devices that have no double precision."""
+"""Device types without double precision."""
 COARSE = 2.0**-8
 """Unit of the coarse part of a value: 2^24 of them are exact in single precision."""
 
@@ -13,12 +13,11 @@ COARSE = 2.0**-8
 def before(
     values: Float[Tensor, "N *D"], ray: Int[Tensor, "N"], offsets: Int[Tensor, "R_plus_1"]
 ) -> Float[Tensor, "N *D"]:
-    """Of each sample the sum of the values of those before it on its ray.
+    """For each sample, the sum of the values before it on its ray.
 
     Args:
-        values: of the samples.
-        ray: of each sample.
-        offsets: first sample of each ray, then how many there are.
+        values, ray: of each sample.
+        offsets: first sample of each ray, then N.
     """
     first = offsets.index_select(0, ray)
 
@@ -29,7 +28,7 @@ def before(
 
     if values.device.type not in WITHOUT_DOUBLE:
         return along_ray(values.cumsum(0, dtype=torch.float64), values).to(values.dtype)
-    # Sums of multiples of 2^-8 are exact up to 65536, and what is left is so small that its sums are nearly so.
+    # Sums of multiples of 2^-8 are exact up to 65536; the remainders are so small that their sums are nearly exact.
     coarse = (values.detach() / COARSE).round() * COARSE
     fine = values - coarse
     return along_ray(coarse.cumsum(0), coarse) + along_ray(fine.cumsum(0), fine)

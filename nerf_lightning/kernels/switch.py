@@ -1,4 +1,4 @@
-"""Which version of a kernel runs: the plain-torch reference, or the fast one for CPUs."""
+"""Which version of a kernel runs: the plain PyTorch reference, or the fast one for CPUs."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ _allowed = True
 
 
 def use_kernels(choice: str) -> None:
-    """Sets the versions for this process: "auto" takes a fast one wherever it applies, "reference" never does.
+    """Sets the version for this process: "auto" uses the fast one wherever it applies, "reference" never.
 
     Raises:
         InputError: on any other choice.
@@ -21,7 +21,7 @@ def use_kernels(choice: str) -> None:
 
 
 def chosen_kernels() -> str:
-    """What `use_kernels` was told last."""
+    """The last choice given to `use_kernels`."""
     return "auto" if _allowed else "reference"
 
 

@@ -1,6 +1,6 @@
-"""Trilinear interpolation on a sparse grid: an index of all vertices says which of them hold values, and in which row.
+"""Trilinear interpolation on a sparse grid: an index over all vertices gives the row of each one that holds values.
 
-Row 0 stands for all vertices that hold none: its values are constants and get no gradient.
+Row 0 stands for all other vertices: its values are constants and get no gradient.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def side_of(index: Int[Tensor, "cells"]) -> int:
 
 @constant
 def _steps(side: int, device: torch.device) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:
-    """What a step along each axis adds to the number of a vertex, and each corner of a cell."""
+    """What a step along each axis adds to a vertex's number, and what each corner of a cell adds."""
     ends = torch.arange(2, device=device)
     corners = (ends[:, None, None] * side + ends[:, None]) * side + ends
     return torch.tensor([side * side, side, 1], device=device), corners.flatten()
@@ -28,11 +28,11 @@ def _steps(side: int, device: torch.device) -> tuple[Int[Tensor, "3"], Int[Tenso
 def locate_reference(
     index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
-    """`locate` in plain torch, for every device and differentiable in the positions."""
+    """`locate` in plain PyTorch, for every device and differentiable in the positions."""
     side = side_of(index)
     strides, corners = _steps(side, unit.device)
     scaled = unit.clamp(0, 1) * (side - 1)
-    cell = scaled.long().clamp_(0, side - 2)  # what is not a number becomes the smallest of all
+    cell = scaled.long().clamp_(0, side - 2)  # NaN becomes the smallest integer
     fraction = scaled - cell
     x, y, z = torch.stack([1 - fraction, fraction], dim=2).unbind(1)
     weights = (x[:, :, None] * y[:, None])[..., None] * z[:, None, None]
@@ -58,7 +58,7 @@ def locate(index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]) -> tuple[Int
 
 
 def mark_rows(seen: Int[Tensor, "V"], rows: Int[Tensor, "N 8"], step: int) -> None:
-    """Notes in `seen` that these rows were read at this step; both tensors are 32-bit."""
+    """Writes `step` into `seen` at the rows that were read; both tensors are 32-bit."""
     if not fast(seen):
         seen.index_fill_(0, rows.flatten().long(), step)
         return
@@ -70,7 +70,7 @@ def mark_rows(seen: Int[Tensor, "V"], rows: Int[Tensor, "N 8"], step: int) -> No
 def interpolate_rows(
     values: Float[Tensor, "V *F"], rows: Int[Tensor, "N 8"], weights: Float[Tensor, "N 8"]
 ) -> Float[Tensor, "N *F"]:
-    """Any number of values a vertex, interpolated, in plain torch."""
+    """Interpolates any number of values per vertex, in plain PyTorch."""
     values = torch.cat([values[:1].detach(), values[1:]])
     found = values.index_select(0, rows.flatten()).view(*rows.shape, *values.shape[1:])
     return (found * weights.view(*weights.shape, *[1] * (values.dim() - 1))).sum(1)
@@ -79,7 +79,7 @@ def interpolate_rows(
 def voxel_value(
     values: Float[Tensor, "V"], index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N"]:
-    """One value a vertex, interpolated at positions in [0, 1]^3; fast where no gradient is asked, as samplers do."""
+    """Interpolates one value per vertex at positions in [0, 1]^3; fast without gradients, as samplers call it."""
     if not fast(values, unit) or (torch.is_grad_enabled() and (values.requires_grad or unit.requires_grad)):
         return interpolate_rows(values, *locate_reference(index, unit))
     from nerf_lightning.kernels.cpu import voxels, workers
@@ -124,8 +124,8 @@ class _Read(torch.autograd.Function):
 def read_voxels_reference(
     density: Tensor, colour: Tensor, views: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
-    """`read_voxels` in plain torch, for every device and differentiable in weights and basis too."""
-    # One table, so that all is gathered at once.
+    """`read_voxels` in plain PyTorch, for every device and differentiable in weights and basis too."""
+    # One table: a single gather.
     found = interpolate_rows(torch.cat([density[:, None], colour, views], dim=1), rows, weights)
     raw, rgb, mixed = found.split([1, 3, views.shape[1]], dim=1)
     return raw[:, 0], rgb + (mixed.unflatten(1, (3, -1)) * basis[:, None]).sum(2)
@@ -139,11 +139,11 @@ def read_voxels(
     weights: Float[Tensor, "N 8"],
     basis: Float[Tensor, "N B"],
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
-    """One density a vertex, interpolated, and a colour that depends on the direction.
+    """Interpolates one density per vertex, and a colour that depends on the direction.
 
     Args:
         density, colour: of the vertices that are kept.
-        views: C = 3 B coefficients of what a colour adds by direction, those of red first; they are summed as they are read.
+        views: C = 3 B coefficients of the colour's view-dependent part, red's first.
         rows, weights: of the vertices around each sample, as `locate` gives them.
         basis: the basis functions at each sample's direction, constants.
     """
@@ -172,18 +172,18 @@ class _Roughness(torch.autograd.Function):
 
 @constant
 def _neighbours(side: int, device: torch.device) -> tuple[Int[Tensor, "6 1"], ...]:
-    """Of the six directions: the stride of the axis, the way to the neighbour, and the place on the axis that has none."""
+    """For the six directions: the axis's stride, the step to the neighbour, and the coordinate that has no neighbour there."""
     strides = torch.tensor([side * side, side, 1], device=device).repeat(2)[:, None]
     signs = torch.tensor([-1, 1], device=device).repeat_interleave(3)[:, None]
     return strides, strides * signs, (signs > 0) * (side - 1)
 
 
 def roughness_reference(values: Tensor, vertex: Tensor, index: Tensor, first: int, last: int) -> Float[Tensor, ""]:
-    """`roughness` in plain torch, for every device."""
+    """`roughness` in plain PyTorch, for every device."""
     side, at = side_of(index), vertex[first:last].long()
     strides, ways, ends = _neighbours(side, index.device)
     inside = at // strides % side != ends
-    # Row 0 stands for all that are not kept; where there is no neighbour, any vertex will do.
+    # Row 0 stands for all that are not kept, and is used where there is no neighbour.
     other = index.index_select(0, (at + ways * inside).flatten()).view(inside.shape) * inside
     apart = values[first:last] - values.detach().index_select(0, other.flatten()).view(inside.shape)
     return (apart.square() * (other > 0)).sum() / (last - first)
@@ -192,13 +192,13 @@ def roughness_reference(values: Tensor, vertex: Tensor, index: Tensor, first: in
 def roughness(
     values: Float[Tensor, "V"], vertex: Int[Tensor, "V"], index: Int[Tensor, "cells"], first: int, last: int
 ) -> Float[Tensor, ""]:
-    """Mean over rows `first` to `last` of the squared differences to the six neighbours, summed over those that are kept.
+    """Mean over rows `first` to `last` of the sum of squared differences to those of the six neighbours that are kept.
 
-    The neighbours count as constants: over runs that cover all rows, the gradients sum up to that of the whole.
+    Neighbours count as constants, so that the gradients of consecutive runs of rows add up to that of the whole table.
 
     Args:
-        values: of the vertices that are kept, row 0 that of the others.
-        vertex: number of each row's vertex in the grid; that of row 0 is not read.
+        values: of the kept vertices; row 0 is that of all others.
+        vertex: number of each row's vertex in the grid; row 0's is not read.
         index: see `locate`.
     """
     version = _Roughness.apply if fast(values) else roughness_reference

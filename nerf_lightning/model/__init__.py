@@ -1,4 +1,4 @@
-"""Stage 4, fields: position and direction -> density and rgb; and pictures as fields of two coordinates."""
+"""Stage 4, fields: position and direction -> density and rgb; also pictures as fields of two coordinates."""
 
 from nerf_lightning.model.field import Field, PictureField
 from nerf_lightning.model.hashgrid import HashGrid, HashGridField

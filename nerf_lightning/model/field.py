@@ -1,6 +1,7 @@
 """What every field offers, in three dimensions and in two."""
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,18 +12,45 @@ from nerf_lightning.errors import InputError
 
 
 def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
-    """Gives a parameter data of another shape. It stays the same parameter, in modules and optimisers."""
+    """Gives a parameter data of another shape. Modules and optimisers keep the same parameter."""
     parameter.grad = None
-    # Autograd remembers a parameter's shape as long as some graph that used it lives; a change of type makes it forget.
+    # Autograd remembers a parameter's shape while a graph that used it lives; a change of type makes it forget.
     parameter.data = data.new_empty(0, dtype=torch.float16)
     parameter.data = data
 
 
+class Packable(torch.nn.Module):
+    """What fields in two and in three dimensions have in common."""
+
+    grown_after: float = 0.0
+    """Fraction of the budget after which the field keeps its size."""
+    sizing: str = ""
+    """One line on how the field's size follows from the data; "" if it does not."""
+
+    def take(self, smaller: Any) -> None:
+        """Copies the function of a smaller field of the same kind, as far as possible, leaving the rest free to learn.
+
+        What cannot be copied starts fresh; here, that is everything.
+        """
+
+    def packed(self) -> dict[str, Tensor]:
+        """The least that rendering needs, for `unpack`."""
+        return dict(self.state_dict())
+
+    def unpack(self, packed: dict[str, Tensor]) -> None:
+        """Restores what `packed` returned.
+
+        Raises:
+            RuntimeError, KeyError: if it came from another kind or size of field.
+        """
+        self.load_state_dict(packed)
+
+
 PER_PIXEL = 2.0
-"""Cells that the width of a pixel may hold: many views tell more of a place than one, but finer ones are noise."""
+"""Most cells per pixel width: many views together show more than one does, but finer cells hold noise."""
 
 
-class Field(InBounds):
+class Field(InBounds, Packable):
     """A radiance field in world coordinates. Subclasses define `features` and `colour`, or `density` and `forward`.
 
     Networks work in units of the bounds' half-size; `forward` and `density` convert to 1 / world unit, so that a scene in
@@ -30,18 +58,14 @@ class Field(InBounds):
     """
 
     fastest: float = math.inf
-    """Adam's learning rate above which training comes apart, as measured by the stability suite; infinite where not known."""
-    grown_after: float = 0.0
-    """Progress after which the field keeps its size."""
+    """Adam's learning rate above which training diverges, as the stability suite measured it; infinite if unknown."""
 
     def __init__(self, bounds: Bounds):
         super().__init__(bounds)
         self.unit_length = bounds.longest
-        self.sizing = ""
-        """How the field's size follows from the data, in one line; "" where it does not."""
 
     def grid_sizes(self, coarsest: int, finest: int, size: str) -> tuple[int, int]:
-        """Cells along a side of the coarsest and the finest grid: as asked, or for size "auto" no more than photos can show.
+        """Cells along a side of the coarsest and the finest grid: as given, or with "auto" no more than the photos can show.
 
         Raises:
             InputError: where coarsest > finest, or for another size than "auto" and "fixed".
@@ -72,34 +96,16 @@ class Field(InBounds):
         """Called before each training step with the fraction of the budget done; a field may change its size here.
 
         Returns:
-            Parameters whose data was replaced by data of another shape: what an optimiser remembers of them is void.
+            Parameters whose data now has another shape: an optimiser must forget its state for them.
         """
         return []
 
-    def take(self, smaller: "Field") -> None:
-        """Becomes the function that a smaller field of the same kind is, as far as it can, with room for more.
-
-        What is not taken over starts anew; here, that is all.
-        """
-
     def penalty(self) -> Float[Tensor, ""] | None:
-        """What training adds to the squared error, if anything."""
+        """What training adds to the squared error, or None."""
         return None
 
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
-        """Empties what no position in the reached cells of the unit cube reads: there the field stays what it is."""
-
-    def packed(self) -> dict[str, Tensor]:
-        """All that rendering needs, as little of it as there can be: what `unpack` takes."""
-        return dict(self.state_dict())
-
-    def unpack(self, packed: dict[str, Tensor]) -> None:
-        """Becomes the field that `packed` told of.
-
-        Raises:
-            RuntimeError, KeyError: where that was another kind of field, or one of another size.
-        """
-        self.load_state_dict(packed)
+        """Empties what no position in the reached cells of the unit cube reads; in those cells the field does not change."""
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """World positions -> density, 1 / world unit."""
@@ -113,19 +119,16 @@ class Field(InBounds):
         return density / self.unit_length, self.colour(features, directions)
 
 
-class PictureField(torch.nn.Module):
-    """A picture as a function of place: subclasses define `forward`.
+class PictureField(Packable):
+    """A picture as a function of position: subclasses define `forward`.
 
     Args:
-        size: width and height of the picture in pixels, from which a field takes how fine it must be.
-        rate: factor on the learning rate, so that one rate serves fields of every kind.
+        size: width and height of the picture in pixels, which decide how fine the field is.
+        rate: factor on the learning rate, so that one rate suits every kind of field.
 
     Raises:
         InputError: where rate is not above 0.
     """
-
-    grown_after: float = 0.0
-    """As of `Field`: it does not grow."""
 
     def __init__(self, size: tuple[int, int], rate: float = 1.0):
         super().__init__()
@@ -133,29 +136,16 @@ class PictureField(torch.nn.Module):
             raise InputError("model.rate", "", str(rate), "above 0")
         self.size = size
         self.rate = rate
-        self.sizing = ""
-        """How the field's size follows from the picture, in one line; "" where it does not."""
 
     @property
     def nyquist(self) -> float:
-        """The highest frequency that the pixels can show, in cycles over the picture's longer side."""
+        """The Nyquist frequency of the pixels, in cycles over the picture's longer side."""
         return max(self.size) / 2
 
     def centred(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:
-        """Places with the picture's centre at the origin and its longer side from -1 to 1: pixels stay square."""
+        """Positions with the picture's centre at the origin and its longer side from -1 to 1: pixels stay square."""
         return (2 * uv - 1) * uv.new_tensor([side / max(self.size) for side in self.size])
 
-    def take(self, smaller: "PictureField") -> None:
-        """As of `Field`."""
-
-    def packed(self) -> dict[str, Tensor]:
-        """As of `Field`."""
-        return dict(self.state_dict())
-
-    def unpack(self, packed: dict[str, Tensor]) -> None:
-        """As of `Field`."""
-        self.load_state_dict(packed)
-
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-        """Places in [0, 1]^2 (x right, y down) -> rgb, in [0, 1] or near it."""
+        """Positions in [0, 1]^2 (x right, y down) -> rgb, in [0, 1] or near it."""
         raise TypeError(f"{type(self).__name__} must define forward(uv)")

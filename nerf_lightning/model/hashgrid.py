@@ -34,9 +34,9 @@ class HashGrid(torch.nn.Module):
     """Trainable features on nested grids over the unit cube.
 
     Args:
-        levels: how many grids.
-        log2_entries: each level keeps at most 2^log2_entries entries; finer levels than fit share them by hashing.
-        features: numbers an entry.
+        levels: number of grids.
+        log2_entries: each level has at most 2^log2_entries entries; levels too fine for that share them by hashing.
+        features: numbers per entry.
         coarsest, finest: cells along a side of the first and the last level.
     """
 
@@ -61,15 +61,15 @@ class HashGrid(torch.nn.Module):
         return hash_interpolate(self.tables, unit, self.cells, self.sizes)
 
     def rows(self, vertices: Int[Tensor, "3 N"], level: int) -> Int[Tensor, "N"]:
-        """Rows of `tables` that a level keeps its vertices in."""
+        """Rows of `tables` that hold a level's vertices."""
         return sum(self.sizes[:level]) + entry_of(vertices, self.cells[level], self.sizes[level])
 
     @torch.no_grad()
     def take(self, smaller: "HashGrid") -> Int[Tensor, "I"]:
-        """Takes over the levels that have a resolution of its own, in tables that are as large or larger.
+        """Copies the levels whose resolutions occur here too; this grid's tables are as large or larger.
 
         Returns:
-            The place in this grid's features of each of the smaller one's that was taken over; -1 for the others.
+            For each feature of the smaller grid, its place among this grid's features, or -1 if it was not copied.
         """
         features = self.tables.shape[1]
         places = torch.full((len(smaller.sizes) * features,), -1)
@@ -77,7 +77,7 @@ class HashGrid(torch.nn.Module):
             if resolution not in self.resolutions:
                 continue
             mine = self.resolutions.index(resolution)
-            # Hashes differ in how many of their bits count: an entry of a larger table has one it came from.
+            # Hashes differ only in how many of their bits are used: each entry of the larger table maps to one of the smaller.
             if (resolution + 1) ** 3 == self.sizes[mine]:
                 vertices = torch.cartesian_prod(*[torch.arange(resolution + 1, dtype=torch.int32)] * 3).T
                 rows = self.rows(vertices, mine), smaller.rows(vertices, theirs)
@@ -90,7 +90,7 @@ class HashGrid(torch.nn.Module):
 
     @torch.no_grad()
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
-        """Zeroes entries that no position in the reached cells reads."""
+        """Zeroes the entries that no position in the reached cells reads."""
         read = torch.zeros(len(self.tables), dtype=torch.bool, device=reached.device)
         for level, resolution in enumerate(self.resolutions):
             read[self.rows(vertices_in(reached, resolution).nonzero().T.int(), level)] = True
@@ -112,7 +112,7 @@ class HashGridField(Field):
 
     Args:
         bounds: the box the grid covers.
-        levels, log2_entries, features, coarsest, finest: the grid, see `HashGrid`.
+        levels, log2_entries, features, coarsest, finest: see `HashGrid`.
         width: neurons of the hidden layers (one for density, two for colour).
         degree: see `TensoRFField`.
         density: "relu", "softplus" or "exp".
@@ -123,7 +123,7 @@ class HashGridField(Field):
     """
 
     GEOMETRY = 15  # features handed from density to colour network, Instant-NGP section 5.4
-    START = -1.0  # what an exponential begins with: thin fog
+    START = -1.0  # an exponential density starts as thin fog
     fastest = 0.1
 
     def __init__(
@@ -150,14 +150,14 @@ class HashGridField(Field):
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """The layers have drawn theirs. From dense fog training may throw all density away, and with it all gradient."""
+        """The layers drew their own. Starting from dense fog, training may remove all density, and all gradient with it."""
         if self.starts_thin:
             self.density_net[-1].get_parameter("bias")[0] = self.START
 
     @torch.no_grad()
     def take(self, smaller: Field) -> None:
-        """Takes over both networks, and all of the grid where no level of it is missing here."""
-        assert isinstance(smaller, HashGridField)  # of the same kind, as said
+        """Copies the levels that both grids have, and both networks if no level is missing here."""
+        assert isinstance(smaller, HashGridField)
         columns = self.grid.take(smaller.grid)
         if (columns >= 0).all():
             widen_all(self.density_net, smaller.density_net, columns)

@@ -12,22 +12,22 @@ from nerf_lightning.model.layers.widening import widen_all
 from nerf_lightning.utils.options import Count
 
 SHARE = 0.5
-"""Numbers of the grids for each number of the picture, unless the table size is given."""
+"""Numbers in the grids for each number in the picture, unless the table size is given."""
 
 
 class HashGrid2DField(PictureField):
-    """Hash-grid features of a place, and a network that turns them into a colour.
+    """Hash-grid features of a position, and a network that turns them into a colour.
 
-    The finest level has a vertex at the centre of every pixel: finer ones would hold nothing that the picture tells.
+    The finest level has a vertex at the centre of every pixel: the picture could not fill a finer one.
 
     Args:
         size: see `PictureField`.
-        levels: how many grids; fewer where a picture is so small that they would be the same.
-        log2_entries: each level keeps at most 2^log2_entries entries; finer levels than fit share them by hashing. None takes
-            the most with which all levels together hold half as many numbers as the picture.
-        features: numbers an entry.
-        coarsest: cells along the longer side of the first level; a smaller picture has as many as pixels.
-        finest: of the last level, at most as fine as the pixels; None takes that.
+        levels: number of grids; fewer for a picture so small that some would be equal.
+        log2_entries: each level has at most 2^log2_entries entries; levels too fine for that share them by hashing. None picks
+            the largest for which all levels together hold at most half as many numbers as the picture.
+        features: numbers per entry.
+        coarsest: cells along the longer side of the first level, at most as many as pixels.
+        finest: the same for the last level; None makes it as fine as the pixels.
         width: neurons of the hidden layer.
         rate: factor on the learning rate.
     """
@@ -65,8 +65,8 @@ class HashGrid2DField(PictureField):
 
     @torch.no_grad()
     def take(self, smaller: PictureField) -> None:
-        """Takes over the levels whose grids and tables are the same here, and the network where all are."""
-        assert isinstance(smaller, HashGrid2DField)  # of the same kind, as said
+        """Copies the levels and the network if every level has the same grid and table size here."""
+        assert isinstance(smaller, HashGrid2DField)
         features, places = self.tables.shape[1], []
         for theirs, resolution in enumerate(smaller.resolutions):
             mine = self.resolutions.index(resolution) if resolution in self.resolutions else -1

@@ -19,7 +19,7 @@ class MLPField(Field):
     Args:
         bounds: positions are scaled to [-1, 1] in them.
         depth: hidden layers of the trunk.
-        width: neurons of each.
+        width: neurons in each.
         skip: the layer that sees the encoded position again, or None.
         position_frequencies, direction_frequencies: octaves of the two encodings.
         density: "relu", "softplus" or "exp".
@@ -61,8 +61,8 @@ class MLPField(Field):
 
     @torch.no_grad()
     def take(self, smaller: Field) -> None:
-        """Takes over a network with the same encodings and skip; further layers of the trunk hand on what comes in."""
-        assert isinstance(smaller, MLPField)  # of the same kind, as said
+        """Copies a network with the same encodings and skip; further layers of the trunk pass on their input."""
+        assert isinstance(smaller, MLPField)
         like = ("skip", "position_frequencies", "direction_frequencies")
         if any(getattr(self, key) != getattr(smaller, key) for key in like) or len(smaller.trunk) > len(self.trunk):
             return
@@ -72,7 +72,7 @@ class MLPField(Field):
         hidden = torch.arange(narrow)
         for layer, mine in enumerate(self.trunk):
             assert isinstance(mine, torch.nn.Linear)
-            if layer >= len(smaller.trunk):  # rectified before, so rectifying again changes nothing
+            if layer >= len(smaller.trunk):  # its input has been through a ReLU, which a second one leaves alone
                 mine.weight[:narrow] = torch.eye(mine.in_features)[:narrow]
                 mine.bias[:narrow] = 0
                 continue

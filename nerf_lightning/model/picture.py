@@ -14,8 +14,8 @@ from nerf_lightning.model.layers.widening import widen_all
 from nerf_lightning.utils.options import Count
 
 
-def rectified(sizes: list[int]) -> torch.nn.Sequential:
-    """Fully connected layers of the given widths with rectifiers between them."""
+def relu_layers(sizes: list[int]) -> torch.nn.Sequential:
+    """Fully connected layers of the given widths with ReLU between them."""
     parts: list[torch.nn.Module] = [torch.nn.Linear(sizes[0], sizes[1])]
     for inputs, outputs in zip(sizes[1:-1], sizes[2:], strict=True):
         parts += [torch.nn.ReLU(), torch.nn.Linear(inputs, outputs)]
@@ -27,8 +27,8 @@ class PictureMLP(PictureField):
 
     Args:
         size: see `PictureField`.
-        frequencies: octaves L of the encoding; 0 feeds the bare coordinates; None takes the octaves up to about half of the
-            most that the picture's pixels can show, one cycle in two pixels: further ones run wild between the pixels.
+        frequencies: octaves L of the encoding; 0 means the bare coordinates; None takes octaves up to about half the Nyquist
+            frequency, as higher ones are unconstrained between the pixels.
         width: neurons of each hidden layer.
         depth: hidden layers.
     """
@@ -36,8 +36,8 @@ class PictureMLP(PictureField):
     def __init__(self, size: tuple[int, int], frequencies: int | None = None, width: Count = 256, depth: Count = 3):
         super().__init__(size)
         if frequencies is None:
-            # The last octave has 2^(L-1) / 2 cycles over the picture, and `nyquist` is the most that its pixels can show.
-            # At that limit a sine has one value at all pixels, up to its sign, and whatever it likes between them.
+            # The last octave has 2^(L-1) / 2 cycles over the picture. At the Nyquist frequency itself a sine would have the
+            # same value at all pixels, up to its sign, and anything between them.
             frequencies = 1 + max(0, round(math.log2(self.nyquist)))
             self.sizing = f"{frequencies} octaves, up to about half of what {max(size)} pixels can show"
         if frequencies < 0:
@@ -45,11 +45,11 @@ class PictureMLP(PictureField):
                 "model.frequencies", "", str(frequencies), "0 or more, or null to take them from the picture"
             )
         self.frequencies = frequencies
-        self.net = rectified([2 * (1 + 2 * frequencies), *[width] * depth, 3])
+        self.net = relu_layers([2 * (1 + 2 * frequencies), *[width] * depth, 3])
 
     def take(self, smaller: PictureField) -> None:
-        """Takes over a network with as many layers and at most as many octaves: those are the first of these."""
-        assert isinstance(smaller, PictureMLP)  # of the same kind, as said
+        """Copies a network with as many layers and at most as many octaves, which come first here."""
+        assert isinstance(smaller, PictureMLP)
         mine, its = ([layer for layer in net if isinstance(layer, torch.nn.Linear)] for net in (self.net, smaller.net))
         if len(mine) == len(its) and smaller.frequencies <= self.frequencies:
             widen_all(torch.nn.ModuleList(mine), torch.nn.ModuleList(its), torch.arange(its[0].in_features))
@@ -64,14 +64,14 @@ class FourierField(PictureField):
 
     Args:
         size: see `PictureField`.
-        features: how many random frequencies; each gives a sine and a cosine.
-        spread: standard deviation of the frequencies, as a share of the highest one the picture's pixels can show.
+        features: number of random frequencies; each gives a sine and a cosine.
+        spread: standard deviation of the frequencies, as a share of the Nyquist frequency.
         width: neurons of each hidden layer.
         depth: hidden layers.
         rate: factor on the learning rate.
 
     Raises:
-        InputError: where spread or rate are not above 0.
+        InputError: if spread or rate is not above 0.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class FourierField(PictureField):
         self.cycles: Tensor
         """[2, features], over the picture's longer side; the seed decides them, and checkpoints keep them."""
         self.register_buffer("cycles", torch.randn(2, features) * spread * self.nyquist)
-        self.net = rectified([2 * features, *[width] * depth, 3])
+        self.net = relu_layers([2 * features, *[width] * depth, 3])
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         angles = math.pi * self.centred(uv) @ self.cycles  # the longer side is 2 units long
@@ -103,12 +103,12 @@ class SirenField(PictureField):
         size: see `PictureField`.
         width: neurons of each hidden layer.
         depth: hidden layers.
-        reach: angular frequency of the first layer as a share of the highest one the pixels can show; 0.075 gives the paper's
-            30 for a picture of 256 pixels.
+        reach: angular frequency of the first layer as a share of the Nyquist frequency; 0.075 gives the paper's 30 for a
+            picture of 256 pixels.
         rate: factor on the learning rate.
 
     Raises:
-        InputError: where reach or rate are not above 0.
+        InputError: if reach or rate is not above 0.
     """
 
     HIDDEN_FREQUENCY = 30.0  # omega_0 of the later layers, which the paper keeps whatever the signal
@@ -119,7 +119,7 @@ class SirenField(PictureField):
         super().__init__(size, rate)
         if not reach > 0:
             raise InputError("model.reach", "", str(reach), "above 0")
-        # In radians a unit, and the longer side is 2 units long: at most pi * nyquist.
+        # In radians per unit; the longer side is 2 units long.
         self.first_frequency = reach * math.pi * self.nyquist
         self.hidden = layers(2, *[width] * depth)
         self.last = torch.nn.Linear(width, 3)
@@ -127,7 +127,7 @@ class SirenField(PictureField):
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """Draws weights so that activations spread alike in all layers; biases are left as the layers drew them."""
+        """Draws weights so that all layers' activations have equal variance; biases stay as the layers drew them."""
         for index, layer in enumerate([*self.hidden, self.last]):
             inputs = layer.weight.shape[1]
             bound = 1 / inputs if index == 0 else math.sqrt(6 / inputs) / self.HIDDEN_FREQUENCY
@@ -137,4 +137,4 @@ class SirenField(PictureField):
         h = self.centred(uv)
         for index, layer in enumerate(self.hidden):
             h = torch.sin((self.first_frequency if index == 0 else self.HIDDEN_FREQUENCY) * layer(h))
-        return 0.5 + 0.5 * self.last(h)  # the paper's outputs lie around 0; what leaves [0, 1] is cut where it is shown
+        return 0.5 + 0.5 * self.last(h)  # the paper's outputs lie around 0; display clips to [0, 1]

@@ -21,7 +21,7 @@ from nerf_lightning.utils.options import Count
 
 
 class VectorMatrix(torch.nn.Module):
-    """Trainable planes and lines over the unit cube: a vector-matrix decomposition (TensoRF, eq. 3).
+    """Trainable planes times lines over the unit cube: TensoRF's vector-matrix decomposition (eq. 3).
 
     Args:
         cells: along each side.
@@ -38,7 +38,7 @@ class VectorMatrix(torch.nn.Module):
 
     @property
     def cells(self) -> int:
-        """Cells along each side at present."""
+        """Current cells along each side."""
         return self.lines.shape[1] - 1
 
     def total(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
@@ -47,7 +47,7 @@ class VectorMatrix(torch.nn.Module):
 
     @torch.no_grad()
     def resize(self, cells: int) -> None:
-        """Interpolates planes and lines onto another grid; the same function where that has all the old vertices."""
+        """Interpolates planes and lines onto another grid; the function stays the same if that has all the old vertices."""
         planes = self.planes.permute(0, 3, 1, 2)
         lines = self.lines.transpose(1, 2)
         planes = interpolate(planes, (cells + 1, cells + 1), mode="bilinear", align_corners=True)
@@ -57,11 +57,11 @@ class VectorMatrix(torch.nn.Module):
 
     @torch.no_grad()
     def take(self, smaller: "VectorMatrix", silent: bool) -> None:
-        """Takes over another volume's components, and its size; further ones are new.
+        """Copies another volume's components and its size; further components are new.
 
         Args:
             smaller: with at most as many components.
-            silent: whether the new ones shall add nothing: their lines are zero then.
+            silent: whether the new ones add nothing at first, by lines of zero.
         """
         new = self.lines.shape[2] - smaller.lines.shape[2]
         planes, lines = (self.SPREAD * torch.randn(*old.shape[:-1], new) for old in (smaller.planes, smaller.lines))
@@ -72,7 +72,7 @@ class VectorMatrix(torch.nn.Module):
 
     @torch.no_grad()
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
-        """Zeroes what no position in the reached cells reads."""
+        """Zeroes the vertices that no position in the reached cells reads."""
         read = vertices_in(reached, self.cells)
         for mode in range(3):
             self.planes[mode][~read.any(mode)] = 0
@@ -80,7 +80,7 @@ class VectorMatrix(torch.nn.Module):
             self.lines[mode][~read.any(b).any(a)] = 0
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        """Takes the size of what is loaded, which may be of another stage of training."""
+        """Takes the size of the loaded state, which may come from another stage of training."""
         lines = state_dict.get(f"{prefix}lines")
         if lines is not None and lines.ndim == 3 and 1 < lines.shape[1] != self.lines.shape[1]:
             self.resize(lines.shape[1] - 1)
@@ -88,20 +88,20 @@ class VectorMatrix(torch.nn.Module):
 
 
 class TensoRFField(Field):
-    """Density as a sum of planes times lines; colour from a small network of other such products and the direction.
+    """TensoRF: density as a sum of planes times lines; colour from a small network of other such products and the direction.
 
-    The planes grow finer while training: a coarse grid finds the shape sooner. The network's first layer stands for the
-    paper's basis matrix too.
+    The planes grow finer during training: a coarse grid finds the shape sooner. The network's first layer includes the
+    paper's basis matrix.
 
     Args:
         bounds: the box the planes cover.
         density_components, colour_components: channels of each plane. Multiples of 8 are the fast ones on a CPU.
         coarsest, finest: cells along a side at the start and at the end.
-        stages: how many sizes there are, growing geometrically.
+        stages: number of sizes, growing geometrically.
         grown: fraction of the budget after which the planes have their finest size; the stages before are equally long.
         width: neurons of the hidden layer.
-        degree: of the spherical harmonics of the direction that the network sees, 0 to 3; with 0 colours are the same from
-            everywhere. Few photos may be better off with less than 3.
+        degree: of the spherical harmonics of the direction that the network sees, 0 to 3; with 0, colours are the same from
+            everywhere. With few photos, less than 3 may be better.
         density: "relu", "softplus" or "exp".
         size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
 
@@ -148,7 +148,7 @@ class TensoRFField(Field):
         return self.activation(total), products
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-        """As `forward` gives it, without the work for the colour."""
+        """As `forward` gives it, without computing the colour."""
         return self.activation(self.density_volume.total(self.bounds.to_unit(positions))) / self.unit_length
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -165,9 +165,9 @@ class TensoRFField(Field):
 
     @torch.no_grad()
     def take(self, smaller: Field) -> None:
-        """Takes over all of it, and refines it to the finest size at once: the coarse sizes have done their work."""
-        assert isinstance(smaller, TensoRFField)  # of the same kind, as said
-        # Densities are a plain sum. New components of the colour stay unheard as long as their weights are zero.
+        """Copies everything and refines it to the finest size at once: the coarse sizes have done their work."""
+        assert isinstance(smaller, TensoRFField)
+        # Densities are a plain sum; new colour components have no effect while their weights are zero.
         self.density_volume.take(smaller.density_volume, silent=True)
         self.colour_volume.take(smaller.colour_volume, silent=False)
         for volume in (self.density_volume, self.colour_volume):
@@ -179,7 +179,7 @@ class TensoRFField(Field):
         widen_all(self.colour_net, smaller.colour_net, columns)
 
     def grow(self, progress: float) -> list[torch.nn.Parameter]:
-        """Refines planes and lines where `progress` asks for more than they have; they never shrink."""
+        """Refines planes and lines to the size that `progress` asks for; they never shrink."""
         wanted = self.resolution_at(progress)
         replaced: list[torch.nn.Parameter] = []
         for volume in (self.density_volume, self.colour_volume):

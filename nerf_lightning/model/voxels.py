@@ -25,30 +25,30 @@ from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_fr
 from nerf_lightning.utils.options import Count
 
 EMPTY = -8.0
-"""Logarithm of the density (in 1 / half-size) where no vertex is kept: nothing that a ray would notice."""
+"""Logarithm of the density (in 1 / half-size) where no vertex is kept: too thin to matter."""
 RECENT = 0.5
-"""The last part of a stage: vertices that were read in it stay."""
+"""The last part of a stage; vertices read in it are kept."""
 PIECES = 4
-"""Steps that share one look at the roughness of all vertices."""
+"""Each step measures the roughness of one of this many pieces of the table."""
 TABLES = ("log_density", "colours", "views")
 COUNTS = {"stage": torch.int64, "steps": torch.int32, "started": torch.int32}
 """Whole numbers in checkpoints."""
 CHUNK = 1 << 16
-"""Vertices interpolated together when growing: bounds the memory."""
+"""Vertices interpolated at a time when growing, to bound the memory."""
 
 
 class VoxelField(Field):
     """Vertices of a cubic grid over the bounds, each with a log-density, a colour, and what the direction adds to it.
 
     All are interpolated trilinearly before the density's exponential and the colour's sigmoid, which keeps surfaces sharp
-    (DVGO, Sun et al. 2022, section 4). Training starts on a coarse, full grid. It grows finer in stages, and at each one keeps
-    only what lies among vertices that samples have read in the latter half of the last: as samplers pass on only what light
-    reaches, this is pruning by visibility. Row 0 stands for all vertices that are not kept, and never learns.
+    (DVGO, Sun et al. 2022, section 4). Training starts on a coarse, full grid. It grows finer in stages. Each new stage
+    keeps only what lies among vertices that samples read in the latter half of the one before: samplers pass on only what
+    light reaches, so this prunes by visibility. Row 0 stands for all vertices that are not kept, and never learns.
 
     Args:
         bounds: the box the grid covers.
         coarsest, finest: cells along a side at the start and at the end.
-        stages: how many sizes there are, growing geometrically.
+        stages: number of sizes, growing geometrically.
         grown: fraction of the budget after which the grid has its finest size.
         degree: of the spherical harmonics, 0 to 3; those above 0 depend on the direction.
         density_rate: factor on the learning rate of the log-densities, relative to the colours'.
@@ -91,7 +91,7 @@ class VoxelField(Field):
         self.grown_after = self.times[-1]
         self.terms = harmonics_up_to(degree) - 1  # without the constant one
         self.density_rate = density_rate
-        # Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog before cameras.
+        # Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog in front of cameras.
         self.fastest = 1 / density_rate
         self.smoothness = smoothness
         rows = (self.resolutions[0] + 1) ** 3 + 1
@@ -108,12 +108,12 @@ class VoxelField(Field):
 
     @property
     def tables(self) -> tuple[torch.nn.Parameter, torch.nn.Parameter, torch.nn.Parameter]:
-        """All that vertices hold, one row a vertex."""
+        """All that vertices hold, one row per vertex."""
         return self.log_density, self.colours, self.views
 
     @property
     def side(self) -> int:
-        """Vertices along each side at present, kept or not."""
+        """Current vertices along each side, kept or not."""
         return round(len(self.index) ** (1 / 3))
 
     def per_length(self, raw: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
@@ -121,7 +121,7 @@ class VoxelField(Field):
         return truncated_exp(self.density_rate * raw) / self.unit_length
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-        """As `forward` gives it, but without a mark on the vertices."""
+        """As `forward` gives it, but without marking the vertices as read."""
         return self.per_length(voxel_value(self.log_density, self.index, self.bounds.to_unit(positions)))
 
     def forward(
@@ -135,13 +135,13 @@ class VoxelField(Field):
             self.mark(rows)
         return found
 
-    @torch.compiler.disable  # else each step would be compiled anew
+    @torch.compiler.disable  # each step would be compiled again
     def mark(self, rows: Int[Tensor, "N 8"]) -> None:
         """Notes that these rows were read."""
         mark_rows(self.seen, rows, self.steps)
 
     def penalty(self) -> Float[Tensor, ""] | None:
-        """The roughness of the log-densities, in each step that of another piece of the table."""
+        """The roughness of the log-densities, of another piece of the table in each step."""
         rows, piece = len(self.vertex) - 1, self.steps % PIECES
         first, last = (1 + rows * i // PIECES for i in (piece, piece + 1))
         if not self.smoothness or first == last:
@@ -164,7 +164,7 @@ class VoxelField(Field):
         return list(self.tables)
 
     def hold(self, keep: Bool[Tensor, "V"], tables: Sequence[Tensor]) -> None:
-        """Takes other tables: the rows of the kept vertices, in their order, behind that of all others."""
+        """Replaces the tables: row 0 for all other vertices, then those of the kept vertices in order."""
         for table, columns in zip(self.tables, tables, strict=True):
             replace_data(table, columns.reshape(len(columns), *table.shape[1:]).contiguous())
         self.index = torch.where(keep, keep.cumsum(0), 0).int()
@@ -173,8 +173,8 @@ class VoxelField(Field):
 
     @torch.no_grad()
     def take(self, smaller: Field) -> None:
-        """Takes over all of it; from there it grows to its finest size in the usual stages."""
-        assert isinstance(smaller, VoxelField)  # of the same kind, as said
+        """Copies everything; from there it grows to its finest size in the usual number of stages."""
+        assert isinstance(smaller, VoxelField)
         cells = smaller.side - 1
         if cells > self.resolutions[-1]:
             return
@@ -208,7 +208,7 @@ class VoxelField(Field):
         self.vertex = torch.cat([kept.new_tensor([-1]), kept]).int()
 
     def surroundings(self, side: int) -> Bool[Tensor, "S S S"]:
-        """Which vertices of a grid of side^3 lie among present vertices that were read of late, or next to such ones."""
+        """Which vertices of a grid of side^3 lie among current vertices that were read lately, or next to those."""
         fresh = self.seen > self.steps - 1 - RECENT * (self.steps - self.started)
         fresh[0] = False
         old = self.side
@@ -216,7 +216,7 @@ class VoxelField(Field):
         at = torch.arange(side, device=keep.device) * (old - 1) / (side - 1)
         for axis in range(3):
             keep = keep.index_select(axis, at.floor().long()) & keep.index_select(axis, at.ceil().long())
-        # Where nothing was rendered yet, everything stays.
+        # Before anything was rendered, everything stays.
         return widened(keep) if keep.any() else torch.ones_like(keep)
 
     def _save_to_state_dict(self, destination: dict[str, Tensor], prefix: str, keep_vars: bool) -> None:
@@ -225,7 +225,7 @@ class VoxelField(Field):
             destination[prefix + name] = torch.tensor(getattr(self, name), dtype=dtype)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        """Takes the sizes of the state that is being loaded: a grid of another stage has other shapes."""
+        """Takes the sizes of the loaded state: a grid of another stage has other shapes."""
         for name in COUNTS:
             if prefix + name in state_dict:
                 setattr(self, name, int(state_dict.pop(prefix + name)))

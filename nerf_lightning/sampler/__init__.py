@@ -1,4 +1,4 @@
-"""Stage 3, samplers: Rays -> Samples, where along each ray the field is asked."""
+"""Stage 3, samplers: Rays -> Samples, where along each ray the field is evaluated."""
 
 from nerf_lightning.sampler.importance import ImportanceSampler
 from nerf_lightning.sampler.occupancy import OccupancySampler

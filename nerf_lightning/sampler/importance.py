@@ -1,4 +1,4 @@
-"""Coarse to fine: look evenly first, then look again where the weight is."""
+"""Coarse to fine: sample evenly first, then again where the weight is."""
 
 import torch
 from jaxtyping import Float
@@ -25,14 +25,14 @@ def inverse_cdf(
 
 
 class ImportanceSampler(UniformSampler):
-    """A uniform pass without gradient, then as many samples again drawn where its weights are; both together are returned.
+    """A uniform pass without gradient, then further samples drawn by its weights; returns both together.
 
     One field serves both passes.
 
     Args:
         bounds: where the content is.
         samples: intervals of the first pass.
-        fine: further samples a ray.
+        fine: further samples per ray.
         stratified: jitter both passes in training.
     """
 

@@ -14,15 +14,15 @@ from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
 from nerf_lightning.utils.options import Count
 
 ASKED, LOOKED_AT = 4, 32
-"""Positions at which the density is asked together, and steps looked at together, for each sample that is rendered so."""
+"""How many positions are evaluated at a time, and how many steps are tested at a time, as multiples of `Sampler.chunk`."""
 MOST_CAMERAS = 128
-"""Cameras, evenly chosen, that tell which cells are in view."""
+"""Most cameras, evenly chosen, that decide which cells are in view."""
 ROOM = 1.25
-"""Times as many steps as were last counted there is room for, where they are not counted."""
+"""Room for steps that are not counted, as a multiple of the last count."""
 
 
 def in_view(camera: Cameras, points: Float[Tensor, "N 3"], near: float) -> Bool[Tensor, "N"]:
-    """Which points of the world one camera has in its picture, farther from it than `near`."""
+    """Which world points one camera sees, farther from it than `near`."""
     rotation, eye = camera.c2w[0, :3, :3], camera.c2w[0, :3, 3]
     local = (points - eye) @ rotation
     pixels = local @ camera.K[0].T
@@ -35,24 +35,24 @@ class OccupancySampler(Sampler):
     """Steps of one length through the bounds, kept only where there is something that light can reach.
 
     A coarse grid says where to look. Each cell holds a decaying maximum of the optical thickness (density times step) found
-    in it at random places; it is occupied while that stands above the lower of `threshold` and half the grid's mean. In
-    training, only cells that light reached lately are looked at, but for one step in `update_every` that looks at all
-    occupied ones: what lies inside a solid costs nothing. Then the field's density is asked along the steps found, and those
-    behind something opaque, and those that hold nothing, are dropped.
+    at random positions in it; it is occupied while that is above the lower of `threshold` and half the grid's mean. Training
+    looks only at cells that light reached lately, except that every `update_every`-th step looks at all occupied ones: the
+    inside of a solid costs nothing. The field's density is then evaluated along these steps, and those behind something
+    opaque and those that hold nothing are dropped.
 
     Args:
         bounds: where the content is.
         samples: steps along the diagonal of the bounds; rays that cross less of it get fewer.
         resolution: cells along each side.
         threshold: optical thickness of a step above which a cell counts as occupied.
-        decay: factor on a cell's memory each time it is looked at.
+        decay: factor on a cell's maximum at each update.
         update_every: training steps between updates.
-        warmup: steps during which every update looks at every cell; afterwards at a quarter of them.
-        memory: updates after which a cell that light no longer reached is left out.
-        seen_by: cells that fewer training cameras have in view are left empty: what one camera alone sees can be anything, such
-            as fog before its lens.
-        transparent: transmittance below which a ray has ended, above 0.
-        thin: opacity of a step below which training drops it; never more than half the mean, so that a fog trains too.
+        warmup: steps during which updates cover every cell; afterwards each covers a quarter of them.
+        memory: updates after which a cell that light no longer reaches is skipped.
+        seen_by: cells seen by fewer training cameras stay empty: what only one camera sees can be anything, such as fog in
+            front of its lens.
+        transparent: early-stop transmittance, above 0: below it a ray has ended.
+        thin: alpha threshold: training drops steps of lower opacity; at most half the mean, so that fog trains too.
     """
 
     thickness: Tensor
@@ -97,15 +97,14 @@ class OccupancySampler(Sampler):
         self.register_buffer("reached", torch.zeros(cells, dtype=torch.int32))
         self.register_buffer("lit", torch.ones(cells, dtype=torch.bool))
         self.first_step = 0
-        """Where training began: the warm-up counts from there."""
+        """The step at which training began; the warm-up counts from it."""
         self.updates = 0
-        """Number of the last update; `reached` holds the number of the update after which light last met the cell."""
+        """Number of the last update; `reached` holds, for each cell, the number of the last update before light last met it."""
         self.look_everywhere = True
         """Whether the next training step looks at all occupied cells."""
         self.per_ray: tuple[float, float] | None = None
-        """Steps a ray in occupied cells, and those of them that were kept, when they were last counted; None where the next
-        training step is to count. To count is to wait for the device: but on a CPU, where that costs nothing, the steps
-        between two updates take it that there will be as many."""
+        """Steps per ray in occupied cells, and how many of those were kept, at the last count; None if the next training step
+        must count. Counting waits for the device, so except on a CPU the steps between two updates assume the last count."""
         self.step_length = 2 * float(bounds.half_size.norm()) / samples
         """Length of one step inside the box, in world units."""
 
@@ -113,7 +112,7 @@ class OccupancySampler(Sampler):
         near, far = self.bounds.near_far(rays)
         if generator is None:
             packed = self._march(rays, near, far, torch.zeros_like(near), self.occupied)
-            # A picture must not depend on how its rays are cut into calls: only training looks at the mean, and drops.
+            # A picture must not depend on how its rays are split into calls: only training uses the mean to drop steps.
             return Samples(*keep_visible(self._thickness(density, rays, packed), packed, self.transparent, 0.0))
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.occupied if self.look_everywhere else self.lit
@@ -146,13 +145,13 @@ class OccupancySampler(Sampler):
 
     @torch.no_grad()
     def _thickness(self, density: DensityFn, rays: Rays, packed: Packed) -> Float[Tensor, "N"]:
-        """Optical thickness of intervals, by the density at their middle; mixed precision gives halves."""
+        """Optical thickness of intervals, from the density at their middle, which mixed precision gives in half precision."""
         found = [density(part).float() for part in Samples(*packed).positions(rays).split(ASKED * self.chunk)]
         return (found[0].detach() if len(found) == 1 else torch.cat(found)) * packed[1]
 
     @torch.no_grad()
     def look_through(self, cameras: Cameras) -> None:
-        """Leaves cells empty for good whose middle fewer than `seen_by` cameras have in view."""
+        """Empties for good the cells whose middle fewer than `seen_by` cameras see."""
         chosen = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS)).round().long()
         n = self.resolution
         cells = torch.arange(n**3)
@@ -162,7 +161,7 @@ class OccupancySampler(Sampler):
         count = torch.zeros(len(cells), dtype=torch.int32)
         wanted = min(self.seen_by, len(chosen))
         for camera in chosen:
-            open_ones = (count < wanted).nonzero()[:, 0]  # what is in view often enough needs no more looks
+            open_ones = (count < wanted).nonzero()[:, 0]  # the others have enough views already
             count[open_ones] += in_view(cameras[camera : camera + 1].to("cpu"), centres[open_ones], near).int()
         allowed = count >= wanted
         self.allowed.copy_(allowed if allowed.any() else torch.ones_like(allowed))
@@ -185,7 +184,7 @@ class OccupancySampler(Sampler):
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         self.updates, phase = divmod(step, self.update_every)
         self.look_everywhere = not phase
-        if phase <= 1:  # other cells than in the step before
+        if phase <= 1:  # the cells differ from those of the step before
             self.per_ray = None
         if phase:
             return
@@ -194,7 +193,7 @@ class OccupancySampler(Sampler):
         if step - self.first_step < self.warmup:
             cells = torch.arange(total, device=device)
         else:
-            # A random phase of a stride of four: no cell twice, and every cell has the same chance.
+            # Every fourth cell from a random start: no cell twice, all equally likely.
             start = torch.randint(4, (1,), generator=generator, device=device)
             cells = (torch.arange(0, total, 4, device=device) + start) % total
         n = self.resolution
@@ -206,6 +205,6 @@ class OccupancySampler(Sampler):
         )
         self.thickness[cells] = torch.maximum(self.thickness[cells] * self.decay, found)
         occupied = self.allowed & (self.thickness > self.thickness.mean().mul(0.5).clamp_max(self.threshold))
-        # With no density anywhere there would be no samples, hence no gradient, for ever: look everywhere again.
+        # Without any density there would be no samples, so no gradient, forever: look everywhere again.
         self.occupied = torch.where(occupied.any(), occupied, self.allowed)
         self.lit = self.occupied & (self.reached >= self.updates - self.memory)

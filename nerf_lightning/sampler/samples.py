@@ -1,4 +1,4 @@
-"""Samples: intervals along rays, packed one ray after the other, and the interface every sampler meets."""
+"""Samples: intervals along rays, packed one ray after the other, and the interface of all samplers."""
 
 import bisect
 from collections.abc import Callable, Iterator
@@ -12,7 +12,7 @@ from nerf_lightning.cameras import Cameras, InBounds, Rays
 from nerf_lightning.kernels import pack_intervals, points
 
 DensityFn = Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N"]]
-"""World positions -> density (1 / world unit); how samplers look at a field without knowing it."""
+"""World positions -> density (1 / world unit); all that samplers know of a field."""
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,14 @@ class Samples:
     dt: Float[Tensor, "N"]
     """Length of each interval."""
     ray: Int[Tensor, "N"]
-    """Index of the ray each sample lies on."""
+    """Index of each sample's ray."""
     offsets: Int[Tensor, "R_plus_1"]
     """Samples of ray r are offsets[r] : offsets[r + 1]."""
     whole: Bool[Tensor, "R"] | None = None
-    """Which rays have all their samples, where the number of samples was settled before they were found: then some rays may
-    lack some, and where there are fewer, intervals of length 0 stand at the end. None: all have."""
+    """Which rays have all their samples, if the number of samples was fixed before they were found: some rays may then lack
+    some, or intervals of length 0 fill the end. None: all rays have all."""
     places: Float[Tensor, "N 3"] | None = None
-    """World positions of the midpoints, where somebody has worked them out already."""
+    """World positions of the midpoints, if already known."""
 
     def __len__(self) -> int:
         return self.t.shape[0]
@@ -47,7 +47,7 @@ class Samples:
         return rays.directions.index_select(0, self.ray)
 
     def between(self, near: float, far: float) -> "Samples":
-        """Those whose midpoints lie within two distances along their rays."""
+        """The samples whose midpoints lie between two distances along their rays."""
         keep = (self.t >= near) & (self.t <= far)
         before = torch.cat([keep.new_zeros(1, dtype=torch.int64), keep.cumsum(0)])
         return Samples(self.t[keep], self.dt[keep], self.ray[keep], before[self.offsets].to(self.offsets.dtype))
@@ -59,10 +59,10 @@ def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Sampl
 
 
 def split(samples: Samples, most: int) -> Iterator[tuple[slice, Samples]]:
-    """Cuts samples into runs of whole rays with at most `most` samples each (a ray with more makes a run of its own).
+    """Splits samples into runs of whole rays with at most `most` samples each (a ray with more is a run of its own).
 
     Yields:
-        The rays of a run, as a slice, and their samples with `ray` and `offsets` counted from the run's start.
+        A run's rays as a slice, and their samples with `ray` and `offsets` counted from the run's start.
     """
     offsets = samples.offsets.tolist()
     first, rays = 0, len(offsets) - 1
@@ -75,34 +75,34 @@ def split(samples: Samples, most: int) -> Iterator[tuple[slice, Samples]]:
 
 
 class Sampler(InBounds):
-    """Base of samplers. Without a generator (evaluation) the samples do not depend on chance."""
+    """Base of samplers. Without a generator (evaluation) the samples are not random."""
 
     chunk = 1 << 15
-    """Samples that a device renders together: what a sampler does at once is a multiple of that."""
+    """Samples that a device renders at a time; samplers work on multiples of it."""
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         raise TypeError(f"{type(self).__name__} must define forward(rays, density, generator) -> Samples")
 
     def packed(self) -> dict[str, Tensor]:
-        """All that rendering needs: what `unpack` takes."""
+        """What rendering needs, for `unpack`."""
         return {}
 
     def unpack(self, packed: dict[str, Tensor]) -> None:
-        """Becomes the sampler that `packed` told of.
+        """Restores what `packed` returned.
 
         Raises:
-            RuntimeError, KeyError: where that was one of another size or kind.
+            RuntimeError, KeyError: if it came from another kind or size of sampler.
         """
 
     def take(self, other: "Sampler") -> None:
-        """Goes on from what another sampler of its kind and size has found out."""
+        """Copies what another sampler of the same kind and size has learned."""
         self.load_state_dict(other.state_dict())
 
     def look_through(self, cameras: Cameras) -> None:
-        """Called before training with the cameras of the photos; samplers that leave out what none has in view do so here."""
+        """Called before training with the photos' cameras, for samplers that skip what no camera sees."""
 
     def restart(self, step: int) -> None:
-        """Called where training starts again at a step with a field that has learned nothing yet."""
+        """Called when training starts again at a step, with a fresh field."""
 
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
-        """Called before each training step; samplers that learn where content is do so here."""
+        """Called before each training step, for samplers that learn where the content is."""

@@ -22,8 +22,8 @@ class UniformSampler(Sampler):
 
     Args:
         bounds: where the content is; rays that miss it get no samples.
-        samples: intervals a ray.
-        stratified: jitter the intervals in training, so that over time the field is asked everywhere.
+        samples: intervals per ray.
+        stratified: jitter the intervals in training, so that over time the field is evaluated everywhere.
     """
 
     def __init__(self, bounds: Bounds, samples: Count = 64, stratified: bool = False):

@@ -6,7 +6,7 @@ from agreement import agree
 from ragged import COUNTS, MANY, ragged
 from torch import Tensor
 
-from nerf_lightning.kernels import accumulate, composite, use_kernels, volume_weights
+from nerf_lightning.kernels import composite, use_kernels, volume_weights
 from nerf_lightning.sampler import Samples
 
 NAN = float("nan")
@@ -44,7 +44,7 @@ def test_weights_agree_with_a_loop_along_each_ray(counts, scale, weights_of):
             i += 1
     actual = weights_of(density, samples)
     torch.testing.assert_close(actual, torch.tensor(expected), rtol=1e-4, atol=1e-6)
-    opacity = accumulate(actual, torch.ones(len(samples), 1), samples.ray, len(counts))[:, 0]
+    opacity = torch.zeros(len(counts)).index_add(0, samples.ray, actual)
     assert (actual >= 0).all() and (opacity <= 1 + 1e-6).all()
     assert (opacity[torch.tensor(counts) == 0] == 0).all()
 
@@ -98,8 +98,6 @@ def test_gradients(counts):
     density = (2 * torch.rand(len(samples), dtype=torch.float64)).requires_grad_()
     dt = samples.dt.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda s, d: volume_weights(s, d, samples.ray, samples.offsets), (density, dt))
-    values = torch.rand(len(samples), 2, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda w, v: accumulate(w, v, samples.ray, len(counts)), (density, values))
 
 
 def test_gradients_behind_something_opaque_are_finite(kernels: str):
@@ -110,14 +108,6 @@ def test_gradients_behind_something_opaque_are_finite(kernels: str):
     seen = composite(density, torch.rand(4, 3), samples.t, samples.dt, samples.ray, samples.offsets)
     (gradient,) = torch.autograd.grad(sum(x.square().sum() for x in seen), density)
     assert gradient.isfinite().all() and gradient[0].abs() < 1e-6, "no more of it can be seen"
-
-
-@pytest.mark.parametrize("counts", COUNTS)
-def test_accumulate_sums_over_each_ray(counts):
-    samples = ragged(counts)
-    weights, values = torch.rand(len(samples)), torch.rand(len(samples), 3)
-    expected = [(w[:, None] * v).sum(0) for w, v in zip(weights.split(counts), values.split(counts), strict=True)]
-    torch.testing.assert_close(accumulate(weights, values, samples.ray, len(counts)), torch.stack(expected))
 
 
 def seen(samples: Samples):

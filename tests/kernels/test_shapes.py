@@ -24,7 +24,6 @@ def read(density: Tensor, colour: Tensor, views: Tensor) -> None:
 CALLS: dict[str, Callable[[], object]] = {
     "lengths": lambda: k.volume_weights(ONE, ONE[1:], RAY, OFFSETS),
     "rays that are no whole numbers": lambda: k.volume_weights(ONE, ONE, ONE, OFFSETS),
-    "values of one column": lambda: k.accumulate(ONE, ONE, RAY, 1),
     "colours of two channels": lambda: k.composite(ONE, torch.zeros(3, 2), ONE, ONE, RAY, OFFSETS),
     "too few colours": lambda: k.composite(ONE, torch.zeros(2, 3), ONE, ONE, RAY, OFFSETS),
     "too little thickness": lambda: k.keep_visible(ONE[1:], (ONE, ONE, RAY, OFFSETS), 1e-4, 0.0),

@@ -7,11 +7,11 @@ import torch
 
 # No fast maths. Numba optimises a function again for every other one it is linked into, and a process that compiles a kernel
 # runs another copy than one that loads it from the cache: where the optimiser may reorder or fuse, their last bits differ.
-# What vector units need is written out instead: see `lanes`.
+# Vector code is written out instead: see `lanes`.
 inner = partial(numba.njit, cache=True, error_model="numpy")
-"""Decorates what is called within a kernel."""
+"""Decorates functions that kernels call."""
 kernel = partial(inner, parallel=True)
-"""Decorates an entry point; `workers` says into how many pieces it cuts its work."""
+"""Decorates an entry point; its argument `workers` is the number of pieces its work is split into."""
 
 
 def workers() -> int:
@@ -19,6 +19,6 @@ def workers() -> int:
     asked = torch.get_num_threads()
     threads = min(asked, numba.config.NUMBA_NUM_THREADS)
     numba.set_num_threads(threads)
-    if torch.get_num_threads() != asked:  # both stand on OpenMP, and numba's first start takes all cores for torch too
+    if torch.get_num_threads() != asked:  # both use OpenMP, and numba's start gives torch all cores too
         torch.set_num_threads(asked)
     return threads

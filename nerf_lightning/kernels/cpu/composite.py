@@ -61,11 +61,11 @@ def backward(
 
 @kernel
 def visible(thickness, offsets, transparent, thin, keep, counts, workers):
-    """Marks samples that light can reach and that hold something, and counts them a ray [R].
+    """Marks samples that light can reach and that hold something, and counts them for each ray [R].
 
     Args:
-        transparent: transmittance below which a ray has ended.
-        thin: optical thickness of a sample below which it holds nothing.
+        transparent: early-stop transmittance: below it a ray has ended.
+        thin: alpha threshold, as an optical thickness: a sample below it holds nothing.
     """
     rays = len(offsets) - 1
     furthest = -math.log(transparent)
@@ -74,7 +74,7 @@ def visible(thickness, offsets, transparent, thin, keep, counts, workers):
             optical, kept = 0.0, 0
             for n in range(offsets[ray], offsets[ray + 1]):
                 step = thickness[n]
-                keep[n] = not (optical > furthest or step < thin)  # what is not a number stays, to be noticed
+                keep[n] = not (optical > furthest or step < thin)  # NaN stays, to be noticed
                 kept += keep[n]
                 optical += step
             counts[ray] = kept

@@ -1,6 +1,6 @@
-"""A run of neighbouring numbers as one value, for numba: it loads, adds, multiplies and stores them in vector registers.
+"""Several consecutive numbers as one value for numba, loaded, added, multiplied and stored in vector registers.
 
-Numba leaves short loops to scalar instructions and cannot know that rows do not overlap; this says both.
+Numba compiles short loops to scalar instructions and cannot know that rows do not overlap.
 """
 
 import operator
@@ -11,7 +11,7 @@ from numba.extending import intrinsic, models, overload, register_model
 
 
 class Lanes(types.Type):
-    """So many single-precision numbers."""
+    """`width` single-precision numbers."""
 
     def __init__(self, width):
         self.width = width
@@ -34,7 +34,7 @@ def _pointer(context, builder, types_, values, width):
 
 @intrinsic
 def load(typing, array, row, first, lanes):
-    """array[row, first : first + len(lanes)], inside a float32 array [., .] in C order; `lanes` is any tuple so long."""
+    """array[row, first : first + len(lanes)], inside a float32 array [., .] in C order; `lanes` is any tuple of that length."""
     width = len(lanes)
 
     def code(context, builder, signature, values):
@@ -56,7 +56,7 @@ def store(typing, array, row, first, values):
 
 @intrinsic
 def zeros(typing, lanes):
-    """As many zeros as the tuple `lanes` is long."""
+    """Zeros, one for each entry of the tuple `lanes`."""
     width = len(lanes)
 
     def code(context, builder, signature, values):
@@ -83,13 +83,13 @@ def total(typing, a):
 
 
 def _pick(builder, first, second, places):
-    """A vector of the numbers at these places of two vectors of one length."""
+    """The numbers at these places of two vectors joined end to end."""
     mask = ir.Constant(ir.VectorType(ir.IntType(32), len(places)), list(places))
     return builder.shuffle_vector(first, second, mask)
 
 
 FUSES = binding.get_host_cpu_features().get("fma", True)
-"""Whether the processor multiplies and adds in one go; only x86 knows such that do not."""
+"""Whether the processor has fused multiply-add; only some x86 ones lack it."""
 
 
 @intrinsic

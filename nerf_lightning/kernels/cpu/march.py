@@ -1,6 +1,6 @@
 """Walking rays through an occupancy grid.
 
-Distances, positions and cells are rounded exactly as the torch reference rounds them, so that both keep the same samples.
+Distances, positions and cells are rounded exactly as the torch reference rounds them, so both keep the same samples.
 """
 
 from numba import float32, int32, prange
@@ -10,7 +10,7 @@ from nerf_lightning.kernels.cpu.compile import inner, kernel
 
 @inner
 def warp(t, enter, leave, unit):
-    """Numbers that an unbounded ray's steps are even in; see `nerf_lightning.cameras.bounds.warp`."""
+    """Numbers in which an unbounded ray's steps are even; see `nerf_lightning.cameras.bounds.warp`."""
     one, zero = float32(1), float32(0)
     before, behind = max((enter - t) / unit, zero), max((t - leave) / unit, zero)
     within = (min(max(t, enter), leave) - enter) / unit
@@ -85,7 +85,7 @@ def flat_cell(u, v, w, resolution):
 
 @inner
 def steps_to_leave(origin, direction, centre, half, cells, u, v, w, t, step):
-    """How many steps surely stay within the present cell of a cells^3 grid over the box (0 if unsure)."""
+    """How many steps certainly stay within the current cell of a cells^3 grid over the box (0 if unsure)."""
     nearest = float32(1e30)
     for axis in range(3):
         here = u if axis == 0 else (v if axis == 1 else w)
@@ -102,7 +102,7 @@ def steps_to_leave(origin, direction, centre, half, cells, u, v, w, t, step):
 @kernel
 def walk(origins, directions, near, far, inside, shift, occupied, resolution, blocks, cells, centre, half, unbounded, samples,
          step, found, counts, workers):  # fmt: skip
-    """Notes which intervals of each ray to keep in found [R, samples + 1] and how many in counts [R].
+    """Writes which intervals of each ray to keep into found [R, samples + 1], and how many into counts [R].
 
     Args:
         occupied: [resolution^3], row by row.
@@ -139,7 +139,7 @@ def walk(origins, directions, near, far, inside, shift, occupied, resolution, bl
 
 @kernel
 def pack(near, far, inside, shift, half, unbounded, samples, step, found, offsets, t, dt, ray_of, workers):
-    """Distances and lengths of the intervals that `walk` noted, one ray after the other."""
+    """Distances and lengths of the intervals that `walk` found, one ray after the other."""
     rays = len(near)
     for worker in prange(workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
@@ -181,7 +181,7 @@ def points(origins, directions, ray, t, out, workers):
 
 @kernel
 def mark(places, centre, half, unbounded, marks, resolution, value, workers):
-    """Writes a value into the cells that hold places [3, N]. Workers may meet in a cell: they write the same there."""
+    """Writes a value into the cells that hold places [3, N]. Two workers may write to one cell: the same value."""
     samples = places.shape[1]
     for worker in prange(workers):
         for n in range(samples * worker // workers, samples * (worker + 1) // workers):

@@ -1,7 +1,7 @@
 """A whole small network on one tile of samples at a time, so that its activations never leave the core's cache.
 
-Weights come as one row of numbers, layer after layer [O, I] then bias [O], every width filled up with zeros to a multiple
-of four: the loops handle four rows by four columns at once, in registers.
+Weights come as one flat array, layer after layer [O, I] then bias [O], every width padded with zeros to a multiple of four:
+the loops handle four rows by four columns at once, in registers.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from nerf_lightning.kernels.cpu.lanes import fused, load, total, zeros
 TILE = 128
 """Samples worked on together; a constant, so that the inner loops need no remainder."""
 RUN = (0,) * 8
-"""Samples of a tile summed up side by side."""
+"""Samples of a tile that are summed side by side."""
 
 
 @inner(inline="always")
@@ -159,7 +159,7 @@ def forward(weights, widths, x, extra, out, workers):
 
 @kernel
 def backward(weights, widths, x, extra, above, grad_x, grad_weights, workers):
-    """Fills grad_x [I, N] and one row of grad_weights [workers, W] a worker, running each tile again on the way."""
+    """Fills grad_x [I, N] and one row of grad_weights [workers, W] a worker, running each tile's forward pass again."""
     samples = x.shape[1]
     tiles, layers = (samples + TILE - 1) // TILE, len(widths) - 1
     nothing = np.empty((0, samples), np.float32)

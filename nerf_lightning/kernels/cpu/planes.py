@@ -1,4 +1,4 @@
-"""Planes times lines (TensoRF) and their gradient: at each sample, whole rows of channels at once."""
+"""TensoRF's planes times lines and their gradient: whole rows of channels at once at each sample."""
 
 import numpy as np
 from numba import float32, prange, uint32
@@ -78,7 +78,7 @@ def add_to(rows, row, first, values, lanes):
 
 @inner
 def scatter_block(plane, line, grad_plane, grad_line, unit, above, mode, channel, lanes):
-    """Adds the gradient of one mode's channels from `channel` on; `above` [C, N] is theirs, or one row for all of them."""
+    """Adds the gradient of one mode's channels from `channel` on; `above` is [C, N], or one row that serves all channels."""
     samples, cells, one = unit.shape[1], len(line) - 1, uint32(1)
     rows = np.empty((TILE, len(lanes)), np.float32)
     for first in range(0, samples, TILE):
@@ -103,11 +103,11 @@ def scatter_block(plane, line, grad_plane, grad_line, unit, above, mode, channel
 
 @kernel
 def scatter(planes, lines, unit, above, grad_planes, grad_lines, lanes, workers):
-    """Adds to the gradients. A mode's block of channels, as long as `lanes`, belongs to one worker: no two add to the same."""
+    """Adds to the gradients. A mode's block of channels, as many as `lanes`, belongs to one worker, so no two share a place."""
     channels = planes.shape[2]
     blocks = channels // len(lanes)
     for worker in prange(workers):
-        # Runs of neighbouring blocks: workers on two blocks of one plane would take each other's cache lines.
+        # Neighbouring blocks go to one worker: two workers on one plane would fight over cache lines.
         for index in range(3 * blocks * worker // workers, 3 * blocks * (worker + 1) // workers):
             mode, channel = index // blocks, index % blocks * len(lanes)
             start = mode * channels + channel if len(above) > 1 else 0

@@ -1,7 +1,7 @@
 """Trilinear interpolation on a sparse grid of vertices, and its gradient.
 
-In gradients a worker owns a run of rows: it visits all samples in order and adds to its own rows alone, so that the sums do
-not depend on the number of workers. Row 0, of all vertices that are not kept, is constant.
+For gradients each worker owns a run of rows: it visits all samples in order and adds to its own rows only, so that the sums
+do not depend on the number of workers. Row 0, for all vertices that are not kept, is constant.
 """
 
 import numpy as np
@@ -12,9 +12,9 @@ from nerf_lightning.kernels.cpu.hashgrid import cell_of
 from nerf_lightning.kernels.cpu.lanes import load, store, total
 
 TILE = 64
-"""Samples whose basis functions are turned from columns into rows together."""
+"""Samples whose basis functions are transposed together."""
 BINS = 256
-"""Pieces of the table in which a gradient's work is counted before it is shared out."""
+"""Pieces of the table in which a gradient's work is counted before it is divided among workers."""
 
 
 @inner
@@ -45,7 +45,7 @@ def locate(index, cells, unit, rows, weights, workers):
 
 @kernel
 def mark(seen, rows, step, workers):
-    """seen [V] = step at all rows [N, 8]. Workers may meet in a row: they write the same there."""
+    """seen [V] = step at all rows [N, 8]. Two workers may write to one row: the same value."""
     samples = rows.shape[0]
     for worker in prange(workers):
         for n in range(samples * worker // workers, samples * (worker + 1) // workers):
@@ -121,7 +121,7 @@ def add_views_run(views, rows, weights, basis, rgb, lanes, start, end):
 
 @kernel
 def add_views(views, rows, weights, basis, rgb, lanes, workers):
-    """Adds to rgb [3, N] what views [V, 3 B], interpolated, gives with basis [B, N]; `lanes` is a tuple of length B."""
+    """Adds to rgb [3, N] the interpolated views [V, 3 B] times basis [B, N]; `lanes` is a tuple of length B."""
     samples = rows.shape[0]
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
@@ -130,9 +130,9 @@ def add_views(views, rows, weights, basis, rgb, lanes, workers):
 
 @inner
 def borders(rows, table, workers):
-    """Rows [workers + 1], from 1 to `table`, between which each worker adds, so that all have about as much to do."""
+    """Rows [workers + 1], from 1 to `table`, that bound each worker's share, so that all have about as much to do."""
     counts, width = np.zeros(BINS, np.int64), table // BINS + 1
-    for n in range(0, len(rows), 4):  # a part of them tells enough
+    for n in range(0, len(rows), 4):  # a sample of them is enough
         for corner in range(0, 8, 3):
             if rows[n, corner] > 0:
                 counts[rows[n, corner] // width] += 1
@@ -193,7 +193,7 @@ def scatter_views(grad, rows, weights, basis, rgb, lanes, workers):
 
 @inner
 def roughness_run(values, vertex, index, side, start, first, last, slope):
-    """Sum of squared differences, and in `slope` of plain ones."""
+    """The sum of squared differences; `slope` gets each row's sum of plain ones."""
     squares = 0.0
     for row in range(first, last):
         at = int64(vertex[row])

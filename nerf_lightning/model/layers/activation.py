@@ -32,9 +32,9 @@ class _TruncatedExp(torch.autograd.Function):
 
 
 def truncated_exp(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """exp(x), held at e^15 above, with a gradient that neither vanishes nor overflows (Instant-NGP's density).
+    """exp(x), at most e^15, with a gradient that neither vanishes nor overflows (Instant-NGP's density).
 
-    Of half-precision input it gives single precision.
+    Half-precision input gives single precision.
     """
     return _TruncatedExp.apply(x)
 
@@ -45,15 +45,15 @@ def shifted_softplus(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 class Rectifier(torch.nn.Module):
-    """The original NeRF's density. Where it is zero no gradient comes back, so a field can die: `soften` is the way out."""
+    """ReLU, the original NeRF's density. Zero density has no gradient, so a field can die: `soften` is the way out."""
 
     soft: Tensor
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("soft", torch.tensor(False))  # in checkpoints, as it changes what the weights mean
+        self.register_buffer("soft", torch.tensor(False))  # saved in checkpoints, as it changes what the weights mean
         self._soft = False
-        """The same, for the host to know."""
+        """The same on the host."""
 
     def soften(self) -> None:
         """From now on `shifted_softplus`."""

@@ -1,4 +1,4 @@
-"""Fixed encodings of places and directions."""
+"""Fixed encodings of positions and directions."""
 
 import math
 

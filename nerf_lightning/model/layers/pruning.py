@@ -1,4 +1,4 @@
-"""Masks over grids in the unit cube: neighbours, and which vertices positions in some cells of another grid read."""
+"""Masks over grids in the unit cube: neighbours, and the vertices that are read from some cells of another grid."""
 
 import torch
 from jaxtyping import Bool
@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 def widened(mask: Bool[Tensor, "S S S"]) -> Bool[Tensor, "S S S"]:
-    """True also at all neighbours, diagonal ones too."""
+    """Also True at all neighbours, including diagonal ones."""
     for axis in range(3):
         wide, last = mask.clone(), mask.shape[axis] - 1
         wide.narrow(axis, 0, last).logical_or_(mask.narrow(axis, 1, last))

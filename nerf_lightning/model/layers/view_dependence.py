@@ -1,4 +1,4 @@
-"""How finely a colour may depend on the direction it is seen from."""
+"""How finely a colour may depend on the viewing direction."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -7,11 +7,11 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import spherical_harmonics
 
 HIGHEST = 3
-"""The highest degree of spherical harmonics there is."""
+"""The highest degree of spherical harmonics available."""
 
 
 def harmonics_up_to(degree: int) -> int:
-    """How many spherical harmonics there are up to a degree, the constant one among them.
+    """Number of spherical harmonics up to a degree, including the constant one.
 
     Raises:
         InputError: outside 0 to 3.
@@ -22,5 +22,5 @@ def harmonics_up_to(degree: int) -> int:
 
 
 def seen_from(directions: Float[Tensor, "N 3"], terms: int) -> Float[Tensor, "N terms"]:
-    """The first so many spherical harmonics of unit directions."""
+    """The first `terms` spherical harmonics of unit directions."""
     return spherical_harmonics(directions)[:, :terms]

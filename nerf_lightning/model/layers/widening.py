@@ -1,7 +1,7 @@
-"""Networks that take up what a smaller one has learned: the same function, with room for more.
+"""Networks that start from what a smaller one has learned: the same function, with room for more.
 
-New neurons start with random weights towards their inputs and none towards the old neurons behind them, so that the old ones go
-on as before and the new ones learn (Net2Net, Chen et al. 2016, section 2.3, without copies).
+New neurons have random input weights and zero weights into the old neurons of the next layer, so the old ones are unchanged and
+the new ones learn (Net2Net, Chen et al. 2016, section 2.3, without copies).
 """
 
 import torch
@@ -15,7 +15,7 @@ def widen(wide: torch.nn.Linear, narrow: torch.nn.Linear, columns: Int[Tensor, "
 
     Args:
         wide, narrow: the layers; `wide` has as many outputs, or more.
-        columns: which input of `wide` each input of `narrow` has become.
+        columns: for each input of `narrow`, the matching input of `wide`.
     """
     kept = narrow.out_features
     wide.weight[:kept] = 0
@@ -24,7 +24,7 @@ def widen(wide: torch.nn.Linear, narrow: torch.nn.Linear, columns: Int[Tensor, "
 
 
 def widen_all(wide: torch.nn.ModuleList, narrow: torch.nn.ModuleList, columns: Int[Tensor, "I"]) -> None:
-    """The same for layers in a row; `columns` are those of the first."""
+    """The same for consecutive layers; `columns` are the first one's."""
     for mine, its in zip(wide, narrow, strict=True):
         assert isinstance(mine, torch.nn.Linear) and isinstance(its, torch.nn.Linear)
         widen(mine, its, columns)
