@@ -14,11 +14,7 @@ def test_truncated_exp():
     y.sum().backward()
     torch.testing.assert_close(x.grad, torch.tensor([math.exp(max(-15, min(v, 15))) for v in x.tolist()]))
     assert (x.grad > 0).all(), "neither vanishes"
-
-
-def test_truncated_exp_has_the_gradient_of_exp():
-    x = torch.linspace(-10, 10, 9).double().requires_grad_()
-    assert torch.autograd.gradcheck(truncated_exp, x)
+    assert torch.autograd.gradcheck(truncated_exp, torch.linspace(-10, 10, 9).double().requires_grad_())
 
 
 @pytest.mark.parametrize(

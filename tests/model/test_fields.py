@@ -60,15 +60,10 @@ def test_the_unit_of_length_does_not_matter(make: Make):
     torch.testing.assert_close(rgb10, rgb, rtol=1e-3, atol=1e-4)
 
 
-def test_density_is_per_longest_half_size():
-    field = hashgrid(Bounds(BOX))
-    positions = places(9)
-    torch.testing.assert_close(field.density(positions) * 1.25, field.features(positions)[0])
-
-
 @FIELDS
-def test_colour_depends_on_the_direction_and_density_does_not(make: Make):
+def test_density_is_per_longest_half_size_and_colour_alone_depends_on_the_direction(make: Make):
     field, positions = make(Bounds(BOX)), places(20)
+    torch.testing.assert_close(field.density(positions) * 1.25, field.features(positions)[0])
     (density, rgb), (density2, rgb2) = field(positions, ways(20)), field(positions, ways(20))
     assert torch.equal(density, density2) and (rgb - rgb2).abs().max() > 1e-4
 
@@ -95,17 +90,12 @@ def test_fast_and_reference_kernels_make_the_same_field(unbounded: bool):
         torch.testing.assert_close(fast, reference, rtol=1e-4, atol=1e-5 * float(reference.detach().abs().max()))
 
 
-@pytest.mark.parametrize("depth", [2, 4])
-def test_the_skip_layer_sees_the_position_again(depth: int):
-    field = MLPField(Bounds(BOX), depth=depth, width=16, skip=depth - 1, position_frequencies=2)
-    inputs = [layer.in_features for layer in field.trunk]
-    assert inputs == [15] + [16] * (depth - 2) + [16 + 15]
-
-
-@pytest.mark.parametrize("skip", [-1, 0, 3, 4])
-def test_a_skip_beyond_the_trunk_is_refused(skip: int):
-    with pytest.raises(InputError, match="model.skip"):
-        MLPField(Bounds(BOX), depth=3, width=16, skip=skip)
+def test_the_skip_layer_sees_the_position_again_and_lies_in_the_trunk():
+    field = MLPField(Bounds(BOX), depth=4, width=16, skip=3, position_frequencies=2)
+    assert [layer.in_features for layer in field.trunk] == [15, 16, 16, 16 + 15]
+    for skip in (-1, 0, 3, 4):
+        with pytest.raises(InputError, match="model.skip"):
+            MLPField(Bounds(BOX), depth=3, width=16, skip=skip)
 
 
 @pytest.mark.parametrize("make", [MLPField, HashGridField])

@@ -55,22 +55,10 @@ def test_grids_are_no_finer_than_two_cells_a_pixel(resolutions: Resolutions):
     auto, fixed = resolutions(bounds, 16, 100, "auto"), resolutions(bounds, 16, 100, "fixed")
     assert auto[0] == fixed[0] == 16 and auto[-1] == 40 and fixed[-1] == 100
     assert resolutions(bounds, 16, 30, "auto") == resolutions(bounds, 16, 30, "fixed")
-
-
-@GRIDS
-def test_a_subject_of_few_pixels_lowers_the_coarsest_too(resolutions: Resolutions):
-    assert set(resolutions(Bounds(BOX, pixel=0.5), 16, 100, "auto")) == {8}
-
-
-@GRIDS
-def test_without_photos_sizes_are_as_asked(resolutions: Resolutions):
-    assert resolutions(Bounds(BOX), 16, 100, "auto") == resolutions(Bounds(BOX), 16, 100, "fixed")
-
-
-@GRIDS
-def test_a_size_is_auto_or_fixed(resolutions: Resolutions):
+    assert resolutions(Bounds(BOX), 16, 100, "auto") == fixed, "without photos sizes are as asked"
+    assert set(resolutions(Bounds(BOX, pixel=0.5), 16, 100, "auto")) == {8}, "few pixels lower the coarsest too"
     with pytest.raises(InputError, match=r"model\.size: found 'large', expected auto or fixed"):
-        resolutions(Bounds(BOX), 16, 100, "large")
+        resolutions(bounds, 16, 100, "large")
 
 
 def test_fields_say_in_a_line_what_their_size_follows_from():

@@ -15,7 +15,7 @@ BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("kind", [TensoRFField, HashGridField])
 def test_colours_turn_with_the_direction_no_faster_than_their_degree(kind: type, degree: int, kernels: str):
-    """Where no rectifier closes, the logits of a colour are a polynomial of that degree in the direction: around a circle
+    """Where every ReLU stays open, the logits of a colour are a polynomial of that degree in the direction: around a circle
     their Fourier series ends there."""
     field = kind(BOX, degree=degree, width=8)
     first, *others = field.colour_net

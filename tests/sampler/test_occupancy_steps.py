@@ -134,13 +134,10 @@ def test_no_rays_or_only_misses_give_no_samples(box: Bounds, rays: Rays, kernels
     assert len(missing) == 0 and missing.offsets.tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("transparent", [0.0, 1.0, -1e-4])
-def test_other_transmittances_are_refused(transparent: float):
-    with pytest.raises(InputError, match="sampler.transparent"):
-        OccupancySampler(CUBE, transparent=transparent)
-
-
-@pytest.mark.parametrize("thin", [-0.1, 1.0])
-def test_other_opacities_are_refused(thin: float):
-    with pytest.raises(InputError, match="sampler.thin"):
-        OccupancySampler(CUBE, thin=thin)
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("transparent", 0.0), ("transparent", 1.0), ("transparent", -1e-4), ("thin", -0.1), ("thin", 1.0)],
+)
+def test_other_transmittances_and_opacities_are_refused(key: str, value: float):
+    with pytest.raises(InputError, match=f"sampler.{key}"):
+        OccupancySampler(CUBE, **{key: value})

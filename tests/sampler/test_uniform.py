@@ -65,7 +65,7 @@ def test_jitter_follows_the_generator(box: Bounds, rays: Rays):
 
 
 @pytest.mark.parametrize("stratified", [False, True])
-def test_without_a_generator_there_is_no_chance(stratified: bool, box: Bounds, rays: Rays):
+def test_without_a_generator_nothing_is_random(stratified: bool, box: Bounds, rays: Rays):
     even = UniformSampler(box, 8)(rays, nowhere)
     assert same(even, UniformSampler(box, 8, stratified)(rays, nowhere))
     assert same(even, UniformSampler(box, 8, stratified=False)(rays, nowhere, seeded()))
