@@ -1,11 +1,14 @@
 """Comparing a fast kernel with its reference: values, and gradients where there are any."""
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from nerf_lightning.kernels import use_kernels
+
+T = TypeVar("T")
 
 
 def outcome(call: Callable[..., object], inputs: list[Tensor], constants: tuple[int, ...] = ()) -> list[Tensor]:
@@ -52,7 +55,7 @@ def agree(
         torch.testing.assert_close(got, wanted, rtol=rtol, atol=atol * scale, msg=lambda m, n=number: f"{n}: {m}")
 
 
-def with_threads(call: Callable[[], list[Tensor]], threads: int) -> list[Tensor]:
+def with_threads(call: Callable[[], T], threads: int) -> T:
     """What `call` gives with this number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)

@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
-from nerf_lightning.model import Field, HashGridField, MLPField, PictureMLP
+from nerf_lightning.model import Field, HashGridField, MLPField, PictureMLP, TensoRFField
 
 BOX = torch.tensor([[-1.0, -0.5, 0.2], [1.5, 2.0, 1.0]])
 
@@ -24,7 +24,14 @@ def hashgrid(bounds: Bounds) -> Field:
     return field
 
 
-FIELDS = pytest.mark.parametrize("make", [mlp, hashgrid])
+def tensorf(bounds: Bounds) -> Field:
+    field = TensoRFField(bounds, 3, 8, coarsest=4, finest=4, stages=1, width=8)
+    for parameter in (*field.density_volume.parameters(), *field.colour_volume.parameters()):
+        torch.nn.init.normal_(parameter)
+    return field
+
+
+FIELDS = pytest.mark.parametrize("make", [mlp, hashgrid, tensorf])
 Make = Callable[[Bounds], Field]
 
 
@@ -77,9 +84,10 @@ def test_every_parameter_learns(make: Make):
         assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
 
 
+@pytest.mark.parametrize("make", [hashgrid, tensorf])
 @pytest.mark.parametrize("unbounded", [False, True])
-def test_fast_and_reference_kernels_make_the_same_field(unbounded: bool):
-    field, results = hashgrid(Bounds(BOX, unbounded)), []
+def test_fast_and_reference_kernels_make_the_same_field(make: Make, unbounded: bool):
+    field, results = make(Bounds(BOX, unbounded)), []
     positions, directions = 2 * places(300), ways(300)
     for choice in ("auto", "reference"):
         use_kernels(choice)
