@@ -128,6 +128,7 @@ def test_kernels_whose_value_or_gradient_is_wrong_are_named(few_samples: None, m
     assert unequal == [
         "points (value, nan apart)",
         "hash_interpolate (gradient, 3.0e-2 apart)",
+        "hash_interpolate_2d (gradient, 3.0e-2 apart)",
         "spherical_harmonics (value, 1.0e-3 apart)",
         "voxel_value (failed: not on this device)",
     ]
