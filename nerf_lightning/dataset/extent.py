@@ -1,7 +1,8 @@
-"""Where the content is, told from cameras and silhouettes alone: a box to sample in."""
+"""The box to sample in, estimated from cameras and silhouettes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,8 +37,7 @@ def estimate_bounds(
     or from a flat `background` (sRGB in [0, 1]), the visual hull on a coarse grid shrinks it, twice.
     """
     aabb = visible_cube(views.cameras)
-    chosen = torch.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().long()
-    views = Views(views.images[chosen], views.cameras[chosen])
+    views = views.spread(MAX_VIEWS)
     masks = silhouettes(views, background)
     if masks is not None:
         # The second pass sees finer voxels, so the box loses the slack of the first.
@@ -133,18 +133,23 @@ def sightings(aabb: Float[np.ndarray, "2 3"], count: int, cameras: Cameras) -> I
         yield Sighting(inside, column, row, reach)
 
 
+def visual_hull(masks: Bool[np.ndarray, "V H W"], sightings: Iterable[Sighting], least: float) -> Bool[np.ndarray, "N"]:
+    """Which voxels at least `least` views see, and nearly all of these find in their silhouettes."""
+    seen: Any = 0
+    found: Any = 0
+    for mask, sighting in zip(masks, sightings, strict=True):
+        seen = seen + sighting.inside
+        found = found + sighting.found_in(mask)
+    return (seen >= least) & (found >= AGREEMENT * seen)
+
+
 def _carve(
     aabb: Float[np.ndarray, "2 3"], masks: Bool[np.ndarray, "V H W"], cameras: Cameras
 ) -> Float[np.ndarray, "2 3"] | None:
     """The box of the voxels inside (nearly) all silhouettes, one voxel wider; None when there are none."""
     voxel = (aabb[1] - aabb[0]) / GRID
     centres = np.stack(np.meshgrid(*voxel_centres(aabb, GRID), indexing="ij"), axis=-1).reshape(-1, 3)
-    seen = np.zeros(len(centres), np.int32)
-    hits = np.zeros(len(centres), np.int32)
-    for mask, sighting in zip(masks, sightings(aabb, GRID, cameras), strict=True):
-        seen += sighting.inside
-        hits += sighting.found_in(mask)
-    kept = centres[(seen >= 0.5 * len(masks)) & (hits >= AGREEMENT * seen)]
+    kept = centres[visual_hull(masks, sightings(aabb, GRID, cameras), least=0.5 * len(masks))]
     if len(kept) == 0:
         return None
     return np.stack([kept.min(0) - 1.5 * voxel, kept.max(0) + 1.5 * voxel])

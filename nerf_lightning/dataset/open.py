@@ -1,4 +1,4 @@
-"""One door for all formats: what stands at a path decides how it is read."""
+"""Opens a scene of any format: what is at the path decides how it is read."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ def open_scene(
             (transforms.json or its folder).
         name: what to call it; defaults to the file's or folder's name.
         resize: longest side in pixels after averaging, if smaller than the photos.
-        holdout: every so-manieth photo is held out, where the format has no split of its own.
+        holdout: N to hold out every N-th photo, where the format has no split of its own.
         near, far: distances along the rays, in the scene's unit, that override the bounds'.
 
     Raises:

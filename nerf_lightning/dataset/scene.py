@@ -29,13 +29,21 @@ class Views:
         """Of the pictures."""
         return self.images.nbytes
 
+    def __getitem__(self, index: Tensor) -> "Views":
+        """Some of the views."""
+        return Views(self.images[index], self.cameras[index])
+
+    def spread(self, count: int) -> "Views":
+        """At most `count` views, evenly spaced from the first to the last."""
+        return self[torch.linspace(0, len(self) - 1, min(len(self), count)).round().long()]
+
     def to(self, device: torch.device) -> "Views":
         return Views(self.images.to(device), self.cameras.to(device))
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything a run needs to know about what it trains on."""
+    """What a run trains on."""
 
     name: str
     """A short word for file names and captions, "lego" or "bricks"."""

@@ -1,8 +1,7 @@
-"""One cell of the suite: a condition, a method and a seed, trained as a user would train it."""
+"""One cell of the suite: a condition, a method and a seed, trained as a user would."""
 
-import contextlib
 import json
-from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,25 +17,25 @@ OUTCOME = "cell.json"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a cell, as stability.json tells it."""
+    """The result of a cell, as in stability.json."""
 
     condition: str
     method: str
     seed: int
     guard: bool
     psnr: float | None
-    """dB: of held-out views; of a picture, at `LARGER` times the pixels it was trained on."""
+    """dB on held-out views; for a picture, on one with `LARGER` times the pixels it was trained on along each side."""
     status: str
     """finished, collapsed, refused (before training) or failed."""
     diagnosis: str
     recoveries: int
     alarm: str
-    """What was doubtful about the data, or the result, as the run itself says."""
+    """What the run warned of, about the data or the result."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What is to be tried."""
+    """What to train."""
 
     condition: str
     method: str
@@ -50,7 +49,7 @@ class Cell:
 
     @property
     def options(self) -> list[str] | None:
-        """Overrides; None where the condition is not for the method."""
+        """Overrides; None if the condition does not apply to the method."""
         condition, method = self.parts
         own = condition.options_for(method.kind)
         return None if own is None else [*method.options, *own]
@@ -65,20 +64,20 @@ def folder_of(root: Path, condition: str, method: str, seed: int) -> Path:
 
 
 def run(cell: Cell, root: Path) -> Outcome:
-    """Trains a cell, unless it was trained before with the same options."""
+    """Trains a cell, unless a result with the same options is there."""
     folder = cell.folder(root)
     before = _read(folder, cell)
     if before is not None:
         return before
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "log.txt").open("w", encoding="utf-8") as log, _to(log):
+    with (folder / "log.txt").open("w", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
         outcome = _train(cell, folder)
     write_json(folder / OUTCOME, {**_identity(cell), "outcome": asdict(outcome)})
     return outcome
 
 
 def _identity(cell: Cell) -> dict[str, Any]:
-    """What a cell that was done before must agree in."""
+    """What must be the same for an earlier result to count."""
     return {"cell": asdict(cell), "options": cell.options, "rate": cell.parts[0].rate}
 
 
@@ -88,14 +87,8 @@ def _read(folder: Path, cell: Cell) -> Outcome | None:
         if {key: content[key] for key in _identity(cell)} == _identity(cell):
             return Outcome(**content["outcome"])
     except (OSError, ValueError, KeyError, TypeError):
-        pass  # not there, or cut short: it is done anew
+        pass  # missing or cut short: trained again
     return None
-
-
-@contextlib.contextmanager
-def _to(log: Any) -> Iterator[None]:
-    with contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
-        yield
 
 
 def _train(cell: Cell, folder: Path) -> Outcome:
@@ -114,9 +107,7 @@ def _train(cell: Cell, folder: Path) -> Outcome:
         path = folder / "picture.png"
         write_png(path, made.image.numpy())
         given = [
-            "callbacks.training_gif=null",
-            "callbacks.charts=null",
-            "callbacks.baselines=null",
+            *("callbacks.training_gif=null", "callbacks.charts=null", "callbacks.baselines=null"),
             f"dataset.max_side={max(made.size) // LARGER}",
             f"render.scale={LARGER}",
         ]
@@ -125,10 +116,10 @@ def _train(cell: Cell, folder: Path) -> Outcome:
         f"dataset.path='{path}'",
         f"seed={cell.seed}",
         "threads=1",
-        "device=cpu",  # cells are small, and stand side by side
+        "device=cpu",  # cells are small, and run side by side
         f"budget.steps={cell.steps}",
+        *("~logger", "callbacks.snapshots.steps=[]", "callbacks.heldout=null", "callbacks.checkpoints=null"),
     ]
-    given += ["~logger", "callbacks.snapshots.steps=[]", "callbacks.heldout=null", "callbacks.checkpoints=null"]
     psnr, status, diagnosis, recoveries, alarm = None, "failed", "", 0, ""
     try:
         cfg = composed(given, folder)
@@ -138,12 +129,12 @@ def _train(cell: Cell, folder: Path) -> Outcome:
         psnr, status, diagnosis = results["psnr"], results["status"], results["diagnosis"]
         if method.flat:
             between = json.loads((folder / "enlarged.json").read_text(encoding="utf-8"))["field"]
-            psnr = psnr if between is None else between  # none where each byte is right
+            psnr = psnr if between is None else between  # None where every byte is right
         recoveries = len(results["recoveries"])
         alarm = "; ".join([*results["warnings"], *([diagnosis] if status == "finished" and diagnosis else [])])
     except InputError as error:
         status, diagnosis = "refused", str(error).replace(str(path), condition.name)
-    except Exception as error:  # noqa: BLE001  (a failure is what the suite is for; it stands in the outcome)
+    except Exception as error:  # noqa: BLE001  (failures are what the suite looks for)
         diagnosis = " ".join(f"{type(error).__name__}: {error}".split())
     path.unlink(missing_ok=True)
     return Outcome(cell.condition, cell.method, cell.seed, method.guard, psnr, status, diagnosis, recoveries, alarm)

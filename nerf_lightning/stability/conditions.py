@@ -1,7 +1,8 @@
-"""Where methods are known to fail: each condition with the check that decides whether one did."""
+"""Conditions under which methods are known to fail, each with the check that decides."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -13,56 +14,56 @@ from nerf_lightning.stability.toys import MARBLE, PILE, ROD, around, photograph,
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 LARGER = 2
-"""Times that pictures are larger than what is trained on: a field is judged by what it makes of the places between."""
+"""Pictures have this many times the pixels that are trained on along each side, so that a field is judged between them too."""
 MakeScene = Callable[[int], Scene | Picture]
-"""From a seed: something to train on, in three dimensions or in two."""
+"""Makes a 3D scene or a 2D picture from a seed."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One way of making it hard."""
+    """One way to make training hard."""
 
     name: str
     check: str
-    """What must be so, in words."""
+    """What must hold, in words."""
     scene: MakeScene
     options: tuple[str, ...] = ()
-    """Overrides on the command line, the same for all methods."""
+    """Overrides for all methods."""
     by_method: tuple[tuple[str, str], ...] = ()
-    """Overrides for methods of a kind, the only ones that the condition is for; for all where there are none."""
+    """(kind, override): if there are any, the condition applies to methods of these kinds alone."""
     rate: float = 1.0
     """Factor on the learning rate."""
     hopeless: bool = False
-    """Whether no method can work: training must be refused, or at least sound an alarm."""
+    """Whether no method can work: training must be refused, or at least warn."""
     flat: bool = False
-    """Whether it is about pictures."""
+    """Whether it is 2D."""
     loses: float | None = None
-    """dB below its own clean run that a method may lose; None where only a collapse is a failure."""
+    """dB that a method may lose against its own clean run; None if only a collapse is a failure."""
     control: bool = False
-    """Whether it holds a setting that must fail: a suite that nothing fails proves nothing."""
+    """Whether it must fail: a suite in which nothing fails proves nothing."""
 
     def options_for(self, kind: str) -> list[str] | None:
-        """Overrides for a kind of model; None where the condition is not for it."""
+        """Overrides for a kind of model; None if the condition does not apply to it."""
         own = [option for name, option in self.by_method if name == kind]
         return None if self.by_method and not own else [*self.options, *own]
 
 
-def _pile(seed: int) -> Scene:
+@cache
+def _pile(seed: int = 0) -> Scene:
+    """The same for every seed; nobody changes it in place."""
     return toy(PILE)
 
 
 def picture(width: int = 48, height: int = 48) -> Picture:
-    """Waves that grow shorter from left to right, in three colours, down to six pixels of the picture that is trained on.
+    """Waves in three colours that grow shorter from left to right, down to six pixels of the picture that is trained on.
 
-    Args:
-        width, height: of that picture; this one has `LARGER` times as many pixels along each side.
+    That one is `width` by `height`; this one has `LARGER` times as many pixels along each side.
     """
     across, down = ((np.arange(LARGER * side) + 0.5) / (LARGER * side) for side in (width, height))
     phase = np.pi * across**2 * width / 6
     waves = [np.sin(phase[None, :] + tilt * down[:, None]) for tilt in (0.0, 3.0, 9.0)]
-    return Picture(
-        "waves", BUILT_IN, torch.from_numpy((127.5 + 110 * np.stack(waves, axis=-1)).round().astype(np.uint8))
-    )
+    image = (127.5 + 110 * np.stack(waves, axis=-1)).round().astype(np.uint8)
+    return Picture("waves", BUILT_IN, torch.from_numpy(image))
 
 
 def _one_colour(seed: int) -> Picture:
@@ -70,7 +71,7 @@ def _one_colour(seed: int) -> Picture:
 
 
 def _damaged(change: Callable[..., Scene], *how: object) -> MakeScene:
-    return lambda seed: change(toy(PILE), seed, *how)
+    return lambda seed: change(_pile(), seed, *how)
 
 
 def _waves(seed: int) -> Picture:
@@ -78,7 +79,7 @@ def _waves(seed: int) -> Picture:
 
 
 def _seen_from_nearer(seed: int) -> Scene:
-    scene = toy(PILE)
+    scene = _pile()
     cameras = around(len(scene.val), scene.val.cameras.width, phase=0.7, distance=2.4)
     return replace(scene, val=Views(photograph(PILE, cameras, BLACK), cameras))
 

@@ -1,4 +1,4 @@
-"""What can go wrong with a scene, done to it on purpose. All of it depends on the seed alone."""
+"""Ways to spoil a scene on purpose; the result depends on the seed alone."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,7 +27,7 @@ def exposed(views: Views, change: Photos) -> Views:
 
 
 def turned_to_opengl(scene: Scene, seed: int) -> Scene:
-    """Poses whose y axis points up and whose z axis points backward, read as if they did not."""
+    """OpenGL poses (y up, z backward) read as OpenCV ones."""
 
     def flip(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
         c2w[:, :3, 1:3] *= -1
@@ -69,9 +69,8 @@ def with_noise(scene: Scene, seed: int, spread: float) -> Scene:
 
 
 def with_views(scene: Scene, seed: int, count: int) -> Scene:
-    """Few training photos, evenly chosen."""
-    kept = torch.linspace(0, len(scene.train) - 1, count).round().long()
-    return replace(scene, train=Views(scene.train.images[kept], scene.train.cameras[kept]))
+    """A few training photos, evenly spaced."""
+    return replace(scene, train=scene.train.spread(count))
 
 
 def scaled(scene: Scene, seed: int, factor: float) -> Scene:
@@ -90,9 +89,8 @@ def with_limits(scene: Scene, seed: int, factor: float) -> Scene:
     """near and far as a file may state them, wrong by a factor."""
     distance = float(scene.train.cameras.centres.norm(dim=1).mean())
     reach = float(scene.bounds.half_size.norm())
-    return replace(
-        scene, bounds=replace(scene.bounds, near=factor * (distance - reach), far=factor * (distance + reach))
-    )
+    near, far = factor * (distance - reach), factor * (distance + reach)
+    return replace(scene, bounds=replace(scene.bounds, near=near, far=far))
 
 
 def with_box(scene: Scene, seed: int, factor: float) -> Scene:
@@ -101,5 +99,5 @@ def with_box(scene: Scene, seed: int, factor: float) -> Scene:
 
 
 def with_background(scene: Scene, seed: int, colour: tuple[float, float, float]) -> Scene:
-    """The pictures as they are, and another colour said to be behind them."""
+    """The same pictures, with a wrong background colour stated."""
     return replace(scene, background=colour)

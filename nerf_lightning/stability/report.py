@@ -1,4 +1,4 @@
-"""What a suite leaves behind: stability.json, a heat map, a table in Markdown, and the worst renders."""
+"""The files of a suite: stability.json, a heat map, a table in Markdown, and the worst renders."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,7 +14,7 @@ from nerf_lightning.utils.files import atomic, write_json
 
 
 def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> None:
-    """Writes all files into the suite's folder and says what was found."""
+    """Writes all files into the suite's folder and prints a summary."""
     found = squares(outcomes)
     saved = rescues(outcomes)
     whole = {"suite": suite, "cells": [asdict(one) for one in outcomes], "rescues": [asdict(one) for one in saved]}
@@ -41,7 +41,7 @@ def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> None:
 
 
 def summary(found: Sequence[Square], saved: Sequence[Rescue]) -> list[str]:
-    """What it comes to, in sentences."""
+    """The result in sentences."""
     shipped = [square for square in found if square.shipped]
     lost, tried = (sum(len(getattr(square, part)) for square in shipped) for part in ("failed", "outcomes"))
     controls = [square for square in found if square.control]
@@ -50,8 +50,8 @@ def summary(found: Sequence[Square], saved: Sequence[Rescue]) -> list[str]:
         failing = [
             f"{s.condition.name}, {s.method} ({len(s.failed)} of {len(s.outcomes)})" for s in controls if s.failed
         ]
-        told = "; ".join(failing) or "none, so this suite proves nothing"
-        lines.append(f"controls that failed, as they should: {told}")
+        listed = "; ".join(failing) or "none, so this suite proves nothing"
+        lines.append(f"controls that failed, as they should: {listed}")
     if saved:
         back = sum(one.back for one in saved)
         lines.append(f"guard: {back} of {len(saved)} broken control runs brought back to within {NEAR:g} dB")

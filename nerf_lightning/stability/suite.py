@@ -19,7 +19,7 @@ QUICK = (
 
 
 def cells_of(conditions: Sequence[str], methods: Sequence[str], seeds: int, steps: int) -> list[Cell]:
-    """What is to be tried: of conditions that are refused one seed tells all, and one control at a time is enough."""
+    """The cells to train: one seed of conditions that must be refused, and no control method under a control condition."""
     chosen = [
         Cell(condition.name, method, seed, steps)
         for condition in CONDITIONS
@@ -34,7 +34,7 @@ def cells_of(conditions: Sequence[str], methods: Sequence[str], seeds: int, step
 def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Iterator[tuple[Cell, Outcome]]:
     """Trains cells in processes of one thread each; yields them as they end."""
     count = min(workers or cores(), len(cells))
-    context = multiprocessing.get_context("spawn")  # what numba compiled, and torch's threads, do not survive a fork
+    context = multiprocessing.get_context("spawn")  # numba and torch's threads do not survive a fork
     with ProcessPoolExecutor(count, context, _prepare) as pool:
         pending = {pool.submit(run, cell, root): cell for cell in cells}
         try:

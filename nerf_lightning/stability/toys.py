@@ -1,4 +1,7 @@
-"""Small scenes of known truth, traced here in a fraction of a second: balls and boxes with a smooth pattern."""
+"""Small scenes with exact geometry, traced in a fraction of a second: balls and boxes with a smooth pattern.
+
+Any bodies on any background, which the built-in scene's tracer cannot do: that one draws one model, lit and with shadows.
+"""
 
 import math
 from dataclasses import dataclass
@@ -12,12 +15,11 @@ from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at
 from nerf_lightning.dataset.scene import BUILT_IN, Scene, Views
 
 DISTANCE, FIELD_OF_VIEW = 4.0, 0.7
-"""Of the cameras from the origin, and across a picture, radians."""
+"""Distance of the cameras from the origin; horizontal field of view, radians."""
 FINER = 3
-"""Rays along each side of a pixel, whose mean is its colour."""
+"""Rays along each side of a pixel, to average over."""
 TILE = 90
-"""Rays along each side of what is traced at a time: what bodies say of them stays in the processor's cache, and most bodies
-of a heap are not there."""
+"""Rays along each side of a tile: small enough for the processor's cache, and for `in_sight` to drop most bodies."""
 LIGHT = (0.5, -0.4, 0.77)
 """Direction towards the light, nearly unit."""
 
@@ -72,7 +74,7 @@ Body = Ball | Block
 
 
 def pattern(points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grain: float = 1.0) -> Float[Tensor, "N 3"]:
-    """The colour of a surface: waves of three lengths, lit from one side; the finer, the larger `grain`, and plain for 0."""
+    """The colour of a surface: three waves, lit from one side; finer with larger `grain`, plain for 0."""
     waves = torch.tensor([[5.0, 2.0, 1.0], [-2.0, 6.0, 3.0], [1.0, -3.0, 7.0]])
     colour = 0.5 + 0.35 * torch.sin(grain * points @ waves.T + torch.tensor([0.0, 1.0, 2.0]))
     light = (normals @ torch.tensor(LIGHT)).clamp_min(0)
@@ -90,7 +92,7 @@ def trace(bodies: list[Body], rays: Rays, grain: float = 1.0) -> tuple[Float[Ten
 
 
 def in_sight(bodies: list[Body], rays: Rays) -> list[Body]:
-    """Those that rays from one place may meet: their enclosing balls reach into the cone around all of the rays."""
+    """The bodies that rays from one point may hit: those whose bounding ball reaches into the cone around the rays."""
     boxes = torch.stack([body.box for body in bodies])
     offset = boxes.mean(1) - rays.origins[0]
     distance, radius = offset.norm(dim=1), (boxes[:, 1] - boxes[:, 0]).norm(dim=1) / 2
@@ -105,7 +107,7 @@ def in_sight(bodies: list[Body], rays: Rays) -> list[Body]:
 def photograph(
     bodies: list[Body], cameras: Cameras, background: tuple[float, float, float] | None, grain: float = 1.0
 ) -> UInt8[Tensor, "V H W C"]:
-    """Pictures on a background, or with alpha where that is None."""
+    """Pictures on a background, or with alpha if it is None."""
     fine = cameras.resized(FINER * cameras.width, FINER * cameras.height)
     pixels = torch.arange(fine.height * fine.width).view(fine.height, fine.width)
     tiles = [tile.flatten() for row in pixels.split(TILE) for tile in row.split(TILE, dim=1)]
@@ -130,7 +132,7 @@ def photograph(
 
 
 def around(count: int, size: int, phase: float = 0.0, distance: float = DISTANCE) -> Cameras:
-    """Cameras spread over the upper part of a sphere, looking at the origin; another phase, other places.
+    """Cameras spread over the upper part of a sphere, looking at the origin; `phase` turns them about z.
 
     Equal steps in height are equal areas of the sphere; the golden angle between neighbours keeps them apart.
     """
@@ -165,10 +167,10 @@ def toy(
 
     Args:
         bodies: within about 1 of the origin.
-        background: baked into the pictures; None leaves them their alpha.
+        background: baked into the pictures; None for pictures with alpha.
         size: pixels along each side.
-        views, held_out: how many to train on and to judge by.
-        grain: how fine the pattern on the bodies is.
+        views, held_out: number of training and held-out views.
+        grain: fineness of the pattern on the bodies.
     """
     train, val = around(views, size), around(held_out, size, phase=0.7)
     return Scene(
@@ -188,8 +190,8 @@ PILE: list[Body] = [
     Block((-0.8, 0.2, -0.4), (-0.2, 0.8, 0.3)),
     Block((-0.9, -0.9, -0.6), (0.9, 0.9, -0.4)),
 ]
-"""What most conditions look at."""
+"""The scene of most conditions."""
 MARBLE: list[Body] = [Ball((0.0, 0.0, 0.0), 0.3)]
-"""Small: a twentieth of a picture."""
+"""Small: three percent of a picture."""
 ROD: list[Body] = [Block((-0.02, -0.02, -0.8), (0.02, 0.02, 0.8)), Block((-0.6, -0.6, -0.9), (0.6, 0.6, -0.8))]
 """Thinner than a pixel, on a plate."""

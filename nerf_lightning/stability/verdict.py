@@ -1,4 +1,4 @@
-"""Which cells failed, and what a condition and a method come to over all seeds."""
+"""Which cells failed, and the verdict on a condition and a method over all seeds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from nerf_lightning.stability.methods import METHODS
 
 CLEAN = ("clean", "2D: clean")
 NEAR = 2.0
-"""dB below an undisturbed run within which the guard has brought a broken one back."""
+"""A run counts as rescued within this many dB of an undisturbed one."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Square:
 
     @property
     def worst(self) -> float | None:
-        """dB of the worst seed; None where one has no figure."""
+        """dB of the worst seed; None if any seed has none."""
         figures = [one.psnr for one in self.outcomes]
         return None if None in figures else min(figure for figure in figures if figure is not None)
 
@@ -59,7 +59,7 @@ def squares(outcomes: Sequence[Outcome]) -> list[Square]:
 
 
 def passes(outcome: Outcome, condition: Condition, clean: float | None) -> bool:
-    """The condition's check: refused or told where nothing can work; else trained, and no further below clean than allowed."""
+    """Hopeless conditions must be refused or warned of; others trained, and no further below clean than allowed."""
     if condition.hopeless:
         return outcome.status == "refused" or bool(outcome.alarm)
     if outcome.status != "finished" or outcome.psnr is None:
@@ -69,7 +69,7 @@ def passes(outcome: Outcome, condition: Condition, clean: float | None) -> bool:
 
 @dataclass(frozen=True)
 class Rescue:
-    """What the guard made of a run that breaks down without it."""
+    """A run that breaks down without the guard, repeated with it."""
 
     condition: str
     method: str
@@ -85,7 +85,7 @@ class Rescue:
 
 
 def rescues(outcomes: Sequence[Outcome]) -> list[Rescue]:
-    """Every control run that broke down without the guard, with the same run under its watch."""
+    """Every control run that broke down without the guard, with the same run guarded."""
     by_cell = {(one.condition, one.method, one.seed): one for one in outcomes}
     found = []
     for lost in outcomes:
@@ -99,7 +99,7 @@ def rescues(outcomes: Sequence[Outcome]) -> list[Rescue]:
 
 
 def _clean(outcomes: Sequence[Outcome], method: str, seed: int | None = None) -> float | None:
-    """dB of the clean run of a seed, as seeds differ among themselves; the median of all where that is not there."""
+    """dB of the same seed's clean run, as seeds differ; the median of all seeds if there is none."""
     alike = [one for one in outcomes if one.seed == seed]
     return _undisturbed(alike, CLEAN, method) or _undisturbed(outcomes, CLEAN, method)
 

@@ -69,11 +69,7 @@ def _tracks(b: Builder) -> None:
         def wheel(y: float, height: float, r: float, inner: float, outer: float, material: Material, side=side):
             b.cylinder((side * inner, y, height), (side * outer, y, height), r, material)
 
-        b.box(
-            (side * 0.48 - 0.06, back, z - 0.07),
-            (side * 0.48 + 0.06, front, z + 0.07),
-            DARK,
-        )
+        b.box((side * 0.48 - 0.06, back, z - 0.07), (side * 0.48 + 0.06, front, z + 0.07), DARK)
         for y in (back, front):
             wheel(y, z, 0.15, 0.39, 0.575, GREY)
             wheel(y, z, 0.105, 0.40, 0.585, DARK)
@@ -81,12 +77,7 @@ def _tracks(b: Builder) -> None:
             for k in range(6):
                 angle = k * math.pi / 3
                 dy, dz = 0.078 * math.cos(angle), 0.078 * math.sin(angle)
-                b.cylinder(
-                    (side * 0.5, y + dy, z + dz),
-                    (side * 0.592, y + dy, z + dz),
-                    0.014,
-                    SILVER,
-                )
+                b.cylinder((side * 0.5, y + dy, z + dz), (side * 0.592, y + dy, z + dz), 0.014, SILVER)
         for k in range(4):
             y = back + (k + 1) * (front - back) / 5
             wheel(y, z - 0.09, 0.075, 0.39, 0.575, GREY)
@@ -129,17 +120,13 @@ def _hull(b: Builder) -> None:
     b.box((-0.36, -0.80, -0.2), (0.36, 0.66, 0.04), BRICKS)
     for side in (-1, 1):
         # Mudguards over the tracks.
-        x = sorted((side * 0.36, side * 0.62))
-        b.box((x[0], -0.76, -0.12), (x[1], 0.30, -0.08), YELLOW)
-        b.studs((x[0], -0.76), (x[1], 0.30), -0.08, YELLOW)
-        b.box((x[0], -0.80, -0.18), (x[1], -0.76, -0.08), HAZARD)
+        b.box((side * 0.36, -0.76, -0.12), (side * 0.62, 0.30, -0.08), YELLOW)
+        b.studs((side * 0.36, -0.76), (side * 0.62, 0.30), -0.08, YELLOW)
+        b.box((side * 0.36, -0.80, -0.18), (side * 0.62, -0.76, -0.08), HAZARD)
         # Fuel tank and toolbox on them.
         b.cylinder((side * 0.49, -0.66, 0.01), (side * 0.49, -0.34, 0.01), 0.085, SILVER if side > 0 else GREY)
-        b.box(
-            (side * 0.49 - 0.09, -0.26, -0.08),
-            (side * 0.49 + 0.09, -0.02, 0.04),
-            RED if side > 0 else CHECKED,
-        )
+        toolbox = RED if side > 0 else CHECKED
+        b.box((side * 0.49 - 0.09, -0.26, -0.08), (side * 0.49 + 0.09, -0.02, 0.04), toolbox)
         b.cylinder((side * 0.49, -0.53, 0.08), (side * 0.49, -0.53, 0.115), 0.03, BLACK)
     b.studs((-0.36, -0.80), (0.36, -0.56), 0.04, YELLOW)
 
@@ -157,11 +144,10 @@ def _hood(b: Builder) -> None:
         b.cylinder((side * 0.29, 0.56, 0.30), (side * 0.29, 0.67, 0.30), 0.05, DARK)
         b.cylinder((side * 0.29, 0.67, 0.30), (side * 0.29, 0.68, 0.30), 0.04, LAMP)
         # Louvres and a coloured band on the engine's flanks.
-        x = sorted((side * 0.27, side * 0.283))
         for k in range(6):
             y = 0.10 + k * 0.065
-            b.box((x[0], y, 0.12), (x[1], y + 0.03, 0.30), BLACK)
-        b.box((x[0], 0.04, 0.055), (x[1], 0.62, 0.095), HAZARD)
+            b.box((side * 0.27, y, 0.12), (side * 0.283, y + 0.03, 0.30), BLACK)
+        b.box((side * 0.27, 0.04, 0.055), (side * 0.283, 0.62, 0.095), HAZARD)
     b.box((-0.245, 0.64, 0.34), (0.245, 0.70, 0.38), YELLOW)
     # Exhaust: muffler, pipe, rain collar and the dark hole in its end; a short air intake beside it.
     b.cylinder((0.13, 0.40, 0.36), (0.13, 0.40, 0.56), 0.06, DARK)
@@ -175,12 +161,11 @@ def _hood(b: Builder) -> None:
 def _cab(b: Builder) -> None:
     b.box((-0.30, -0.52, 0.04), (0.30, -0.02, 0.07), DARK)
     for side in (-1, 1):
-        x = sorted((side * 0.34, side * 0.30))
-        b.box((x[0], -0.52, 0.04), (x[1], -0.20, 0.28), BRICKS)
-        b.box((x[0], -0.52, 0.28), (x[1], -0.20, 0.30), BLACK)
+        b.box((side * 0.34, -0.52, 0.04), (side * 0.30, -0.20, 0.28), BRICKS)
+        b.box((side * 0.34, -0.52, 0.28), (side * 0.30, -0.20, 0.30), BLACK)
         for y in (-0.56, -0.02):
-            b.box((x[0], y, 0.04), (x[1], y + 0.04, 0.78), BLACK)
-        b.box((x[0], -0.22, 0.30), (x[1], -0.19, 0.78), BLACK)
+            b.box((side * 0.34, y, 0.04), (side * 0.30, y + 0.04, 0.78), BLACK)
+        b.box((side * 0.34, -0.22, 0.30), (side * 0.30, -0.19, 0.78), BLACK)
         # Work lights on the roof's front corners.
         b.cylinder((side * 0.28, 0.02, 0.72), (side * 0.28, 0.09, 0.72), 0.04, DARK)
         b.cylinder((side * 0.28, 0.09, 0.72), (side * 0.28, 0.10, 0.72), 0.032, LAMP)

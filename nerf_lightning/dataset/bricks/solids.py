@@ -1,5 +1,6 @@
 """Solids: boxes and cylinders with their materials, the parts a built-in model is made of."""
 
+import itertools
 import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -76,10 +77,10 @@ class Builder:
 
     parts: list[tuple] = field(default_factory=list)
 
-    def box(self, low: tuple, high: tuple, material: Material) -> None:
-        """An axis-aligned box from its lower to its upper corner."""
-        a, b = np.array(low, float), np.array(high, float)
-        self.parts.append((False, (a + b) / 2, np.eye(3), (b - a) / 2, material))
+    def box(self, corner: tuple, opposite: tuple, material: Material) -> None:
+        """An axis-aligned box between two opposite corners."""
+        a, b = np.array(corner, float), np.array(opposite, float)
+        self.parts.append((False, (a + b) / 2, np.eye(3), np.abs(b - a) / 2, material))
 
     def bar(self, start: tuple, end: tuple, width: float, thickness: float, material: Material) -> None:
         """A straight bar between two points in a plane of constant x; `width` is its size along x."""
@@ -102,12 +103,13 @@ class Builder:
 
     def studs(self, low: tuple[float, float], high: tuple[float, float], z: float, material: Material) -> None:
         """As many rows of studs as fit on the rectangle at height `z`, centred on it."""
-        counts = [math.floor((b - a) / STUD_PITCH + 1e-6) for a, b in zip(low, high, strict=True)]
-        for i in range(counts[0]):
-            for j in range(counts[1]):
-                x = (low[0] + high[0]) / 2 + (i - (counts[0] - 1) / 2) * STUD_PITCH
-                y = (low[1] + high[1]) / 2 + (j - (counts[1] - 1) / 2) * STUD_PITCH
-                self.cylinder((x, y, z), (x, y, z + STUD_HEIGHT), STUD_RADIUS, material)
+        counts = [math.floor(abs(b - a) / STUD_PITCH + 1e-6) for a, b in zip(low, high, strict=True)]
+        xs, ys = (
+            [(a + b) / 2 + (i - (count - 1) / 2) * STUD_PITCH for i in range(count)]
+            for a, b, count in zip(low, high, counts, strict=True)
+        )
+        for x, y in itertools.product(xs, ys):
+            self.cylinder((x, y, z), (x, y, z + STUD_HEIGHT), STUD_RADIUS, material)
 
     def build(self, scale: float = 1.0, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Solids:
         """All solids, first moved by `shift`, then scaled about the origin, their patterns with them."""

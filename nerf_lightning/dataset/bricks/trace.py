@@ -22,7 +22,7 @@ BATCH = 1 << 15
 """Ray-solid pairs intersected at once: as many as stay in a core's cache."""
 SHADOW_SIZE = 1536
 SHADOW_BIAS = 0.01
-"""World units a surface may lie behind the shadow map's: more than a texel's slope, less than a stud."""
+"""World units a surface may lie behind the shadow map: more than the slope of a texel, less than a stud."""
 
 
 def trace(rays: Rays) -> tuple[Float[Tensor, "R 3"], Bool[Tensor, "R"], Float[Tensor, "R"]]:
@@ -53,7 +53,7 @@ def nearest(
 ) -> tuple[Int[np.ndarray, "R"], Float[np.ndarray, "R"]]:
     """The first solid each ray enters (-1 for none) and the distance to it in lengths of `directions` (inf for none).
 
-    `cull` tests a solid's bounding sphere before the solid itself; without it the answer is the same, but later.
+    `cull` tests each solid's bounding sphere first; the answer is the same without, but slower.
     """
     solid = np.full(len(origins), -1)
     t = np.full(len(origins), np.inf)

@@ -1,10 +1,9 @@
-"""What every loader asks of a file before it believes it. All of these raise InputError: one line a user can act on.
+"""Checks that all loaders share. Each raises InputError: one line that a user can act on.
 
-Files come from strangers: nothing here unpickles, evaluates or follows what a file says beyond reading numbers.
+Files come from strangers: nothing here unpickles or evaluates anything.
 """
 
 import json
-import math
 import zipfile
 import zlib
 from collections.abc import Iterable, Sequence
@@ -17,6 +16,9 @@ from nerf_lightning.errors import InputError
 
 RIGID_TOLERANCE = 1e-3
 """How far R^T R may stand from the identity, entry by entry; files that print six digits stay well below."""
+
+UNREADABLE = (zipfile.BadZipFile, ValueError, EOFError, OSError, KeyError, zlib.error, RuntimeError, MemoryError)
+"""What np.load raises for a damaged archive: RuntimeError for an encrypted entry, MemoryError for a forged shape."""
 
 
 def existing_file(path: Path) -> Path:
@@ -46,21 +48,10 @@ def read_npz(path: Path, known: Iterable[str], needed: Sequence[str]) -> dict[st
             return arrays
     except InputError:
         raise
-    except (
-        zipfile.BadZipFile,
-        ValueError,
-        EOFError,
-        OSError,
-        KeyError,
-        zlib.error,
-        RuntimeError,
-        MemoryError,
-    ) as error:
-        # RuntimeError is what zipfile says to an encrypted entry, MemoryError what a forged shape comes to.
+    except UNREADABLE as error:
         found = f"something unreadable ({type(error).__name__}: {error})"
-        raise InputError(
-            path, key, found, "plain numeric arrays in a whole .npz file", "save or copy it again"
-        ) from error
+        expected = "plain numeric arrays in a whole .npz file"
+        raise InputError(path, key, found, expected, "save or copy it again") from error
 
 
 def read_json(path: Path) -> dict:
@@ -89,13 +80,8 @@ def number(where: object, key: str, value: object) -> float:
     """A finite real number; 0-d arrays and arrays of one element count."""
     if isinstance(value, np.ndarray) and value.size == 1 and value.dtype.kind in "iuf":
         value = value.item()
-    # Python's integers know no bounds, and JSON may hold any: the comparison catches them without overflow.
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, (int, float))
-        or not abs(value) < math.inf
-        or abs(value) > 1e300
-    ):
+    # JSON may hold integers too large for a float: the comparison catches them, and nan and infinity.
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= 1e300:
         found = f"shape {value.shape}, {value.dtype}" if isinstance(value, np.ndarray) else repr(value)[:60]
         raise InputError(where, key, found, "one finite number")
     return float(value)
@@ -109,13 +95,9 @@ def positive(where: object, key: str, value: object, unit: str = "pixels") -> fl
 
 
 def numeric(where: object, key: str, array: Shaped[np.ndarray, "..."], shape: str) -> Float[np.ndarray, "..."]:
-    """The array as float64 when its shape fits `shape`, words like "V 4 4" where letters stand for any size >= 0."""
-    words = shape.split()
-    fits = len(words) == array.ndim and all(
-        not w.isdigit() or int(w) == n for w, n in zip(words, array.shape, strict=True)
-    )
-    wanted = f"numbers of shape ({', '.join(words)})"
-    if not fits:
+    """The array as float64; `shape` is what it must have, like "4 4"."""
+    wanted = f"numbers of shape ({', '.join(shape.split())})"
+    if list(array.shape) != [int(size) for size in shape.split()]:
         raise InputError(where, key, f"shape {array.shape}", wanted)
     if array.dtype.kind not in "iuf":
         raise InputError(where, key, f"dtype {array.dtype}", wanted)

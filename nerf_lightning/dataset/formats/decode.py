@@ -1,4 +1,7 @@
-"""Image files to arrays: any depth and channel count becomes 8-bit RGB or RGBA."""
+"""Image files to arrays: any depth and channel count becomes 8-bit RGB or RGBA.
+
+OpenCV rather than Pillow, which cuts 16-bit colour to its high byte and cannot open TIFFs of floats to say so.
+"""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,8 +31,8 @@ def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]
 
     Args:
         path: PNG, JPEG, TIFF or whatever else OpenCV reads.
-        upright: apply the EXIF rotation (photos; files with alpha carry none). Off for posed photos: poses and
-            intrinsics speak of the stored pixels.
+        upright: apply the EXIF rotation (not to images with alpha). Off for posed photos, whose poses and intrinsics
+            are about the pixels as stored.
 
     Raises:
         InputError: missing, truncated, not an image, or of floating-point pixels.
@@ -53,9 +56,9 @@ def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]
 def read_images(
     paths: Sequence[Path], process: Callable[[int, UInt8[np.ndarray, "H W C"]], UInt8[np.ndarray, "h w C"]]
 ) -> UInt8[np.ndarray, "V h w C"]:
-    """Decodes posed photos, hands each to `process(index, image)` and stacks the results. All must share one size.
+    """Decodes posed photos of one size and stacks what `process(index, image)` makes of each.
 
-    Threads, not processes: OpenCV lets go of the interpreter lock, and full-size photos never pile up in memory.
+    In threads: OpenCV releases the interpreter lock, and few full-size photos are in memory at a time.
     """
     size = read_pixels(paths[0]).shape
 
@@ -74,12 +77,11 @@ def _rgb8(path: Path, raw: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "H W 
     if raw.dtype != np.uint8:
         raise InputError(path, "", f"{raw.dtype} pixels", "8 or 16 bits a channel")
     raw = raw.reshape(*raw.shape[:2], -1)
-    grey, alpha = raw[..., :1], raw[..., -1:]
     match raw.shape[2]:
         case 1:
-            return np.repeat(grey, 3, axis=2)
+            return cv2.cvtColor(raw, cv2.COLOR_GRAY2RGB)
         case 2:
-            return np.concatenate([grey, grey, grey, alpha], axis=2)
+            return raw[..., [0, 0, 0, 1]]
         case 3:
             return cv2.cvtColor(raw, cv2.COLOR_BGR2RGB)
         case 4:
@@ -89,12 +91,12 @@ def _rgb8(path: Path, raw: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "H W 
 
 
 def _cut_short(data: bytes) -> bool:
-    """Some OpenCV versions pad truncated PNG and JPEG files with grey and only mutter; end markers tell."""
+    """Whether the end marker is missing: some OpenCV versions fill the rest of a PNG or JPEG with grey and only warn."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data
     if not data.startswith(b"\xff\xd8"):
         return False
-    # Hop over the segments before the scan: a thumbnail in the EXIF segment has an end marker of its own.
+    # Skip the segments before the scan: a thumbnail in the EXIF segment has an end marker of its own.
     at = 2
     while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")

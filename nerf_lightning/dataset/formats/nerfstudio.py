@@ -32,7 +32,7 @@ class Frame(NamedTuple):
     image: Path
     entry: dict
     key: str
-    """Where the entry stands in the file, "frames[3]"."""
+    """Its key in the file, "frames[3]"."""
     c2w: Float[np.ndarray, "4 4"]
     """OpenCV, the file's world frame and unit."""
 
@@ -51,7 +51,7 @@ def load_nerfstudio(path: Path, name: str | None = None, resize: int | None = No
         path: transforms.json or the folder that holds it.
         name: defaults to the folder's name, or the file's if that is not transforms.json.
         resize: longest side in pixels after averaging, if smaller than the photos.
-        holdout: every so-manieth frame, sorted by file_path, is held out, unless the file names its own split.
+        holdout: N to hold out every N-th frame, sorted by file_path, unless the file names its own split.
 
     Raises:
         InputError: anything missing, malformed, of unequal size, or a lens that is not a perspective one.
@@ -76,11 +76,10 @@ def load_nerfstudio(path: Path, name: str | None = None, resize: int | None = No
     c2w = torch.from_numpy(np.stack([frame.c2w for frame in frames])).float()
     c2w, to_source = _normalised(c2w, c2w[train])
     cameras = Cameras(K, c2w, width, height).resized(new_width, new_height)
-    images = torch.from_numpy(read_images([frame.image for frame in frames], process))
-
-    train_views, val_views = (Views(images[index], cameras[torch.tensor(index)]) for index in (train, val))
+    views = Views(torch.from_numpy(read_images([frame.image for frame in frames], process)), cameras)
+    train_views, val_views = views[torch.tensor(train)], views[torch.tensor(val)]
     bounds = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), unbounded=True)
-    if images.shape[3] == 4:
+    if views.images.shape[3] == 4:
         bounds = estimate_bounds(train_views, BLACK)
     folder = file.resolve().parent
     return Scene(
@@ -117,30 +116,31 @@ def _frames(file: Path, content: dict) -> list[Frame]:
 def _split(file: Path, content: dict, frames: list[Frame], holdout: int) -> tuple[list[int], list[int]]:
     """Indices of training and held-out frames: as the file says, or every `holdout`-th held out."""
     if holdout < 2:
-        raise InputError("holdout", "", str(holdout), "2 or more: every so-manieth photo is held out")
+        raise InputError("holdout", "", str(holdout), "2 or more: every N-th photo is held out")
     held_key = "val_filenames" if "val_filenames" in content else "test_filenames"
     named = {}
     everything = {entry.get("file_path") for entry in content["frames"]}
     for key in ("train_filenames", held_key):
-        if key in content:
-            if not isinstance(content[key], list) or not all(isinstance(item, str) for item in content[key]):
-                raise InputError(file, key, repr(content[key])[:60], "a list of file_path strings")
-            if strangers := set(content[key]) - everything:
-                raise InputError(file, key, f"{min(strangers)!r}, which is no frame", "the file_path of a frame")
-            named[key] = set(content[key])
-    indices = range(len(frames))
+        if key not in content:
+            continue
+        if not isinstance(content[key], list) or not all(isinstance(item, str) for item in content[key]):
+            raise InputError(file, key, repr(content[key])[:60], "a list of file_path strings")
+        if strangers := set(content[key]) - everything:
+            raise InputError(file, key, f"{min(strangers)!r}, which is no frame", "the file_path of a frame")
+        named[key] = set(content[key])
+    names = [frame.name for frame in frames]
     if held_key in named:
-        val = [i for i in indices if frames[i].name in named[held_key]]
+        val = [i for i, name in enumerate(names) if name in named[held_key]]
     elif "train_filenames" in named:
-        val = [i for i in indices if frames[i].name not in named["train_filenames"]]
+        val = [i for i, name in enumerate(names) if name not in named["train_filenames"]]
     else:
-        val = list(indices[::holdout])
-    train_names = named.get("train_filenames", everything - {frames[i].name for i in val})
-    if both := sorted(train_names & {frames[i].name for i in val}):
-        raise InputError(
-            file, held_key, f"{both[0]!r}, which is in train_filenames too", "held-out photos of their own"
-        )
-    train = [i for i in indices if frames[i].name in train_names]
+        val = list(range(0, len(names), holdout))
+    val_names = {names[i] for i in val}
+    train_names = named.get("train_filenames", everything - val_names)
+    train = [i for i, name in enumerate(names) if name in train_names]
+    if both := sorted(train_names & val_names):
+        found = f"{both[0]!r}, which is in train_filenames too"
+        raise InputError(file, held_key, found, "held-out photos of their own")
     checks.split_size(file, "train split", len(train))
     checks.split_size(file, "val split", len(val))
     return train, val
@@ -162,9 +162,8 @@ def _lens(file: Path, content: dict, frame: Frame, width: int, height: int) -> L
         raise InputError(file, key_of("camera_model"), found, f"a perspective lens: {', '.join(PERSPECTIVE)}")
     for key in ("k4", "k5", "k6"):
         if number(key, 0.0):
-            raise InputError(
-                file, key_of(key), f"{number(key):g}", "at most k1, k2, k3, p1, p2", "calibrate with these"
-            )
+            found = f"{number(key):g}"
+            raise InputError(file, key_of(key), found, "at most k1, k2, k3, p1, p2", "calibrate with these")
     for key, size in (("w", width), ("h", height)):
         if number(key, float(size)) != size:
             raise InputError(file, key_of(key), f"{number(key):g}", f"{size}, the size of {frame.image.name}")
