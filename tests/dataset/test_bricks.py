@@ -18,6 +18,7 @@ from nerf_lightning.dataset.bricks.trace import nearest, shadow, trace, visible
 from nerf_lightning.errors import InputError
 
 SMALL = {"size": 40, "train_views": 4, "val_views": 2, "orbit_views": 3}
+TINY = {"size": 8, "train_views": 1, "val_views": 1, "orbit_views": 1}
 MATERIAL = Material((1.0, 1.0, 1.0))
 
 
@@ -28,6 +29,12 @@ def scene():
 
 def enter(builder, origin, direction):
     return nearest(builder.build(), np.array([origin], float), np.array([direction], float))[1][0]
+
+
+def trace_exactly(rays):
+    """The bulldozer in double precision: origins, directions, the solid each ray hits and the distance to it."""
+    origins, directions = rays.origins.double().numpy(), rays.directions.double().numpy()
+    return origins, directions, *nearest(bulldozer(), origins, directions)
 
 
 def test_box_distances():
@@ -147,11 +154,9 @@ def test_culling_changes_nothing(scene):
             visible(bulldozer(), cameras, view), visible(bulldozer(), cameras, view, cull=False), strict=True
         ):
             np.testing.assert_array_equal(fast, slow)
-    rays = cameras.view_rays(0)
-    origins, directions = rays.origins.double().numpy(), rays.directions.double().numpy()
-    fast, slow = (nearest(bulldozer(), origins, directions, cull=cull) for cull in (True, False))
-    np.testing.assert_array_equal(fast[0], slow[0])
-    np.testing.assert_array_equal(fast[1], slow[1])
+    origins, directions, *fast = trace_exactly(cameras.view_rays(0))
+    for a, b in zip(fast, nearest(bulldozer(), origins, directions, cull=False), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_pictures_agree_with_trace(scene):
@@ -159,7 +164,7 @@ def test_pictures_agree_with_trace(scene):
     cameras = scene.train.cameras
     solid, depth = visible(bulldozer(), cameras, 2)
     rays = cameras.view_rays(2)
-    expected, distance = nearest(bulldozer(), rays.origins.double().numpy(), rays.directions.double().numpy())
+    _, _, expected, distance = trace_exactly(rays)
     along = distance * (rays.directions @ cameras.c2w[2, :3, 2]).double().numpy()
     same = solid.reshape(-1) == expected
     assert same.mean() > 0.998
@@ -174,9 +179,7 @@ def test_pictures_agree_with_trace(scene):
 
 
 def test_shadows_agree_with_rays_to_the_light(scene):
-    rays = scene.train.cameras.view_rays(3)
-    origins, directions = rays.origins.double().numpy(), rays.directions.double().numpy()
-    solid, t = nearest(bulldozer(), origins, directions)
+    origins, directions, solid, t = trace_exactly(scene.train.cameras.view_rays(3))
     hit = solid >= 0
     points = origins[hit] + t[hit, None] * directions[hit]
     to_light = LIGHT - points
@@ -187,7 +190,7 @@ def test_shadows_agree_with_rays_to_the_light(scene):
 
 
 def test_colour_depends_on_the_viewer():
-    orbit = bricks(**SMALL | {"orbit_views": 12}, cache="").orbit
+    orbit = bricks(**TINY | {"size": 32, "orbit_views": 12}, cache="").orbit
     changed = []
     for view in range(0, 12, 3):
         rays, centre = orbit.view_rays(view), orbit.centres[view + 1]  # the same points from 30 degrees further on
@@ -223,70 +226,66 @@ def test_cache_round_trip(scene, tmp_path, monkeypatch):
     (file,) = folder.iterdir()
     assert file.suffix == ".npz"
 
-    def refuse(*_):
-        raise AssertionError("traced again")
-
-    monkeypatch.setattr(module, "picture", refuse)
+    monkeypatch.setattr(module, "picture", lambda *_: pytest.fail("traced again"))
     assert bricks(**SMALL, cache=str(folder)).sha256() == scene.sha256()
     # Other parameters, other file.
-    with pytest.raises(AssertionError, match="traced again"):
+    with pytest.raises(pytest.fail.Exception, match="traced again"):
         bricks(**SMALL | {"size": 41}, cache=str(folder))
 
 
-@pytest.mark.parametrize(
-    "damage", [lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b[:200] + b"\0" * 99 + b[299:]]
-)
-def test_damaged_cache_is_remade(scene, tmp_path, damage):
-    bricks(**SMALL, cache=str(tmp_path))
+OTHER = np.zeros((1, 2, 2, 4), np.uint8)
+DAMAGE = {
+    "cut": lambda file, b: file.write_bytes(b[: len(b) // 2]),
+    "empty": lambda file, b: file.write_bytes(b""),
+    "zeros": lambda file, b: file.write_bytes(b[:200] + b"\0" * 99 + b[299:]),
+    "other shapes": lambda file, b: np.savez(file, images_train=OTHER, images_val=OTHER),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_cache_is_remade(tmp_path, damage):
+    digest = bricks(**TINY, cache=str(tmp_path)).sha256()
     (file,) = tmp_path.iterdir()
-    whole = file.read_bytes()
-    file.write_bytes(damage(whole))
-    assert bricks(**SMALL, cache=str(tmp_path)).sha256() == scene.sha256()
+    DAMAGE[damage](file, file.read_bytes())
+    scene = bricks(**TINY, cache=str(tmp_path))
+    assert scene.sha256() == digest
     with np.load(file, allow_pickle=False) as again:
         np.testing.assert_array_equal(again["images_train"], scene.train.images.numpy())
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_cache_with_other_shapes_is_remade(scene, tmp_path):
-    bricks(**SMALL, cache=str(tmp_path))
-    (file,) = tmp_path.iterdir()
-    np.savez(file, images_train=np.zeros((1, 2, 2, 4), np.uint8), images_val=np.zeros((1, 2, 2, 4), np.uint8))
-    assert bricks(**SMALL, cache=str(tmp_path)).sha256() == scene.sha256()
-
-
-def test_unwritable_cache_warns_once(scene, tmp_path):
+def test_unwritable_cache_warns_once(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
     with pytest.warns(UserWarning, match="not cached") as caught:
-        assert bricks(**SMALL, cache=str(blocked / "cache")).sha256() == scene.sha256()
+        assert len(bricks(**TINY, cache=str(blocked / "cache")).train) == 1
     assert len(caught) == 1
 
 
-def test_failed_write_leaves_nothing(scene, tmp_path, monkeypatch):
+def test_failed_write_leaves_nothing(tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(module.np, "savez_compressed", full)
     with pytest.warns(UserWarning, match="No space left"):
-        bricks(**SMALL, cache=str(tmp_path))
+        bricks(**TINY, cache=str(tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_cache_folder(tmp_path, monkeypatch):
-    tiny = {"size": 8, "train_views": 1, "val_views": 1, "orbit_views": 1}
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.setenv("NERF_LIGHTNING_CACHE", str(tmp_path / "own"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        bricks(**tiny, cache="")
+        bricks(**TINY, cache="")
         assert list(tmp_path.iterdir()) == []
         for folder, variable in (
             ("own", "NERF_LIGHTNING_CACHE"),
             ("xdg/nerf_lightning", "XDG_CACHE_HOME"),
             ("home/.cache/nerf_lightning", "HOME"),
         ):
-            bricks(**tiny)
+            bricks(**TINY)
             assert len(list((tmp_path / folder).iterdir())) == 1
             if variable != "HOME":
                 monkeypatch.delenv(variable)

@@ -2,7 +2,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
@@ -15,7 +15,7 @@ def write_frames(folder: Path, views: Views, prefix: str) -> list[dict]:
     (folder / prefix).mkdir(parents=True)
     frames = []
     for i, (image, c2w) in enumerate(zip(views.images.numpy(), views.cameras.c2w, strict=True)):
-        cv2.imwrite(str(folder / prefix / f"{i:03d}.png"), cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))
+        imageio.imwrite(folder / prefix / f"{i:03d}.png", image)
         opengl = c2w * torch.tensor([1.0, -1.0, -1.0, 1.0])
         frames.append({"file_path": f"{prefix}/{i:03d}", "transform_matrix": opengl.tolist()})
     return frames
