@@ -1,4 +1,4 @@
-"""One picture, for 2D fields: from a file, or made here so that nothing needs a download."""
+"""One picture, for 2D fields: from a file, or the built-in one, which needs no download."""
 
 from pathlib import Path
 
@@ -9,6 +9,8 @@ from torch import Tensor
 
 from nerf_lightning.dataset.formats.decode import read_pixels
 
+Plane = Float[np.ndarray, "H W"]
+Colours = Float[np.ndarray, "H W 3"]
 SUN = (0.66, 0.30)
 """Where the built-in picture's sun stands, as a share of its width and height."""
 
@@ -29,7 +31,7 @@ def load_picture(path: Path) -> UInt8[Tensor, "H W 3"]:
 def builtin_picture(size: int = 256) -> UInt8[Tensor, "size size 3"]:
     """A sunset over water: smooth sky, sharp sun and hills, and ripples ever finer towards the horizon.
 
-    Deterministic; all scales of detail in one picture, so that what a field cannot represent shows.
+    Deterministic; it has detail at all scales, so that what a field cannot represent shows.
     """
     fine = 2 * size  # two samples a pixel side, averaged below, keep the edges from jagging
     grid = (np.arange(fine) + 0.5) / fine
@@ -48,7 +50,7 @@ def builtin_picture(size: int = 256) -> UInt8[Tensor, "size size 3"]:
     return torch.from_numpy(np.rint(picture * 255).clip(0, 255).astype(np.uint8))
 
 
-def _sky(x: Float[np.ndarray, "H W"], y: Float[np.ndarray, "H W"], horizon: float) -> Float[np.ndarray, "H W 3"]:
+def _sky(x: Plane, y: Plane, horizon: float) -> Colours:
     stops = np.array([0.0, 0.35, 0.7, 1.0])
     colours = np.array([[0.09, 0.13, 0.36], [0.45, 0.27, 0.56], [0.95, 0.48, 0.40], [1.0, 0.80, 0.45]])
     t = (y / horizon).clip(0, 1)
@@ -60,9 +62,7 @@ def _sky(x: Float[np.ndarray, "H W"], y: Float[np.ndarray, "H W"], horizon: floa
     return _balloon(sky, x, y)
 
 
-def _balloon(
-    sky: Float[np.ndarray, "H W 3"], x: Float[np.ndarray, "H W"], y: Float[np.ndarray, "H W"]
-) -> Float[np.ndarray, "H W 3"]:
+def _balloon(sky: Colours, x: Plane, y: Plane) -> Colours:
     u, v = (x - 0.25) / 0.12, (y - 0.185) / 0.12
     taper = np.where(v > 0, np.sqrt((1 - (v / 1.35) ** 2).clip(0, 1)), np.sqrt((1 - v**2).clip(0, 1)))
     gore = np.floor(np.arcsin((u / taper.clip(1e-6)).clip(-1, 1)) * 7 / np.pi + 8.5).astype(int) % 4
@@ -75,7 +75,7 @@ def _balloon(
     return np.where((basket | ropes)[..., None], np.array([0.30, 0.16, 0.10]), sky)
 
 
-def _water(x: Float[np.ndarray, "H W"], y: Float[np.ndarray, "H W"], horizon: float) -> Float[np.ndarray, "H W 3"]:
+def _water(x: Plane, y: Plane, horizon: float) -> Colours:
     near = ((y - horizon) / (1 - horizon)).clip(1e-3, 1)
     # Perspective: equal waves crowd together as 1/near, up to the pixel grid's limit and past it at the horizon.
     depth = 1 / (near + 0.07)

@@ -1,4 +1,4 @@
-"""Area-average resizing, with alpha where there is one; a smaller picture is what a coarser sensor would have seen."""
+"""Area-average resizing, also of pictures with alpha."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +13,7 @@ from nerf_lightning.errors import InputError
 
 
 def fit_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
-    """Width and height with the longest side at `longest` pixels; never enlarges, None leaves the size alone."""
+    """Width and height with the longest side at `longest` pixels; never larger than before, and as before for None."""
     if longest is None:
         return width, height
     if longest < 1:
@@ -27,7 +27,7 @@ def premultiplied(
 ) -> UInt8[np.ndarray, "h w C"]:
     """Applies a linear filter to RGB as it is, to RGBA with premultiplied alpha.
 
-    Straight colours under alpha 0 are arbitrary (black, mostly): averaging them in would put a dark rim around objects.
+    Straight colours under alpha 0 are arbitrary, mostly black: averaging them would give objects a dark rim.
     """
     if image.shape[2] == 3:
         return operation(image)

@@ -1,4 +1,4 @@
-"""From a dataset's configuration to its data module: one function for each kind of source."""
+"""The data modules that configurations name: one function for each kind of source."""
 
 import logging
 import os
@@ -24,7 +24,7 @@ from nerf_lightning.utils.options import Count
 log = logging.getLogger(__name__)
 
 DOWNLOAD_TIMEOUT = 10.0
-"""Seconds without an answer after which a download is given up."""
+"""Seconds to wait for an answer."""
 
 
 def from_photos(
@@ -66,13 +66,13 @@ def from_download(
     samples: Count | None = SAMPLES,
     seed: int = 0,
 ) -> RayDataModule:
-    """A published scene: from `path` if given, else from `folder`, else from `url` into `folder`, else the built-in scene.
+    """A published scene: from `path` if given, else `folder`, else downloaded into `folder`, else the built-in scene.
 
     Args:
         url: public address of the file.
         folder: where downloads are kept.
-        download: whether the network may be asked.
-        path: a copy at hand; where it is given it must exist.
+        download: whether to use the network.
+        path: a local copy, which must exist.
         resize, near, far: see `open_scene`.
         rays, samples, seed: see `RayDataModule`.
     """
@@ -113,7 +113,7 @@ def from_picture(
         pixels, seed: see `PixelDataModule`.
     """
     if path is None:
-        # Square, and drawn from formulas: it is known at any size.
+        # Drawn from formulas: known at any size.
         picture = Picture("sunset", BUILT_IN, builtin_picture(max_side or 256), lambda width, _: builtin_picture(width))
     else:
         source = Path(path)

@@ -171,6 +171,8 @@ def test_holdout_counts(capture: Path):
     scene = load_nerfstudio(capture, holdout=5)
     assert (len(scene.train), len(scene.val)) == (9, 3)
     assert len(load_nerfstudio(capture, holdout=100).val) == 1
+    with pytest.raises(InputError, match="holdout: found 1"):
+        load_nerfstudio(capture, holdout=1)
 
 
 def test_missing_extensions_are_found(capture: Path):
@@ -260,11 +262,6 @@ def test_damage(damage: str, capture: Path, says: Callable):
     with pytest.raises(InputError) as caught:
         load_nerfstudio(capture)
     says(caught.value, capture, words, ", expected ")
-
-
-def test_holdout_of_everything(capture: Path):
-    with pytest.raises(InputError, match="holdout: found 1"):
-        load_nerfstudio(capture, holdout=1)
 
 
 @pytest.mark.real_data

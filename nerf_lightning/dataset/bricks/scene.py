@@ -1,4 +1,4 @@
-"""The built-in scene: a brick-built bulldozer, ray-traced here, so that every run has data without any download."""
+"""The built-in scene: a ray-traced bulldozer of bricks, so that a run needs no download."""
 
 import math
 import os
@@ -24,8 +24,9 @@ from nerf_lightning.utils.files import atomic
 VERSION = 1
 """Part of the cache file's name: raise it whenever model, shading or cameras change."""
 RADIUS = 4.0311
-"""Distance of every camera from the origin, and below the horizontal field of view: the NeRF paper's Lego scene."""
+"""Distance of every camera from the origin, as in the NeRF paper's Lego scene."""
 FIELD_OF_VIEW = 0.6911112
+"""Horizontal, radians; from the same scene."""
 ORBIT_ELEVATION = math.radians(30)
 UP = (0.0, 0.0, 1.0)
 
@@ -98,8 +99,7 @@ def _pictures(cameras: Cameras) -> UInt8[np.ndarray, "V H W 4"]:
 
 
 def _cache_folder() -> Path:
-    own = os.environ.get("NERF_LIGHTNING_CACHE")
-    if own:
+    if own := os.environ.get("NERF_LIGHTNING_CACHE"):
         return Path(own)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nerf_lightning"
 
@@ -110,7 +110,7 @@ def _load(path: Path, train: Cameras, val: Cameras) -> tuple[np.ndarray, np.ndar
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             images = arrays["images_train"], arrays["images_val"]
     except (OSError, EOFError, ValueError, KeyError, SyntaxError, RuntimeError, BadZipFile, zlib.error, TokenError):
-        # All the ways a damaged archive fails, the last in an array's header. It is a copy of what can be made again.
+        # All the ways a damaged archive fails, the last in an array's header. The pictures can be traced again.
         return None
     for array, cameras in zip(images, (train, val), strict=True):
         if array.dtype != np.uint8 or array.shape != (len(cameras), cameras.height, cameras.width, 4):

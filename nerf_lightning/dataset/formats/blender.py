@@ -32,13 +32,12 @@ def load_blender(folder: Path, name: str | None = None, resize: int | None = Non
     Raises:
         InputError: anything missing, malformed or of unequal size.
     """
-    held_out = "val" if (folder / "transforms_val.json").is_file() else "test"
-    if not (folder / f"transforms_{held_out}.json").is_file():
+    files = [folder / f"transforms_{split}.json" for split in ("train", "val", "test")]
+    held_out = next((file for file in files[1:] if file.is_file()), None)
+    if held_out is None:
         raise InputError(folder, "", "no transforms_val.json or transforms_test.json", "held-out views in one of them")
-    train, val = (_load_split(folder / f"transforms_{split}.json", resize) for split in ("train", held_out))
-    checks.image_size(
-        folder / f"transforms_{held_out}.json", "frames", val.images.numpy(), tuple(train.images.shape[1:])
-    )
+    train, val = _load_split(files[0], resize), _load_split(held_out, resize)
+    checks.image_size(held_out, "frames", val.images.numpy(), tuple(train.images.shape[1:]))
     return Scene(
         name=name or folder.resolve().name.lower(),
         source=str(folder),

@@ -36,16 +36,13 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
         InputError: anything missing, malformed or contradictory.
     """
     data = checks.read_npz(path, NEEDED + OPTIONAL, NEEDED)
-    if "K" not in data and "focal" not in data:
-        checks.require_keys(path, data, ["focal"])
-    images = {
-        split: checks.uint8_images(path, f"images_{split}", data[f"images_{split}"]) for split in ("train", "val")
-    }
-    size = images["train"].shape[1:]
+    images = {key: checks.uint8_images(path, key, data[key]) for key in ("images_train", "images_val")}
+    size = images["images_train"].shape[1:]
     height, width = size[:2]
     if "K" in data:
         K = checks.intrinsics(path, "K", data["K"])
     else:
+        checks.require_keys(path, data, ["focal"])
         focal = checks.positive(path, "focal", data["focal"])
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
@@ -53,18 +50,19 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
         c2w = torch.from_numpy(checks.rigid_poses(path, key + "[{}]", data[key])).float()
         return Cameras(torch.from_numpy(K).float().repeat(len(c2w), 1, 1), c2w, width, height)
 
-    splits = {}
-    for split in ("train", "val"):
-        count = len(images[split])
-        checks.split_size(path, f"images_{split}", count, len(np.atleast_1d(data[f"c2ws_{split}"])))
-        checks.image_size(path, f"images_{split}", images[split], size)
-        splits[split] = Views(torch.from_numpy(images[split]), cameras(f"c2ws_{split}"))
-    orbit = orbit_like(splits["train"].cameras)
+    def views(split: str) -> Views:
+        key, poses = f"images_{split}", f"c2ws_{split}"
+        checks.split_size(path, key, len(images[key]), len(np.atleast_1d(data[poses])))
+        checks.image_size(path, key, images[key], size)
+        return Views(torch.from_numpy(images[key]), cameras(poses))
+
+    train, val = views("train"), views("val")
+    orbit = orbit_like(train.cameras)
     if "c2ws_test" in data:
         orbit = cameras("c2ws_test")
         checks.split_size(path, "c2ws_test", len(orbit))
 
-    background = border_colour(splits["train"].images) or (0.0, 0.0, 0.0)
+    background = border_colour(train.images) or (0.0, 0.0, 0.0)
     if "background" in data:
         red, green, blue = checks.numeric(path, "background", data["background"], "3").tolist()
         background = (red, green, blue)
@@ -74,10 +72,10 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
     return Scene(
         name=name or re.sub(r"_\d+x\d+$", "", path.stem).lower(),
         source=str(path),
-        train=splits["train"],
-        val=splits["val"],
+        train=train,
+        val=val,
         orbit=orbit,
-        bounds=_bounds(path, data, splits["train"], background),
+        bounds=_bounds(path, data, train, background),
         background=background,
         to_source=to_source,
     )
@@ -91,9 +89,10 @@ def _bounds(path: Path, data: dict[str, np.ndarray], train: Views, background: t
     aabb = torch.from_numpy(checks.box(path, "aabb", data["aabb"])).float()
     unbounded = False
     if "unbounded" in data:
-        if data["unbounded"].shape != () or data["unbounded"].dtype != bool:
-            raise InputError(path, "unbounded", f"{data['unbounded'].dtype}", "one true or false")
-        unbounded = bool(data["unbounded"])
+        flag = data["unbounded"]
+        if flag.shape != () or flag.dtype != bool:
+            raise InputError(path, "unbounded", f"{flag.dtype}", "one true or false")
+        unbounded = bool(flag)
     return Bounds(aabb, unbounded, near, far)
 
 
