@@ -22,7 +22,7 @@ from nerf_lightning.cameras import Cameras
 from nerf_lightning.config.cli import given_of, quoted
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Scene, open_scene
-from nerf_lightning.export.order import Order
+from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.export.verb import export
 from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
 from nerf_lightning.runs.index import read_run
@@ -83,8 +83,8 @@ class Run:
         given = [f"run={self.path}", f"output={output}", f"format={format}", f"device={self.system.device.type}"]
         with undisturbed():
             keys = given_of(composed([*quoted(given, ("run", "output")), *options], self.path, "export"))
-            check_options("", Order, keys)
-            export(Order(**keys))
+            check_options("", ExportOptions, keys)
+            export(ExportOptions(**keys))
         return output
 
 

@@ -9,7 +9,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.drawing.panels import near_bright
+from nerf_lightning.drawing.panels import near_bright, to_bytes
 from nerf_lightning.renderer import Rendered
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.system.metrics import mse_to_psnr
@@ -53,9 +53,8 @@ def draw(system: NeRF3D, cameras: Cameras, view: int, style: Style) -> dict[str,
     """A view's channels; C is 4, with straight alpha, where the background is left transparent."""
     rays = cameras.view_rays(view).to(system.device)
     rendered = system.render(rays, background=style.background or BLACK)
-    painted = {name: colours(rendered, name, style) for name in style.channels}
     shape = (cameras.height, cameras.width, -1)
-    return {name: (one.clamp(0, 1) * 255).round().byte().view(shape).cpu().numpy() for name, one in painted.items()}
+    return {name: to_bytes(colours(rendered, name, style).view(shape)) for name in style.channels}
 
 
 def colours(rendered: Rendered, channel: str, style: Style) -> Float[Tensor, "R C"]:

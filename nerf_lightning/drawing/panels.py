@@ -17,9 +17,9 @@ SMALLEST_SIDE = 160
 """Panels below this height are magnified (whole multiples, hard edges), so that the caption stays readable."""
 
 
-def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[ndarray, "H W 3"]:
-    """[0, 1] -> bytes, rounded."""
-    return (image.clamp(0, 1) * 255).round().byte().numpy()
+def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[ndarray, "*shape"]:
+    """[0, 1] -> bytes, rounded, on the CPU."""
+    return (image.clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
 def near_bright(depth: Float[ndarray, "H W"], low: float, high: float) -> UInt8[ndarray, "H W 3"]:

@@ -1,4 +1,4 @@
-"""The evaluate verb's work: every held-out view rendered and judged, a table, and pictures of the worst."""
+"""The evaluate verb: every held-out view rendered and measured, a table, and pictures of the worst."""
 
 import math
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ from nerf_lightning.utils.progress import tracked
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What a view came to."""
+class ViewMetrics:
+    """How good one view is."""
 
     view: int
     psnr: float
@@ -35,7 +35,7 @@ class Judged:
 
 
 def evaluate(run: str, output: str | None, worst: int, device: str, photos: str | None) -> None:
-    """Judges a run on held-out views, those of another file where one is given.
+    """Measures a run on held-out views, those of another file where one is given.
 
     Args:
         run: its folder, or its compact file.
@@ -54,69 +54,62 @@ def evaluate(run: str, output: str | None, worst: int, device: str, photos: str 
     folder = beside(source) / "evaluation" if output is None else Path(output).expanduser()
     first = data.held_out(0)
     distance, why = perceptual_distance(first.width, first.height)
-    judged: list[Judged] = []
+    metrics: list[ViewMetrics] = []
     kept: dict[int, ViewResult] = {}
     views = tracked(range(data.held_out_views), data.held_out_views, "held-out views")
     for view, result in enumerate(found.system.evaluate_held_out(data, views)):
         lpips = None if distance is None else distance(result.rgb, result.truth)
-        judged.append(Judged(view, result.psnr, result.ssim, lpips, result.seconds))
+        metrics.append(ViewMetrics(view, result.psnr, result.ssim, lpips, result.seconds))
         kept[view] = result
         if len(kept) > worst:
             del kept[max(kept, key=lambda one: kept[one].psnr)]
-    write_json(folder / "views.json", as_json(judged, source, data.scene.describe(), where))
-    poorest = sorted(kept, key=lambda one: kept[one].psnr)
-    write_png(
-        folder / "worst.png", np.concatenate([result_panel(kept[one], captioned(judged[one])) for one in poorest])
-    )
-    Console(highlight=False, soft_wrap=True).print(table(judged))
-    mean = fmean(one.psnr for one in judged)
-    over = f"{len(judged)} held-out views on {device_in_words(where)}"
+    write_json(folder / "views.json", as_json(metrics, source, data.scene.describe(), where))
+    panels = []
+    for view in sorted(kept, key=lambda one: kept[one].psnr):
+        caption = f"view {view}, {metrics[view].psnr:.2f} dB, SSIM {metrics[view].ssim:.3f}"
+        panels.append(result_panel(kept[view], caption))
+    write_png(folder / "worst.png", np.concatenate(panels))
+    Console(highlight=False, soft_wrap=True).print(table(metrics))
+    mean = fmean(one.psnr for one in metrics)
+    over = f"{len(metrics)} held-out views on {device_in_words(where)}"
     print(f"{data.scene.name}: {mean:.2f} dB over {over}; {folder}/worst.png, views.json")
     if why:
         print(f"no LPIPS: {why}")
 
 
-def captioned(one: Judged) -> str:
-    """A view's figures in one line."""
-    return f"view {one.view}, {one.psnr:.2f} dB, SSIM {one.ssim:.3f}"
-
-
-def table(judged: list[Judged]) -> Table:
+def table(metrics: list[ViewMetrics]) -> Table:
     """All views, the worst marked, and their means."""
-    lowest = min(judged, key=lambda one: one.psnr)
+    lowest = min(metrics, key=lambda one: one.psnr)
     drawn = Table("view", "PSNR, dB", "SSIM", "LPIPS", "seconds", box=None)
-    for one in judged:
-        mark = " <- worst" if one is lowest and len(judged) > 1 else ""
-        drawn.add_row(
-            str(one.view), f"{one.psnr:.2f}", _figure(one.ssim), _figure(one.lpips), f"{one.seconds:.3f}{mark}"
-        )
-    means = averages(judged)
-    drawn.add_row(
-        "mean", f"{means['psnr']:.2f}", _figure(means["ssim"]), _figure(means["lpips"]), f"{means['seconds']:.3f}"
-    )
+    for one in metrics:
+        mark = " <- worst" if one is lowest and len(metrics) > 1 else ""
+        drawn.add_row(*_row(str(one.view), vars(one), mark))
+    drawn.add_row(*_row("mean", averages(metrics)))
     return drawn
 
 
-def averages(judged: list[Judged]) -> dict[str, float | None]:
-    """The mean of each figure over the views; None where it could not be told."""
+def _row(name: str, figures: dict[str, float | None], mark: str = "") -> tuple[str, ...]:
+    ssim, lpips = ("-" if _finite(figures[key]) is None else f"{figures[key]:.4f}" for key in ("ssim", "lpips"))
+    return name, f"{figures['psnr']:.2f}", ssim, lpips, f"{figures['seconds']:.3f}{mark}"
+
+
+def averages(metrics: list[ViewMetrics]) -> dict[str, float | None]:
+    """The mean of each figure over the views; None where a view lacks it."""
     means: dict[str, float | None] = {}
     for name in ("psnr", "ssim", "lpips", "seconds"):
-        values = [getattr(one, name) for one in judged]
-        whole = all(value is not None and math.isfinite(value) for value in values)
-        means[name] = fmean(values) if whole else None
+        values = [value for one in metrics if (value := _finite(getattr(one, name))) is not None]
+        means[name] = fmean(values) if len(values) == len(metrics) else None
     return means
 
 
-def as_json(judged: list[Judged], source: Path, scene: dict[str, object], device: torch.device) -> dict[str, object]:
+def as_json(
+    metrics: list[ViewMetrics], source: Path, scene: dict[str, object], device: torch.device
+) -> dict[str, object]:
     """The evaluation as plain values."""
-    views = [{key: _plain(value) for key, value in vars(one).items()} for one in judged]
-    taken = {"device": str(device), "machine": describe_machine(device)}
-    return {"run": str(source), "scene": scene, **taken, "mean": averages(judged), "views": views}
+    views = [{key: _finite(value) for key, value in vars(one).items()} for one in metrics]
+    machine = {"device": str(device), "machine": describe_machine(device)}
+    return {"run": str(source), "scene": scene, **machine, "mean": averages(metrics), "views": views}
 
 
-def _plain(value: float | None) -> float | None:
+def _finite(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else value
-
-
-def _figure(value: float | None) -> str:
-    return "-" if _plain(value) is None else f"{value:.4f}"

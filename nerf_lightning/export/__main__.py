@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from nerf_lightning.config import cli
-from nerf_lightning.export.order import Order
+from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.utils.options import check_options
 
 if TYPE_CHECKING:
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 def task(cfg: "DictConfig") -> None:
     """Checks the configuration and exports."""
     given = cli.given_of(cfg)
-    check_options("", Order, given)
+    check_options("", ExportOptions, given)
 
     from nerf_lightning.export.verb import export
 
-    export(Order(**given))
+    export(ExportOptions(**given))
 
 
 if __name__ == "__main__":

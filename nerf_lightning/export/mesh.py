@@ -11,7 +11,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.errors import InputError
+from nerf_lightning.drawing.panels import to_bytes
 from nerf_lightning.export.surface import Surface, find_surface, lit_cells
 from nerf_lightning.export.volume import PLACES, Volume
 from nerf_lightning.runs.open import SceneRun
@@ -22,18 +22,6 @@ if TYPE_CHECKING:
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From z up, as tags and most scenes have it, to y up, as glTF wants it: written as the node's transform."""
-
-
-def require_mesh() -> None:
-    """Raises InputError where scikit-image or trimesh, an optional extra, is not installed."""
-    try:
-        import skimage  # noqa: F401
-        import trimesh  # noqa: F401
-    except ModuleNotFoundError as error:
-        if error.name not in ("skimage", "trimesh"):
-            raise
-        todo = "pip install 'nerf_lightning[mesh]'"
-        raise InputError(str(error.name), "", "no such package", "the optional extra for meshes", todo) from error
 
 
 @dataclass(frozen=True)
@@ -52,7 +40,7 @@ def colours_at(system: NeRF3D, places: Float[Tensor, "N 3"], outwards: Float[Ten
         system.field(some.to(system.device), -away.to(system.device))[1].cpu()
         for some, away in zip(places.split(together), outwards.split(together), strict=True)
     ]
-    return (torch.cat([torch.zeros(0, 3), *parts]).clamp(0, 1) * 255).round().byte().numpy()
+    return to_bytes(torch.cat([torch.zeros(0, 3), *parts]))
 
 
 def coloured_mesh(

@@ -69,10 +69,7 @@ def lit_cells(system: NeRF3D, volume: Volume, cameras: Cameras) -> Bool[ndarray,
         volume: whose cells are asked about.
         cameras: views from where the field is known.
     """
-    places = volume.places(
-        torch.stack(torch.meshgrid(*map(torch.arange, volume.density.shape), indexing="ij"), -1).float()
-    )
-    places = places.view(-1, 3)
+    places = volume.centres.view(-1, 3)
     dark = torch.arange(len(places))
     share = min(1.0, LOOKED / max(cameras.width, cameras.height))
     cameras = cameras.resized(max(1, round(share * cameras.width)), max(1, round(share * cameras.height)))

@@ -9,8 +9,8 @@ import torch
 from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.mesh import mesh_file, points_file, require_mesh, voxels_file
-from nerf_lightning.export.order import Order
+from nerf_lightning.export.mesh import mesh_file, points_file, voxels_file
+from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.export.smallest import MOST_VIEWS, PRECISIONS, smallest, some_cameras
 from nerf_lightning.export.volume import volume_of
 from nerf_lightning.runs.data import data_again
@@ -18,6 +18,7 @@ from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.open import SceneRun, beside, open_run, open_scene_run
 from nerf_lightning.utils.device import the_device
 from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.machine import device_in_words
 
@@ -31,57 +32,57 @@ NAMES = {
 """Where the output goes if nobody says, by format and content."""
 
 
-def export(order: Order) -> None:
+def export(options: ExportOptions) -> None:
     """Writes a run's last state in another format, and says what became of it.
 
     Raises:
         InputError: where the device, an option or the run is no good, photos are missing, or more would be lost than allowed.
     """
-    device = the_device(order.device)
+    device = the_device(options.device)
     formats = sorted({one for one, _ in NAMES})
-    if order.format not in formats:
-        raise InputError("config", "format", repr(order.format), ", ".join(formats))
-    if (order.format, order.content) not in NAMES:
-        raise InputError("config", "content", repr(order.content), "mesh, or points with format=ply")
-    if order.precision not in (None, *PRECISIONS):
-        found, expected = repr(order.precision), "half, byte, or null for the smaller one that is allowed"
+    if options.format not in formats:
+        raise InputError("config", "format", repr(options.format), ", ".join(formats))
+    if (options.format, options.content) not in NAMES:
+        raise InputError("config", "content", repr(options.content), "mesh, or points with format=ply")
+    if options.precision not in (None, *PRECISIONS):
+        found, expected = repr(options.precision), "half, byte, or null for the smaller one that is allowed"
         raise InputError("config", "precision", found, expected)
-    if order.box is not None and not (len(order.box) == 6 and all(map(lt, order.box[:3], order.box[3:]))):
-        raise InputError("config", "box", str(order.box), "the lower, then the upper corner: [x,y,z,x,y,z]")
-    source = Path(order.run).expanduser()
-    output = beside(source) / NAMES[order.format, order.content]
-    if order.output is not None:
-        output = Path(order.output).expanduser()
-    if order.format in ("ply", "glb"):
-        require_mesh()
-    content, words = (compacted if order.format == "compact" else shaped)(order, source, device)
+    if options.box is not None and not (len(options.box) == 6 and all(map(lt, options.box[:3], options.box[3:]))):
+        raise InputError("config", "box", str(options.box), "the lower, then the upper corner: [x,y,z,x,y,z]")
+    source = Path(options.run).expanduser()
+    output = beside(source) / NAMES[options.format, options.content]
+    if options.output is not None:
+        output = Path(options.output).expanduser()
+    if options.format in ("ply", "glb"):
+        require("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
+    content, words = (compacted if options.format == "compact" else shaped)(options, source, device)
     with atomic(output) as temporary:
         temporary.write_bytes(content)
     print(f"{output}: {words}")
 
 
-def compacted(order: Order, source: Path, device: torch.device) -> tuple[bytes, str]:
+def compacted(options: ExportOptions, source: Path, device: torch.device) -> tuple[bytes, str]:
     """A run as one small file."""
     found = open_run(source, device)
-    data = data_again(found.cfg, found.scene, order.photos)
+    data = data_again(found.cfg, found.scene, options.photos)
     before = sum(tensor.numel() * tensor.element_size() for tensor in found.system.state_dict().values())
-    compact = smallest(found.system, data, plain_config(found.cfg), order.loss, order.precision)
+    compact = smallest(found.system, data, plain_config(found.cfg), options.loss, options.precision)
     size = f"{len(compact.content) / 1000:,.1f} kB of {before / 1000:,.1f} kB (precision={compact.precision})"
     quality = f"held-out PSNR {compact.before:.2f} -> {compact.psnr:.2f} dB, {max(compact.loss, 0):.3f} dB lost"
     return compact.content, f"{size}, {quality}, on {device_in_words(device)}"
 
 
-def shaped(order: Order, source: Path, device: torch.device) -> tuple[bytes, str]:
+def shaped(options: ExportOptions, source: Path, device: torch.device) -> tuple[bytes, str]:
     """A run as a mesh, points or voxels."""
     found = open_scene_run(source, device)
-    box = None if order.box is None else torch.tensor(order.box).view(2, 3)
-    volume = volume_of(found, order.resolution, box)
-    if order.format == "npz":
+    box = None if options.box is None else torch.tensor(options.box).view(2, 3)
+    volume = volume_of(found, options.resolution, box)
+    if options.format == "npz":
         shape = voxels_file(found, volume)
-    elif order.content == "points":
-        shape = points_file(found, views_of(found, order.photos), volume, order.threshold)
+    elif options.content == "points":
+        shape = points_file(found, views_of(found, options.photos), volume, options.threshold)
     else:
-        shape = mesh_file(found, views_of(found, order.photos), volume, order.threshold, order.format)
+        shape = mesh_file(found, views_of(found, options.photos), volume, options.threshold, options.format)
     return shape.content, f"{len(shape.content) / 1e6:,.2f} MB, {shape.words}, cells of {volume.cell * found.scale:.4g}"
 
 

@@ -41,6 +41,12 @@ class Volume:
         """Where in the world an index is; whole numbers are centres of cells."""
         return self.low + (index + 0.5) * self.cell
 
+    @property
+    def centres(self) -> Float[Tensor, "X Y Z 3"]:
+        """Where in the world the centres of all cells are."""
+        axes = [torch.arange(count) for count in self.density.shape]
+        return self.places(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).float())
+
 
 def region_of(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tensor, "4 4"]) -> Float[Tensor, "2 3"]:
     """Lower and upper corner of the part of some bounds, world frame, that holds a box of another frame.
@@ -115,8 +121,7 @@ def cropped(volume: Volume, box: Float[Tensor, "2 3"], to_source: Float[Tensor, 
         box: lower and upper corner in the frame of the photos' own file.
         to_source: similarity from the world frame to that one.
     """
-    index = torch.stack(torch.meshgrid(*[torch.arange(n) for n in volume.density.shape], indexing="ij"), dim=-1)
-    places = transform(to_source, volume.places(index.float()))
+    places = transform(to_source, volume.centres)
     inside = ((places >= box[0]) & (places <= box[1])).all(-1)
     return replace(volume, density=volume.density * inside)
 

@@ -1,5 +1,6 @@
 """python -m nerf_lightning.gallery: the figure of any sweep, from its folder alone. Heavy imports wait until there is work."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerf_lightning.config import cli
@@ -9,20 +10,28 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 
-def options(runs: str, output: str | None) -> None:
-    """The keys of conf/gallery.yaml, for checking."""
-
-
 def task(cfg: "DictConfig") -> None:
-    """Checks the configuration and draws."""
+    """Checks the configuration, draws the runs below a folder, and says where the figure is."""
     from omegaconf import OmegaConf
 
     given = {str(key): cfg[key] for key in cfg if not OmegaConf.is_missing(cfg, key)}
-    check_options("", options, given)
-
-    from nerf_lightning.gallery.verb import gallery
-
+    check_options("", gallery, given)
     gallery(**given)
+
+
+def gallery(runs: str, output: str | None) -> None:
+    """Draws the runs below the folder `runs` into the PNG `output`, or gallery.png in that folder.
+
+    Raises:
+        InputError: no such folder, or no run in it.
+    """
+    from nerf_lightning.gallery.figure import write_contact_figure
+    from nerf_lightning.runs.index import find_runs
+
+    root = Path(runs).expanduser()
+    print(
+        f"figure: {write_contact_figure(root, find_runs(root), None if output is None else Path(output).expanduser())}"
+    )
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from nerf_lightning.config import cli
-from nerf_lightning.render.order import Order
+from nerf_lightning.render.options import RenderOptions
 from nerf_lightning.utils.options import check_options
 
 if TYPE_CHECKING:
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 def task(cfg: "DictConfig") -> None:
     """Checks the configuration and renders."""
     given = cli.given_of(cfg)
-    check_options("", Order, given)
+    check_options("", RenderOptions, given)
 
     from nerf_lightning.render.verb import render
 
     try:
-        render(Order(**given))
+        render(RenderOptions(**given))
     except KeyboardInterrupt:
         print("interrupted: the same command goes on from here", file=sys.stderr)
         sys.exit(130)

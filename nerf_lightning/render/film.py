@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.files import atomic, write_json
 from nerf_lightning.utils.progress import tracked
 
@@ -39,18 +40,8 @@ def check_output(output: Path, transparent: bool) -> None:
     if transparent and output.suffix in OPAQUE:
         raise InputError("config", "background", f"transparent for {output.suffix}", "a colour", "or output=FILE.webp")
     if output.suffix == ".mp4":
-        require_av()
-
-
-def require_av() -> None:
-    """Raises InputError where PyAV, an optional extra, is not installed."""
-    try:
-        import av  # noqa: F401
-    except ModuleNotFoundError as error:
-        if error.name != "av":
-            raise
-        todo = "pip install 'nerf_lightning[video]', or output=FILE.webp"
-        raise InputError("av", "", "no such package", "the optional extra that writes .mp4", todo) from error
+        purpose = "the optional extra that writes .mp4"
+        require("video", "av", purpose=purpose, otherwise=", or output=FILE.webp")
 
 
 def make_film(plan: dict[str, Any], draw: Callable[[int], Picture], count: int, output: Path, fps: float) -> int:

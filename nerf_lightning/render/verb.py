@@ -13,7 +13,7 @@ from nerf_lightning.drawing.frame import CHANNELS, ERROR_TIMES, Style, depth_ran
 from nerf_lightning.drawing.panels import panel
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.film import Picture, check_output, make_film
-from nerf_lightning.render.order import Order
+from nerf_lightning.render.options import RenderOptions
 from nerf_lightning.render.route import WITH_PHOTOS, Route, find_route
 from nerf_lightning.renderer.renderer import NAMED
 from nerf_lightning.runs.data import data_again
@@ -23,28 +23,28 @@ from nerf_lightning.utils.device import synchronize, the_device
 from nerf_lightning.utils.machine import device_in_words
 
 
-def render(order: Order) -> None:
+def render(options: RenderOptions) -> None:
     """Renders, and says what came of it.
 
     Raises:
         InputError: where the device, the run, an option, or the place for the film is no good.
     """
     began = time.perf_counter()
-    device = the_device(order.device)
-    source = Path(order.run).expanduser()
-    channels = the_channels(order.channels)
-    output = the_output(order, source)
-    check_output(output, order.background == "transparent")
+    device = the_device(options.device)
+    source = Path(options.run).expanduser()
+    channels = the_channels(options.channels)
+    output = the_output(options, source)
+    check_output(output, options.background == "transparent")
     found = open_scene_run(source, device)
-    route = the_route(order, found)
-    background = the_background(order, found.system, route)
+    route = the_route(options, found)
+    background = the_background(options, found.system, route)
     depths = depth_range(found.system, route.cameras) if "depth" in channels else (0.0, 1.0)
     style = Style(channels, background, depths)
-    plan = the_plan(order, found.system, route, style)
+    plan = the_plan(options, found.system, route, style)
 
     draw_one = side_by_side if route.photos is None else beside_truth
     there = make_film(
-        plan, lambda index: draw_one(found.system, route, index, style), len(route.cameras), output, order.fps
+        plan, lambda index: draw_one(found.system, route, index, style), len(route.cameras), output, options.fps
     )
     synchronize(device)
     seconds = time.perf_counter() - began
@@ -69,38 +69,38 @@ def the_channels(given: str | list[str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def the_output(order: Order, source: Path) -> Path:
+def the_output(options: RenderOptions, source: Path) -> Path:
     """Where the film goes."""
-    if order.output is not None:
-        return Path(order.output).expanduser()
-    return beside(source) / f"render_{Path(order.path).stem}.webp"
+    if options.output is not None:
+        return Path(options.output).expanduser()
+    return beside(source) / f"render_{Path(options.path).stem}.webp"
 
 
-def the_route(order: Order, found: SceneRun) -> Route:
+def the_route(options: RenderOptions, found: SceneRun) -> Route:
     """The views to show, at the size asked for."""
     scene = None
-    if order.path in WITH_PHOTOS:
-        if order.scale != 1 or order.background == "transparent":
-            key = "scale" if order.scale != 1 else "background"
-            value = order.scale if order.scale != 1 else order.background
-            raise InputError("config", key, str(value), f"scale=1 and a colour beside photos (path={order.path})")
-        data = data_again(found.cfg, found.scene, order.photos)
+    if options.path in WITH_PHOTOS:
+        if options.scale != 1 or options.background == "transparent":
+            key = "scale" if options.scale != 1 else "background"
+            value = options.scale if options.scale != 1 else options.background
+            raise InputError("config", key, str(value), f"scale=1 and a colour beside photos (path={options.path})")
+        data = data_again(found.cfg, found.scene, options.photos)
         assert isinstance(data, RayDataModule)  # of a scene's run
         scene = data.scene
-    route = find_route(order.path, order.frames, found.orbit, scene)
-    if order.scale == 1:
+    route = find_route(options.path, options.frames, found.orbit, scene)
+    if options.scale == 1:
         return route
-    width, height = (max(1, round(side * order.scale)) for side in (route.cameras.width, route.cameras.height))
+    width, height = (max(1, round(side * options.scale)) for side in (route.cameras.width, route.cameras.height))
     return Route(route.cameras.resized(width, height), route.views)
 
 
-def the_background(order: Order, system: NeRF3D, route: Route) -> tuple[float, float, float] | None:
+def the_background(options: RenderOptions, system: NeRF3D, route: Route) -> tuple[float, float, float] | None:
     """What shows where nothing is, in [0, 1]; None for transparency.
 
     Raises:
         InputError: for anything else, or where photos have a background that cannot be taken off.
     """
-    given = order.background
+    given = options.background
     own = tuple(system.renderer.colour.tolist())
     if given == "transparent":
         return None
@@ -123,14 +123,14 @@ def the_background(order: Order, system: NeRF3D, route: Route) -> tuple[float, f
     return red, green, blue
 
 
-def the_plan(order: Order, system: NeRF3D, route: Route, style: Style) -> dict[str, Any]:
+def the_plan(options: RenderOptions, system: NeRF3D, route: Route, style: Style) -> dict[str, Any]:
     """All that frames depend on, as plain values."""
     digest = hashlib.sha256()
     for tensor in (*system.state_dict().values(), route.cameras.K, route.cameras.c2w):
         digest.update(tensor.cpu().contiguous().numpy().tobytes())
     return {
         "what": digest.hexdigest(),
-        "path": order.path,
+        "path": options.path,
         "views": route.views,
         "size": [route.cameras.width, route.cameras.height],
         "channels": list(style.channels),

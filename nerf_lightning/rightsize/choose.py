@@ -33,7 +33,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Measured:
-    """What a rung came to."""
+    """How good a rung is, and how large."""
 
     psnr: float
     """dB held out."""

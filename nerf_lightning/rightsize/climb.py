@@ -39,13 +39,12 @@ BARE = ("guard",)
 
 
 @dataclass(frozen=True)
-class Rung:
+class Rung(Measured):
     """A rung that was climbed to."""
 
     options: Options
     system: System
     parameters: int
-    measured: Measured
     seconds: float
     """Of training on this rung."""
 
@@ -117,8 +116,8 @@ def climb(cfg: DictConfig, data: Data, rungs: list[Options], folder: Path) -> It
         with_options = set_options(part, "model", options)
         system, seconds = trained(with_options, data, folder, start)
         parameters = sum(p.numel() for p in system.parameters() if p.requires_grad)
-        measured = Measured(quality(system, data), compact_bytes(with_options, system, data))
-        yield Rung(options, system, parameters, measured, seconds)
+        psnr, size = quality(system, data), compact_bytes(with_options, system, data)
+        yield Rung(psnr, size, options, system, parameters, seconds)
         start = system
 
 
@@ -129,7 +128,7 @@ def spread(cfg: DictConfig, data: Data, rungs: list[Options], first: Rung, folde
         It, and the seconds of training it took.
     """
     part = set_options(bare(share_of_budget(cfg, SEARCH / len(rungs))), "model", first.options)
-    found, spent = [first.measured.psnr], 0.0
+    found, spent = [first.psnr], 0.0
     for extra in range(1, EXTRA_SEEDS + 1):
         another = copy.deepcopy(part)
         another.seed = cfg.seed + extra

@@ -53,14 +53,17 @@ def as_json(found: Found) -> dict[str, Any]:
     for index, options in enumerate(found.ladder.rungs):
         full = found.full.get(index)
         grown = found.rungs[index] if index < len(found.rungs) else None
-        if grown is None and full is None:
+        known: Full | Rung | None = full or grown
+        if known is None:
             break
         rungs.append(
             {
                 "overrides": overrides("model", options),
-                **(_of_full(full) if full is not None else {}),
-                **(_of_grown(grown) if grown is not None and full is None else {}),
-                "grown_psnr": None if grown is None else grown.measured.psnr,
+                "parameters": known.parameters,
+                "artifact_bytes": known.size,
+                "psnr": known.psnr,
+                "train_seconds": known.seconds,
+                "grown_psnr": None if grown is None else grown.psnr,
                 "run": None if full is None else str(full.folder),
             }
         )
@@ -69,7 +72,7 @@ def as_json(found: Found) -> dict[str, Any]:
         "target": {"psnr": found.target.psnr, "within_db": found.target.within_db},
         "reached": found.reached,
         "reason": found.reason,
-        "knee": knee([rung.measured for rung in found.rungs]),
+        "knee": knee(found.rungs),
         "device": str(found.device),
         "machine": describe_machine(found.device),
         "noise_db": round(found.noise, 4),
@@ -85,15 +88,6 @@ def as_json(found: Found) -> dict[str, Any]:
         },
         "rungs": rungs,
     }
-
-
-def _of_full(one: Full) -> dict[str, Any]:
-    return {"parameters": one.parameters, "artifact_bytes": one.size, "psnr": one.psnr, "train_seconds": one.seconds}
-
-
-def _of_grown(one: Rung) -> dict[str, Any]:
-    size, psnr = one.measured.size, one.measured.psnr
-    return {"parameters": one.parameters, "artifact_bytes": size, "psnr": psnr, "train_seconds": one.seconds}
 
 
 def experiment(found: Found, cfg: DictConfig, choices: dict[str, Any]) -> str:
@@ -115,7 +109,7 @@ def chart(found: Found) -> Figure:
     """Bytes against PSNR: the climb, the full trainings, the target, and the choice."""
     figure = Figure(figsize=(7.2, 4.6), dpi=DPI, layout="constrained")
     axes = figure.subplots()
-    grown = [rung.measured for rung in found.rungs]
+    grown = found.rungs
     sizes = [one.size / 1000 for one in grown]
     axes.plot(sizes, [one.psnr for one in grown], "o-", color=BLUE, mfc="white", label="while growing")
     for index, one in enumerate(grown):

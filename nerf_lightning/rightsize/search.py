@@ -15,7 +15,16 @@ from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.export.smallest import Compact, smallest
 from nerf_lightning.kernels import use_kernels
-from nerf_lightning.rightsize.choose import Target, best_of, candidate, chosen, climbed_enough, expected, next_to_train
+from nerf_lightning.rightsize.choose import (
+    Measured,
+    Target,
+    best_of,
+    candidate,
+    chosen,
+    climbed_enough,
+    expected,
+    next_to_train,
+)
 from nerf_lightning.rightsize.climb import Rung, climb, coarsest_sampler, compact_bytes, set_options, spread
 from nerf_lightning.rightsize.ladder import Ladder, Options
 from nerf_lightning.runs.folder import load_run, plain_config
@@ -31,15 +40,12 @@ COMPACT_LOSS = 0.1
 
 
 @dataclass(frozen=True)
-class Full:
-    """A rung trained with the whole budget."""
+class Full(Measured):
+    """A rung trained with the whole budget, measured on all held-out views."""
 
     folder: Path
-    psnr: float
-    """dB over all held-out views."""
     seconds: float
-    size: int
-    """Bytes of its compact file."""
+    """Of training."""
     parameters: int
 
 
@@ -85,27 +91,23 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     for rung in climb(cfg, data, ladder.rungs, output):
         rungs.append(rung)
         seconds += rung.seconds
-        print(
-            f"rung {len(rungs) - 1}: {told(rung.options)}: {figures(rung.measured.psnr, rung.measured.size)}",
-            flush=True,
-        )
+        print(f"rung {len(rungs) - 1}: {told(rung.options)}: {figures(rung.psnr, rung.size)}", flush=True)
         if len(rungs) == 1:
             noise, spent = spread(cfg, data, ladder.rungs, rung, output)
             seconds += spent
             print(f"seeds differ by {noise:.2f} dB", flush=True)
-        stop = climbed_enough([one.measured for one in rungs], target, noise)
+        stop = climbed_enough(rungs, target, noise)
         if stop:
             why = stop
             break
-    measured = [one.measured for one in rungs]
-    first, best = candidate(measured, target), best_of(measured)
+    first, best = candidate(rungs, target), best_of(rungs)
     print(f"climbed to rung {len(rungs) - 1}: {why}; rung {first} seems enough", flush=True)
     model = set_options(cfg, "model", rungs[first].options)
     sampler = coarsest_sampler(model, data, rungs[first].system, ladder.samplers, lambda line: print(line, flush=True))
     full: dict[int, Full] = {}
     while True:
         tried = {index: one.psnr for index, one in full.items()}
-        following = next_to_train(tried, measured, target, len(ladder.rungs) - 1, MOST_FULL)
+        following = next_to_train(tried, rungs, target, len(ladder.rungs) - 1, MOST_FULL)
         if following is None:
             break
         print(f"rung {following} in full", flush=True)
@@ -120,7 +122,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
         temporary.write_bytes(compact.content)
     reason = in_words(target, tried, choice, found is not None, why, noise)
     if target.psnr is not None and 0 < choice < len(rungs) and choice - 1 not in tried:
-        reason += f"; rung {choice - 1} would be expected at {expected(choice - 1, tried, measured):.1f} dB"
+        reason += f"; rung {choice - 1} would be expected at {expected(choice - 1, tried, rungs):.1f} dB"
     wall = time.perf_counter() - began
     return Found(
         target, ladder, rungs, full, choice, found is not None, reason, noise, sampler, seconds, wall, compact, device
@@ -134,7 +136,7 @@ def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Any, 
     results = read_run(folder).results
     run = load_run(folder, device=device_of(cfg))
     size = compact_bytes(run.cfg, run.system, data)
-    return Full(folder, results["psnr"], results["train_seconds"], size, results["parameters"])
+    return Full(results["psnr"], size, folder, results["train_seconds"], results["parameters"])
 
 
 def told(options: Options) -> str:

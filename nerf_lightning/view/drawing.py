@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays, focus_point
@@ -64,21 +64,20 @@ def frusta(views: Views, word: str, photo_side: int) -> Iterator[Frustum]:
         word: names are this word and the view's number.
         photo_side: longest side of the photos in pixels.
     """
-    for i, (image, K, c2w) in enumerate(zip(views.images, views.cameras.K, views.cameras.c2w, strict=True)):
-        yield _frustum(f"{word} {i}", image.numpy(), K.double().numpy(), c2w.numpy(), photo_side)
+    images, cameras = views.images.numpy(), views.cameras
+    for i, (image, K, c2w) in enumerate(zip(images, cameras.K.double().numpy(), cameras.c2w.numpy(), strict=True)):
+        fov, aspect, photo = _centred(image, K, photo_side)
+        yield Frustum(f"{word} {i}", c2w, fov, aspect, photo)
 
 
-def _frustum(
-    name: str,
-    image: UInt8[np.ndarray, "H W C"],
-    K: Float[np.ndarray, "3 3"],
-    c2w: Float[np.ndarray, "4 4"],
-    photo_side: int,
-) -> Frustum:
+def _centred(
+    image: UInt8[np.ndarray, "H W C"], K: Float[np.ndarray, "3 3"], photo_side: int
+) -> tuple[float, float, UInt8[np.ndarray, "h w C2"]]:
+    """A photo, reduced, with the optical axis in its middle; the vertical field of view and the aspect that it then has."""
     height, width = image.shape[:2]
     w, h = fit_size(width, height, photo_side)
     photo = area_resize(image, w, h)
-    # Viewers put the optical axis in the picture's middle: where it is not, clear margins bring it there.
+    # Viewers assume that the optical axis meets the middle of the picture: where it does not, add transparent margins.
     half_x, half_y = max(K[0, 2], width - K[0, 2]), max(K[1, 2], height - K[1, 2])
     left, right = ((half_x - side) * w / width for side in (K[0, 2], width - K[0, 2]))
     above, below = ((half_y - side) * h / height for side in (K[1, 2], height - K[1, 2]))
@@ -87,20 +86,11 @@ def _frustum(
         opaque = np.full((h, w, 1), 255, np.uint8)
         photo = np.pad(photo if photo.shape[2] == 4 else np.concatenate([photo, opaque], axis=2), margins)
     tangent_x, tangent_y = half_x / K[0, 0], half_y / K[1, 1]
-    return Frustum(name, c2w, 2 * math.atan(tangent_y), float(tangent_x / tangent_y), photo)
+    return 2 * math.atan(tangent_y), float(tangent_x / tangent_y), photo
 
 
-def one_ray_each(cameras: Cameras, generator: Generator) -> Rays:
-    """The ray of a random pixel of every view; R = V."""
-    return _random_pixels(cameras, torch.arange(len(cameras)), generator)
-
-
-def rays_of_one(cameras: Cameras, view: int, count: int, generator: Generator) -> Rays:
-    """The rays of random pixels of one view; R = count."""
-    return _random_pixels(cameras, torch.full((count,), view), generator)
-
-
-def _random_pixels(cameras: Cameras, view: Tensor, generator: Generator) -> Rays:
+def random_rays(cameras: Cameras, view: Int[Tensor, "R"], generator: Generator) -> Rays:
+    """The ray of a random pixel of each of some views, which may repeat."""
     row, col = (torch.randint(size, view.shape, generator=generator) for size in (cameras.height, cameras.width))
     return cameras.rays(view, row, col)
 

@@ -55,6 +55,10 @@ class Page:
     def port(self) -> int:
         return self.server.get_port()
 
+    def run(self) -> None:
+        """Waits for ever; the server has threads of its own."""
+        threading.Event().wait()
+
     def stop(self) -> None:
         with _hushed():
             self.server.stop()

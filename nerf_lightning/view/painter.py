@@ -99,6 +99,6 @@ class Painter:
         )
         depths = self.depths() if wish.channel == "depth" else (0.0, 1.0)
         painted = colours(rendered, wish.channel, Style((wish.channel,), wish.background, depths))
-        picture = to_bytes(painted.view(cameras.height, cameras.width, 3).cpu())
+        picture = to_bytes(painted.view(cameras.height, cameras.width, 3))
         self.rate = 0.5 * self.rate + 0.5 * len(rays) / max(time.perf_counter() - began, 1e-4)
         return np.ascontiguousarray(picture)

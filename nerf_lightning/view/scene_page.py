@@ -5,11 +5,10 @@ import torch
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.view.drawing import (
     box_edges,
-    one_ray_each,
     overview,
     path_segments,
+    random_rays,
     ray_figure,
-    rays_of_one,
     scene_scale,
 )
 from nerf_lightning.view.page import Page
@@ -83,10 +82,9 @@ class ScenePage(Page):
             generator = torch.Generator().manual_seed(self.draw)
             cameras = self.scene.train.cameras
             self.ray_group.visible = self.which.value != NO_RAYS
-            if self.which.value == MANY:
-                rays = rays_of_one(cameras, self.camera.value, self.rays, generator)
-            else:
-                rays = one_ray_each(cameras, generator)
+            many = self.which.value == MANY
+            views = torch.full((self.rays,), self.camera.value) if many else torch.arange(len(cameras))
+            rays = random_rays(cameras, views, generator)
             jitter = generator if self.jitter.value else None
             figure = ray_figure(rays, self.scene.bounds, self.samples, self.scale, jitter)
             self.lines("/rays/approach", figure.approach, APPROACH)

@@ -5,6 +5,7 @@ import ipaddress
 import socket
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.extras import require
 
 NEIGHBOURS = 50
 """How many ports are tried."""
@@ -12,13 +13,7 @@ NEIGHBOURS = 50
 
 def require_viser() -> None:
     """Raises InputError where Viser, an optional extra, is not installed."""
-    try:
-        import viser  # noqa: F401
-    except ModuleNotFoundError as error:
-        if error.name != "viser":
-            raise
-        todo = "pip install 'nerf_lightning[view]'"
-        raise InputError("viser", "", "no such package", "the viewer's optional extra", todo) from error
+    require("view", "viser", purpose="the viewer's optional extra")
 
 
 def find_port(host: str, port: int) -> tuple[str, int]:

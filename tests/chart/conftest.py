@@ -11,12 +11,11 @@ from made_runs import MakeRun, results
 from nerf_lightning.runs.index import Run, read_run
 
 
-@pytest.fixture
-def make_run(tmp_path: Path) -> MakeRun:
-    """Writes a run's folder below tmp_path/runs and reads it: make_run(name, config={...}, psnr=..., ...)."""
+def run_maker(root: Path) -> MakeRun:
+    """Writes a run's folder below a root and reads it: make_run(name, config={...}, psnr=..., ...)."""
 
     def make(name: str, config: dict[str, Any] | None = None, text: str | None = None, **changes: Any) -> Run:
-        folder = tmp_path / "runs" / name
+        folder = root / name
         folder.mkdir(parents=True)
         figures = results(**changes)
         plain = {
@@ -35,3 +34,8 @@ def make_run(tmp_path: Path) -> MakeRun:
         return read_run(folder)
 
     return make
+
+
+@pytest.fixture
+def make_run(tmp_path: Path) -> MakeRun:
+    return run_maker(tmp_path / "runs")

@@ -1,14 +1,19 @@
 """The chart's files: whole folders of good and bad runs, in and out of the comparison."""
 
+import contextlib
 import csv
+import io
 import itertools
 import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import imageio.v3 as imageio
 import pytest
+from chart.conftest import run_maker
 from made_runs import MakeRun
+from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.text import Text
 
@@ -17,7 +22,9 @@ from nerf_lightning.chart.figure import BEYOND, MOST_ROWS, MOST_TROUBLES, chart_
 from nerf_lightning.chart.notes import troubles
 from nerf_lightning.chart.references import Reference
 from nerf_lightning.chart.report import as_svg, write_report
-from nerf_lightning.runs.index import Run, find_runs
+from nerf_lightning.chart.table import write_csv
+from nerf_lightning.drawing.ink import pixels_of
+from nerf_lightning.runs.index import find_runs
 
 LIMITS = (0.5, 15, 1.0)
 PUBLISHED = [
@@ -26,16 +33,34 @@ PUBLISHED = [
 ]
 
 
-@pytest.fixture
-def runs(make_run: MakeRun) -> list[Run]:
-    """Two methods, three seeds; a collapsed run, a failed one, one of another scene, one whose results are cut off."""
+@dataclass(frozen=True)
+class Report:
+    folder: Path
+    terminal: str
+    figure: Figure
+    """Drawn again from the same runs."""
+
+
+def words_of(figure: Figure) -> str:
+    """All text in a figure, its parts included."""
+    return " ".join(text.get_text() for text in figure.findobj(Text)).replace("\n    ", " ")
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
+    """Two methods, three seeds; a collapsed run, a failed one, one of another scene, one whose results are cut off.
+
+    A report of the first runs alone stood in the folder before.
+    """
+    root = tmp_path_factory.mktemp("report")
+    make_run = run_maker(root / "runs")
     made = [
         make_run(f"{method}{seed}", method=method, seed=seed, psnr=quality + seed / 10, train_seconds=seconds)
         for method, quality, seconds in (("grid", 30.0, 5.0), ("net", 31.0, 15.0))
         for seed in range(3)
     ]
     scene = {"name": "ship", "sha256": "cd" * 32, "views": {"train": 9, "val": 2}, "resolution": [8, 6]}
-    return [
+    runs = [
         *made,
         make_run("lost", {"model": {"width": 1}}, psnr=9.8, status="collapsed", diagnosis="no density left"),
         make_run("broken", {"model": {"width": 2}}, psnr=None, train_seconds=None, curve=[], scene=None, status="failed",
@@ -43,67 +68,46 @@ def runs(make_run: MakeRun) -> list[Run]:
         make_run("elsewhere", scene=scene, seed=5),
         make_run("cut", text='{"scene": {"name": "toy"}, "psnr": 3'),
     ]  # fmt: skip
+    terminal = io.StringIO()
+    with contextlib.redirect_stdout(terminal):
+        write_report(made[:3], [], LIMITS, root / "out")
+        write_report(runs, PUBLISHED, LIMITS, root / "out")
+    figure = chart_figure(compare(runs, PUBLISHED, *LIMITS), troubles(runs))
+    pixels_of(figure)  # as the report does before it writes the SVG
+    return Report(root / "out", terminal.getvalue(), figure)
 
 
-def words_of(figure) -> str:
-    """All text in a figure, its parts included."""
-    return " ".join(text.get_text() for text in figure.findobj(Text)).replace("\n    ", " ")
-
-
-def test_all_that_went_wrong_is_named_on_every_output(runs: list[Run], tmp_path: Path, capsys):
-    write_report(runs, PUBLISHED, LIMITS, tmp_path / "out")
-    terminal = capsys.readouterr().out
-    table = (tmp_path / "out" / "chart.csv").read_text()
-    svg = words_of(chart_figure(compare(runs, PUBLISHED, *LIMITS), troubles(runs)))
-    for text in (terminal, table, svg):
+def test_all_that_went_wrong_is_named_on_every_output(report: Report):
+    words = words_of(report.figure)
+    for text in (report.terminal, (report.folder / "chart.csv").read_text(), words):
         assert all(word in text for word in ("lost", "collapsed", "no density left")), text
         assert all(word in text for word in ("broken", "failed", "out of memory"))
         assert "cut" in text and "unreadable" in text
         assert "ship" in text and "cdcdcdcd" in text
-    assert "Collapsed, failed or cut short (3)" in svg
+    assert "Collapsed, failed or cut short (3)" in words
 
 
-def test_files(runs: list[Run], tmp_path: Path):
-    write_report(runs, PUBLISHED, LIMITS, tmp_path / "out")
-    names = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert names == ["chart.csv", "chart.html", "chart.png", "chart.svg", "tensorboard"]
-    picture = imageio.imread(tmp_path / "out" / "chart.png")
+def test_files(report: Report):
+    names = sorted(path.name for path in report.folder.iterdir())
+    assert names == ["chart.csv", "chart.html", "chart.png", "chart.svg", "tensorboard"], "nothing temporary stays"
+    picture = imageio.imread(report.folder / "chart.png")
     assert picture.shape[1] == 1560 and picture.std() > 10
-    with (tmp_path / "out" / "chart.csv").open() as file:
+    assert (report.folder / "chart.svg").read_text() == as_svg(report.figure), "the same runs give the same SVG"
+    with (report.folder / "chart.csv").open() as file:
         lines = list(csv.DictReader(file))
-    assert [line["point"] for line in lines] == [
-        "grid, width 16, 5 s",
-        "net, 5 s",
-        "grid, 5 s",
-        "lost",
-        "broken",
-        "cut",
-    ]
-    first = lines[0]
-    assert (first["psnr"], first["psnr_worst_seed"], first["seeds"], first["frontier"]) == (
-        "30.1",
-        "30.0",
-        "3",
-        "training",
-    )
-    assert lines[1]["frontier"] == "training rendering"
-    assert len(first["folders"].split(";")) == 3
+    points = ["grid, width 16, 5 s", "net, 5 s", "grid, 5 s", "lost", "broken", "cut"]
+    assert [line["point"] for line in lines] == points
+    first = [lines[0][key] for key in ("psnr", "psnr_worst_seed", "seeds", "frontier")]
+    assert first == ["30.1", "30.0", "3", "training"] and lines[1]["frontier"] == "training rendering"
+    assert len(lines[0]["folders"].split(";")) == 3
     assert [line["status"] for line in lines[3:]] == ["collapsed", "failed", "unreadable"]
 
 
-def test_a_second_chart_takes_the_place_of_the_first(runs: list[Run], tmp_path: Path):
-    for chosen in (runs, runs[:3]):
-        write_report(chosen, [], LIMITS, tmp_path / "out")
-    assert sum(path.is_dir() for path in (tmp_path / "out" / "tensorboard").iterdir()) == 1
-    assert not list((tmp_path / "out").glob(".*")), "no temporary file stays behind"
-
-
-def test_the_hparams_tab_holds_the_table(runs: list[Run], tmp_path: Path):
+def test_the_hparams_tab_holds_the_table_of_the_last_report_alone(report: Report):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
     from tensorboard.plugins.hparams import plugin_data_pb2
 
-    write_report(runs, [], LIMITS, tmp_path / "out")
-    sessions = sorted(path for path in (tmp_path / "out" / "tensorboard").iterdir() if path.is_dir())
+    sessions = sorted(path for path in (report.folder / "tensorboard").iterdir() if path.is_dir())
     assert len(sessions) == 3
     events = EventAccumulator(str(sessions[0])).Reload()
     assert events.Scalars("chart/psnr")[0].value == pytest.approx(30.1)
@@ -113,12 +117,10 @@ def test_the_hparams_tab_holds_the_table(runs: list[Run], tmp_path: Path):
     assert start.hparams["runs"].number_value == 3
 
 
-def test_the_page_opens_without_a_network_and_knows_each_configuration(runs: list[Run], tmp_path: Path):
-    write_report(runs, PUBLISHED, LIMITS, tmp_path / "out")
-    page = (tmp_path / "out" / "chart.html").read_text()
-    assert not re.findall(r"""(?:src|href)=["']?(?!#)[^"'>\s]+""", page.replace('xlink:href="#', "")), (
-        "nothing is fetched"
-    )
+def test_the_page_opens_without_a_network_and_knows_each_configuration(report: Report):
+    page = (report.folder / "chart.html").read_text()
+    fetched = re.findall(r"""(?:src|href)=["']?(?!#)[^"'>\s]+""", page.replace('xlink:href="#', ""))
+    assert not fetched
     points = json.loads(re.search(r'id="points">(.*?)</script>', page, re.S)[1])
     assert set(points) == {"0-0", "0-1", "1-0", "published-0-0", "published-0-1"}
     first = points["0-0"]
@@ -128,6 +130,16 @@ def test_the_page_opens_without_a_network_and_knows_each_configuration(runs: lis
     for point in points.values():
         assert all(f'id="{mark}"' in page for mark in point["marks"]), "every point has its marker"
     assert ["source", "a paper"] in points["published-0-0"]["figures"]
+
+
+def test_publications_beyond_the_axis_stand_at_its_end(report: Report):
+    left, right, *_ = report.figure.axes
+    names = [text.get_text() for text in left.texts]
+    assert "theirs" in names and "slower (25.0 h)" in names
+    assert left.get_xlim()[1] < 15.0 * BEYOND * 2
+    legend = [text.get_text() for text in report.figure.findobj(Legend)[0].get_texts()]
+    assert "published, other hardware" in legend
+    assert "theirs" not in [text.get_text() for text in right.texts]
 
 
 def test_nothing_in_a_run_becomes_code_in_the_page(make_run: MakeRun, tmp_path: Path):
@@ -145,16 +157,6 @@ def test_the_figure_says_what_it_leaves_out(make_run: MakeRun):
     assert "2 more settings" in words_of(figure) and "and 3 more" in words_of(figure)
 
 
-def test_publications_beyond_the_axis_stand_at_its_end(runs: list[Run]):
-    figure = chart_figure(compare(runs, PUBLISHED, *LIMITS), [])
-    left = figure.axes[0]
-    names = [text.get_text() for text in left.texts]
-    assert "theirs" in names and "slower (25.0 h)" in names
-    assert left.get_xlim()[1] < 15.0 * BEYOND * 2
-    assert "published, other hardware" in [text.get_text() for text in figure.findobj(Legend)[0].get_texts()]
-    assert "theirs" not in [text.get_text() for text in figure.axes[1].texts]
-
-
 def test_without_any_figures_there_is_still_the_box(make_run: MakeRun, tmp_path: Path):
     run = make_run("a", text="{")
     write_report([run], PUBLISHED, LIMITS, tmp_path / "out")
@@ -165,14 +167,10 @@ def test_without_any_figures_there_is_still_the_box(make_run: MakeRun, tmp_path:
 
 def test_points_without_rendering_times(make_run: MakeRun, tmp_path: Path):
     runs = [make_run(name, {"recipe": name}, render_seconds_per_view=None, artifact_bytes=None) for name in "ab"]
-    write_report(runs, [], LIMITS, tmp_path / "out")
-    figure = chart_figure(compare(runs, [], *LIMITS), [])
-    assert "not measured" in words_of(figure)
-
-
-def test_the_same_runs_give_the_same_svg(runs: list[Run]):
-    first, second = (as_svg(chart_figure(compare(runs, PUBLISHED, *LIMITS), [])) for _ in range(2))
-    assert first == second
+    assert "not measured" in words_of(chart_figure(compare(runs, [], *LIMITS), []))
+    write_csv(tmp_path / "chart.csv", compare(runs, [], *LIMITS), [])
+    with (tmp_path / "chart.csv").open() as file:
+        assert {line["artifact_bytes"] for line in csv.DictReader(file)} == {""}
 
 
 def test_garbage_of_all_kinds(make_run: MakeRun, tmp_path: Path):

@@ -3,6 +3,7 @@
 import io
 import math
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ import torch
 import trimesh
 from export.balls import CENTRE, DENSE, RADIUS, ball_run, ball_system
 
+from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.mesh import mesh_file, points_file, require_mesh, voxels_file
+from nerf_lightning.export.__main__ import task
+from nerf_lightning.export.mesh import mesh_file, points_file, voxels_file
 from nerf_lightning.export.volume import cells_across, region_of, sample_volume, volume_of
 
 SCALE, SHIFT = 0.02, torch.tensor([5.0, -1.0, 2.0])
@@ -110,7 +113,7 @@ def test_boxes_of_any_shape_have_cubic_cells():
     assert cells_across(system) == 80
 
 
-def test_without_the_extra_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+def test_without_the_extra_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(InputError, match=r"trimesh: found no such package.*pip install 'nerf_lightning\[mesh\]'"):
-        require_mesh()
+        task(composed(["run=any", "format=glb", "device=cpu"], tmp_path, "export"))

@@ -24,15 +24,13 @@ from nerf_lightning.view.__main__ import main
 from nerf_lightning.view.drawing import (
     box_edges,
     frusta,
-    one_ray_each,
     overview,
     path_segments,
+    random_rays,
     ray_figure,
-    rays_of_one,
     through,
 )
 from nerf_lightning.view.serve import announcement, find_port
-from nerf_lightning.view.verb import view_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -89,13 +87,13 @@ def pixel_of(cameras: Cameras, view: int, rays: Rays) -> torch.Tensor:
 
 def test_rays_start_at_the_centres_and_pass_through_pixel_centres(scene: Scene):
     cameras = off_centre(scene.train).cameras
-    rays = rays_of_one(cameras, 2, 50, some())
+    rays = random_rays(cameras, torch.full((50,), 2), some())
     assert torch.equal(rays.origins, cameras.centres[2].expand(50, 3))
     pixels = pixel_of(cameras, 2, rays)
     torch.testing.assert_close(pixels - 0.5, (pixels - 0.5).round(), atol=1e-4, rtol=0)
     assert pixels.min() > 0 and pixels.max() < 16
     assert len(pixels.round(decimals=1).unique(dim=0)) > 30
-    rays = one_ray_each(cameras, some())
+    rays = random_rays(cameras, torch.arange(len(cameras)), some())
     assert torch.equal(rays.origins, cameras.centres)
     for view in range(len(cameras)):
         pixel = pixel_of(cameras, view, rays[view : view + 1])
@@ -104,7 +102,7 @@ def test_rays_start_at_the_centres_and_pass_through_pixel_centres(scene: Scene):
 
 @pytest.mark.parametrize("jitter", [False, True])
 def test_samples_lie_on_their_rays_within_the_box(scene: Scene, jitter: bool):
-    rays = rays_of_one(scene.train.cameras, 1, 40, some())
+    rays = random_rays(scene.train.cameras, torch.full((40,), 1), some())
     figure = ray_figure(rays, scene.bounds, 16, 4.0, some() if jitter else None)
     assert len(figure.approach) == 40
     assert np.array_equal(figure.approach[:, 0], rays.origins.numpy())
@@ -221,11 +219,10 @@ def test_controls_change_what_is_shown(page):
     assert nodes("/training/0").image is None
 
 
-def test_a_missing_viser_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch):
+def test_a_missing_viser_is_said_in_one_line(verb, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[view\]'") as raised:
-        view_scene("any.npz", None, 10, 160, 32, 64, "127.0.0.1", 0)
-    assert "\n" not in str(raised.value)
+    code, _, err = verb(main, "scene=any.npz")
+    assert code == 2 and "pip install 'nerf_lightning[view]'" in err and err.count("\n") == 1
 
 
 def test_a_taken_port_gives_the_next_and_a_strange_host_a_line():

@@ -7,7 +7,7 @@ from nerf_lightning.utils.options import AtLeast, Count
 
 
 @dataclass(frozen=True)
-class Order:
+class ExportOptions:
     """The keys of conf/export.yaml, which says what each means; `photos` is its dataset.path."""
 
     run: str
