@@ -63,17 +63,8 @@ def compare(
         frontiers = {cost.name: _frontier(points, cost) for cost in COSTS}
         chosen = [points[number] for number in sorted({n for front in frontiers.values() for n in front})]
         known = matching(references, setting)
-        compared.append(
-            Comparison(
-                setting=setting,
-                points=points,
-                frontiers=frontiers,
-                advice=advice(points, within_db, seconds, smallest_within_db),
-                remarks=remarks(points, chosen),
-                references=known,
-                provenance=provenance(known),
-            )
-        )
+        said = advice(points, within_db, seconds, smallest_within_db)
+        compared.append(Comparison(setting, points, frontiers, said, remarks(points, chosen), known, provenance(known)))
     return compared
 
 

@@ -168,17 +168,8 @@ def in_time(seconds: float) -> str:
 
 def _legend(one: Comparison, methods: dict[str, tuple[str, str]]) -> list[Line2D]:
     def dot(colour: str, shape: str, size: float, label: str, hollow: bool = False) -> Line2D:
-        face = "none" if hollow else colour
-        return Line2D(
-            [],
-            [],
-            linestyle="",
-            marker=shape,
-            markersize=math.sqrt(size),
-            color=colour,
-            markerfacecolor=face,
-            label=label,
-        )
+        given: dict[str, Any] = {"linestyle": "", "marker": shape, "markersize": math.sqrt(size), "label": label}
+        return Line2D([], [], color=colour, markerfacecolor="none" if hollow else colour, **given)
 
     present = sorted({point.method for point in one.points})
     entries = [dot(*methods[method], 49, readable(method)) for method in present]

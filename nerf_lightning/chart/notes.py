@@ -1,4 +1,4 @@
-"""What must be said beside a chart: runs that were lost, a busy machine, too few seeds."""
+"""Warnings beside a chart: lost runs, a busy machine, too few seeds."""
 
 import os
 from collections.abc import Sequence

@@ -35,7 +35,7 @@ dt {{ color: #555; }} dd {{ margin: 0; overflow-wrap: anywhere; }}
 </head>
 <body>
 {svg}
-<p>Point at a marker to see how it was made; a click keeps it open, another one closes it.</p>
+<p>Point at a marker to see its configuration. A click keeps the card open; another click closes it.</p>
 <div id="card" role="status"></div>
 <script type="application/json" id="points">{points}</script>
 <script>

@@ -1,4 +1,4 @@
-"""Names beside markers, where they cover as little as possible."""
+"""Labels beside markers, placed to cover as little as possible."""
 
 import math
 
@@ -17,16 +17,8 @@ SPOTS = [(7 * across, 5 * distance * up) for distance in (1, 2, 3, 5, 7) for acr
 
 def add_name(axes: Axes, text: str, x: float, y: float, colour: str, size: float) -> None:
     """A name beside a point; `place_names` finds its place."""
-    axes.annotate(
-        readable(text),
-        (x, y),
-        (6, 4),
-        textcoords="offset points",
-        fontsize=size,
-        color=colour,
-        zorder=6,
-        parse_math=False,
-    )
+    label = axes.annotate(readable(text), (x, y), (6, 4), textcoords="offset points", parse_math=False)
+    label.set(fontsize=size, color=colour, zorder=6)
 
 
 def place_names(axes: Axes) -> None:

@@ -10,11 +10,11 @@ from nerf_lightning.chart.setting import Setting, setting_of
 from nerf_lightning.runs.index import Run, flat
 
 ELSEWHERE = ("callbacks", "logger", "resume", "name", "method", "recipe", "threads", "device")
-"""Options that do not change what is trained, or that are told by others."""
+"""Options that do not change what is trained, or that repeat others."""
 PLACES = ("seed", "path", "folder", "url", "download", "accelerator")
-"""Last parts of options that tell runs of one configuration apart, or that the setting tells."""
+"""Last parts of options that differ between runs of one configuration, or belong to the setting."""
 MOST, MOST_DB = 1e15, 1e3
-"""Figures as large as these are none: bytes or seconds, and dB."""
+"""Larger figures are nonsense: bytes or seconds, and dB."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ NAMED: dict[tuple[float, ...], str] = {(0.0, 0.0, 0.0): "black background", (1.0
 
 @dataclass(frozen=True)
 class Setting:
-    """Scene, resolution, split, background and machine of a run, in words where they are only told."""
+    """Scene, resolution, split, background and machine of a run, in words if they are only shown."""
 
     scene: str
     fingerprint: str

@@ -58,7 +58,7 @@ def write_csv(path: Path, comparisons: Sequence[Comparison], left_out: Sequence[
 
 
 def print_tables(comparisons: Sequence[Comparison], troubles: Sequence[str]) -> None:
-    """The same on the terminal, a table for each setting, with what is said about it."""
+    """The same on the terminal: a table for each setting, with its advice and warnings."""
     console = Console(highlight=False)
     for one in comparisons:
         table = Table(title=escape(one.setting.words()), box=None, caption=CAPTION)

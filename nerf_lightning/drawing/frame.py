@@ -17,7 +17,7 @@ from nerf_lightning.utils.evenly import evenly
 
 CHANNELS = ("rgb", "depth", "opacity")
 LOOKS, LOOK_SIDE = 6, 64
-"""Views, and pixels along their longer side, that the range of depths is told from."""
+"""Views, and pixels along their longer side, from which the range of depths is found."""
 BLACK = (0.0, 0.0, 0.0)
 ERROR_TIMES = 4
 """By how much errors are magnified."""
@@ -75,7 +75,7 @@ def colours(rendered: Rendered, channel: str, style: Style) -> Float[Tensor, "R 
 
 
 def depth_colours(depth: Float[Tensor, "R"], depths: tuple[float, float]) -> Float[Tensor, "R 3"]:
-    """Near bright, far dark, by a scale that is even to the eye."""
+    """Near bright, far dark, on a perceptually uniform scale."""
     painted = near_bright(depth.cpu().numpy()[:, None], *depths)[:, 0]
     return torch.from_numpy(painted.copy()).to(depth.device).float() / 255
 

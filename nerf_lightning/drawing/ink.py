@@ -1,4 +1,4 @@
-"""How the report draws: colours, letters and scales that all its pictures share."""
+"""Colours, letters and scales that all figures share."""
 
 import functools
 
@@ -12,7 +12,7 @@ from matplotlib.font_manager import findfont, get_font
 BLUE, ORANGE, GREEN, SKY, VERMILLION, MAUVE, GREY = (
     "#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#6E6E6E",
 )  # fmt: skip
-"""Told apart by every kind of eye (Okabe and Ito 2008); what was left out is vermillion."""
+"""Safe for colour-blind readers (Okabe and Ito 2008); what was left out is vermillion."""
 FONT = "DejaVu Sans"
 """Comes with matplotlib."""
 DPI = 100

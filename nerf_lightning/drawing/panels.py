@@ -23,7 +23,7 @@ def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[ndarray, "*shape"]:
 
 
 def near_bright(depth: Float[ndarray, "H W"], low: float, high: float) -> UInt8[ndarray, "H W 3"]:
-    """Depths on a scale that is even to the eye: bright at `low` and nearer, dark at `high` and farther."""
+    """Depths on a perceptually uniform scale: bright at `low` and nearer, dark at `high` and farther."""
     nearness = 1 - (depth - low) / max(high - low, 1e-9)
     return cv2.applyColorMap((nearness.clip(0, 1) * 255).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1]
 
@@ -63,7 +63,7 @@ def result_panel(result: ViewResult, caption: str) -> UInt8[ndarray, "H2 W2 3"]:
 
 
 def narrowed(image: UInt8[ndarray, "H W 3"], width: int) -> UInt8[ndarray, "h w 3"]:
-    """Averaged to at most so many pixels across."""
+    """Averaged down to at most `width` pixels across."""
     if image.shape[1] <= width:
         return image
     return area_resize(image, width, max(1, round(image.shape[0] * width / image.shape[1])))

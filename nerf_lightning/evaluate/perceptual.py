@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018), where the weights it needs lie on this machine already: nothing is ever fetched."""
+"""LPIPS (Zhang et al. 2018), if its weights are on this machine already: nothing is ever downloaded."""
 
 import importlib.util
 from collections.abc import Callable
@@ -25,7 +25,7 @@ def perceptual_distance(width: int, height: int) -> tuple[Distance | None, str]:
     """LPIPS with AlexNet of two pictures in [0, 1]: 0 for the same, smaller is better.
 
     Returns:
-        It, or None and the reason why it cannot be told.
+        It, or None and the reason why it cannot be computed.
     """
     if min(width, height) < SMALLEST:
         return None, f"photos of less than {SMALLEST} pixels"

@@ -41,7 +41,7 @@ def evaluate(run: str, output: str | None, worst: int, device: str, photos: str 
         run: its folder, or its compact file.
         output: folder for the results; None puts them into `evaluation/` beside the run.
         worst: how many of the worst views are pictured.
-        device: that renders, see `the_device`.
+        device: see `the_device`.
         photos: another file or folder of photos.
 
     Raises:

@@ -34,7 +34,7 @@ class Shape:
 
 @torch.no_grad()
 def colours_at(system: NeRF3D, places: Float[Tensor, "N 3"], outwards: Float[Tensor, "N 3"]) -> UInt8[ndarray, "N 3"]:
-    """What a field shows at some places to one who looks at them straight, world frame."""
+    """The colours of a field at some places, seen against their outward directions, world frame."""
     together = PLACES * system.chunk
     parts = [
         system.field(some.to(system.device), -away.to(system.device))[1].cpu()
@@ -52,7 +52,7 @@ def coloured_mesh(
     surface = find_surface(volume, lit_cells(run.system, volume, cameras), threshold)
     normals = torch.from_numpy(surface.normals)
     places = torch.from_numpy(surface.vertices)
-    # Half a cell inside: at the very surface a colour may still be what nobody saw, in the air.
+    # Half a cell inside: just outside the surface no photo constrains the colour.
     rgb = colours_at(run.system, places - normals * (volume.cell / 2), normals)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=rgb, process=False)
     mesh.apply_transform(run.to_source.double().numpy())
@@ -102,7 +102,7 @@ def voxels_file(run: SceneRun, volume: Volume) -> Shape:
         torch.gradient(volume.opacity) if min(solid.shape) > 1 else [torch.zeros(solid.shape)] * 3, -1
     )
     outwards = -torch.nn.functional.normalize(gradient[solid], dim=-1)
-    outwards[outwards.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0])  # where density is even, any side would do
+    outwards[outwards.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0])  # where density is even, any direction will do
     rgb = np.zeros((*solid.shape, 3), np.uint8)
     rgb[solid.numpy()] = colours_at(run.system, volume.places(index.float()), outwards)
     to_world = torch.eye(4, dtype=torch.float64)

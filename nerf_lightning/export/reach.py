@@ -1,4 +1,4 @@
-"""Where the light of some cameras ends up: all that a scene seen from around them can show."""
+"""Which cells some cameras see: all that rendering from around them needs."""
 
 import math
 
@@ -12,7 +12,7 @@ from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D, System
 
 NOTHING = 1e-3
-"""Opacity of a step below which there is nothing in it."""
+"""Opacity below which a step is empty."""
 FINEST = 8
 """Most rays along a pixel's side."""
 
@@ -29,7 +29,7 @@ def occupied_cells(system: System) -> Cells | None:
 
 @torch.no_grad()
 def seen_cells(system: System, cameras: Cameras) -> Cells | None:
-    """Of the occupied cells those in which light towards the cameras comes from anything, and their neighbours.
+    """The occupied cells that are visible to the cameras, and their neighbours.
 
     Rays are as close to each other at the content as cells are.
     """

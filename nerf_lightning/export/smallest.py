@@ -19,14 +19,14 @@ from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.progress import tracked
 
 MOST_VIEWS = 60
-"""Training views whose light is followed to learn which cells matter."""
+"""Training views whose rays show which cells matter."""
 PRECISIONS = ("byte", "half")
 """Smallest first."""
 
 
 @dataclass(frozen=True)
 class Compact:
-    """A compact file, and what it costs."""
+    """A compact file, and its quality."""
 
     content: bytes
     precision: str
@@ -70,7 +70,7 @@ def smallest(
     most_loss: float,
     precision: str | None = None,
 ) -> Compact:
-    """Codes a system in the fewest bytes that lose no more than allowed: what its photos' cameras see, or all there is.
+    """Encodes a system in the fewest bytes within the allowed loss: what its photos' cameras see, or everything.
 
     Args:
         system: trained.

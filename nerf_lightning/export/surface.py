@@ -1,4 +1,4 @@
-"""From densities to a surface: where light ends, without what floats and without what nobody can see inside a solid."""
+"""From densities to a surface, without floating pieces and without what is hidden inside a solid."""
 
 from dataclasses import dataclass
 
@@ -16,13 +16,13 @@ from nerf_lightning.utils.progress import tracked
 
 BINS = 128
 EMPTY = 0.02
-"""Opacity of a cell below which it is nothing at all, and says nothing about where to draw the line."""
+"""Opacity of a cell below which it is empty, and left out when the threshold is chosen."""
 FAR = 1e9
-"""Distance at which a ray ends that meets nothing."""
+"""Where a ray ends that meets nothing."""
 LOOKED = 300
-"""Pixels of a view's longer side, at most, when it is rendered to see what lies in the light."""
+"""Most pixels along a view's longer side when visibility is rendered."""
 FLOATER = 0.01
-"""A piece with fewer cells than this share of the largest one's floats, and is left out."""
+"""A piece with fewer cells than this share of the largest is left out."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def solid_from(values: Float[ndarray, "N"]) -> float:
     """The value from which on something is solid: the upper threshold that parts values into three groups, haze, blurred
     sides and solids, of the least variance within (Otsu 1979, section IV); 0.5 for no values at all.
 
-    Two groups would do for a clean field. Where there is much haze, the line between them lies within it.
+    Two groups would do for a clean field. With much haze, the threshold between two groups lies within the haze.
     """
     from skimage.filters import threshold_multiotsu
 
@@ -62,12 +62,12 @@ def solid_from(values: Float[ndarray, "N"]) -> float:
 
 @torch.no_grad()
 def lit_cells(system: NeRF3D, volume: Volume, cameras: Cameras) -> Bool[ndarray, "X Y Z"]:
-    """Cells that at least one view has in sight, up to the surface it renders there; all others are inside something.
+    """Cells that at least one view sees, up to the surface it renders there; all others are inside something.
 
     Args:
         system: the field that the volume was sampled from.
-        volume: whose cells are asked about.
-        cameras: views from where the field is known.
+        volume: whose cells are tested.
+        cameras: the views it was trained from.
     """
     places = volume.centres.view(-1, 3)
     dark = torch.arange(len(places))
@@ -93,8 +93,8 @@ def lit_cells(system: NeRF3D, volume: Volume, cameras: Cameras) -> Bool[ndarray,
 
 
 def box_around(mask: Bool[ndarray, "X Y Z"]) -> Bool[ndarray, "X Y Z"]:
-    """The cells of the smallest box that holds all marked ones: what is in the dark beyond it, such as under a floor, is not
-    inside anything."""
+    """The cells of the smallest box that holds all marked ones: what is unlit beyond it, such as below a floor, is not inside
+    anything."""
     box = np.zeros(mask.shape, bool)
     marked = np.argwhere(mask)
     if len(marked):
@@ -107,7 +107,7 @@ def find_surface(volume: Volume, lit: Bool[ndarray, "X Y Z"], threshold: float |
 
     Args:
         volume: densities.
-        lit: see `lit_cells`; what is not counts as solid, be it empty or a tangle.
+        lit: see `lit_cells`; cells that are not lit count as solid.
         threshold: opacity of a cell at the surface, in (0, 1); None finds it from the histogram of cells in the light.
 
     Raises:

@@ -29,11 +29,11 @@ NAMES = {
     ("glb", "mesh"): "mesh.glb",
     ("ply", "points"): "points.ply",
 }
-"""Where the output goes if nobody says, by format and content."""
+"""Default names of the output, by format and content."""
 
 
 def export(options: ExportOptions) -> None:
-    """Writes a run's last state in another format, and says what became of it.
+    """Writes a run's last state in another format, and prints what was written.
 
     Raises:
         InputError: where the device, an option or the run is no good, photos are missing, or more would be lost than allowed.
@@ -87,7 +87,7 @@ def shaped(options: ExportOptions, source: Path, device: torch.device) -> tuple[
 
 
 def views_of(run: SceneRun, photos: str | None) -> Cameras:
-    """From where a run's field is known: its photos' cameras, or where these are gone its orbit and what lies above that."""
+    """Views that the field was trained from: its photos' cameras; without photos, its orbit and a spiral above it."""
     try:
         data = data_again(run.cfg, run.scene, photos)
     except InputError as error:

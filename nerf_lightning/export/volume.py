@@ -15,11 +15,11 @@ from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.progress import tracked
 
 COARSEST, FINEST = 64, 256
-"""Cells along the longest side, where nobody says how many."""
+"""Limits for the cells along the longest side, if the user gives no number."""
 PIXELS = 1.25
-"""Width of a cell in pixels: at one pixel what a surface has too much is noise."""
+"""Width of a cell in pixels: cells of one pixel add only noise to the surface."""
 PLACES = 4
-"""So many places are asked together for each sample that is rendered together: bounds the memory of one call."""
+"""Places evaluated in one call, for each sample rendered in one: bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def region_of(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tensor
 
 
 def cells_across(system: NeRF3D, region: Float[Tensor, "2 3"] | None = None) -> int:
-    """Cells along a region's longest side, somewhat larger than what a pixel of the photos shows, within bounds."""
+    """Cells along a region's longest side: somewhat larger than a pixel of the photos, within limits."""
     bounds = system.field.bounds
     low, high = bounds.aabb if region is None else region
     across = float((high - low).max()) / (PIXELS * bounds.pixel) if bounds.pixel else math.inf
@@ -80,7 +80,7 @@ def cells_across(system: NeRF3D, region: Float[Tensor, "2 3"] | None = None) -> 
 
 @torch.no_grad()
 def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] | None = None) -> Volume:
-    """Asks a field's density all over a region, where its sampler would look; elsewhere there is nothing.
+    """Samples a field's density over a region, in the cells its sampler marks as occupied; it is zero elsewhere.
 
     Args:
         resolution: cells along the region's longest side.
@@ -91,7 +91,7 @@ def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] 
     sides = corners[1] - corners[0]
     cell = float(sides.max()) / resolution
     shape = [max(1, math.ceil(float(side) / cell - 1e-6)) for side in sides]
-    # Cubic cells may stand over the region: evenly on both sides.
+    # Cubic cells may reach beyond the region: equally on both sides.
     low = corners.mean(0) - torch.tensor(shape, device=system.device) * (cell / 2)
     volume = Volume(torch.zeros(shape), low.cpu(), cell)
     occupied = occupied_cells(system)
@@ -127,7 +127,7 @@ def cropped(volume: Volume, box: Float[Tensor, "2 3"], to_source: Float[Tensor, 
 
 
 def volume_of(run: SceneRun, resolution: int | None = None, box: Float[Tensor, "2 3"] | None = None) -> Volume:
-    """A run's field, or what of it lies in a box, as cells.
+    """A run's field, or the part in a box, as cells.
 
     Args:
         resolution: cells along the longest side of what is asked; None takes `cells_across`.

@@ -1,4 +1,4 @@
-"""All runs of a sweep in one picture: what each made, how good it is, and how it got there."""
+"""All runs of a sweep in one picture: the last render of each, its PSNR, and its curve."""
 
 import math
 import textwrap
@@ -21,7 +21,7 @@ from nerf_lightning.runs.index import FINISHED, Run, varied
 MOST = 60
 """Pictures in a figure; of more runs the best are shown."""
 WIDEST = 10
-"""Columns of a table that can still be looked at."""
+"""Columns of a table that stay readable."""
 SIDE = 320
 """Pixels of a picture's longer side."""
 CELL = 2.3
@@ -40,8 +40,8 @@ def write_contact_figure(root: Path, runs: Sequence[Run], output: Path | None = 
 def contact_figure(runs: Sequence[Run], title: str) -> Figure:
     """A contact sheet with the PSNR under each picture, beside final quality by option and all curves.
 
-    Two options that vary span a table, one a row; more are told under each picture. Runs that collapsed or failed have a
-    frame, and their diagnosis stands below.
+    Two options that vary give rows and columns; more are written under each picture. Runs that collapsed or failed are framed
+    in red, and their diagnosis is written below.
     """
     keys = varied(runs)
     shown = list(runs)
@@ -78,7 +78,7 @@ def name_of(key: str) -> str:
 
 
 def label(run: Run, keys: Sequence[str]) -> str:
-    """What sets a run apart."""
+    """The options by which a run differs from the others."""
     return ", ".join(f"{name_of(key)} {_text(run.option(key))}" for key in keys) or run.folder.name
 
 
@@ -97,12 +97,12 @@ def _rank(value: Any) -> tuple[int, float, str]:
 
 
 def _ordered(runs: Sequence[Run], keys: Sequence[str]) -> list[Run]:
-    """Runs by what their options were set to."""
+    """Runs sorted by the values of some options."""
     return sorted(runs, key=lambda run: [_rank(run.option(key)) for key in keys])
 
 
 def _values(runs: Sequence[Run], key: str) -> list[Any]:
-    """What an option was set to, in order and each once (lists as they are written)."""
+    """The values of an option, sorted, each once (lists as they are written)."""
     return sorted({_text(run.option(key)): run.option(key) for run in runs}.values(), key=_rank)
 
 

@@ -1,4 +1,4 @@
-"""Films: frames as they come, kept on disk until the film is whole, so that an interrupted one goes on."""
+"""Films: frames are kept on disk until the film is written, so that an interrupted one can go on."""
 
 import json
 import shutil
@@ -19,10 +19,10 @@ from nerf_lightning.utils.progress import tracked
 
 Picture = UInt8[ndarray, "H W C"]
 PLAN = "frames.json"
-"""Beside the frames: what they show, so that frames of something else are never taken for them."""
+"""Beside the frames: what they show, so that frames of something else are never reused."""
 FILMS = (".gif", ".mp4", ".webp")
 OPAQUE = (".gif", ".mp4")
-"""Kinds that know no partial transparency."""
+"""Formats without partial transparency."""
 QUALITY = 90
 """Of WebP, out of 100."""
 CRF = 18
@@ -77,7 +77,7 @@ def make_film(plan: dict[str, Any], draw: Callable[[int], Picture], count: int, 
 
 
 def prepare(folder: Path, plan: dict[str, Any], own: bool) -> None:
-    """Makes a folder ready for the frames of a plan; those of another plan are thrown away where the folder is our own."""
+    """Prepares a folder for the frames of a plan; frames of another plan are deleted if the folder is our own."""
     try:
         found = json.loads((folder / PLAN).read_text(encoding="utf-8"))
     except (OSError, ValueError):

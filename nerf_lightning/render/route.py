@@ -27,13 +27,13 @@ class Route:
 
     cameras: Cameras
     views: list[int]
-    """Which of the photos these are, for captions; which of the path's, where there are none."""
+    """Their numbers among the photos, for captions; without photos, among the path's views."""
     photos: Views | None = None
     """What the views should show, where that is known."""
 
 
 def find_route(path: str, frames: int | None, orbit: Cameras, scene: Scene | None) -> Route:
-    """The views that a word, or a file, stands for.
+    """The views that a name or a file stands for.
 
     Args:
         path: "orbit", "spiral", "test" (held-out photos), "train" (training photos), or a JSON file.

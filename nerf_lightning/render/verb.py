@@ -24,16 +24,18 @@ from nerf_lightning.utils.machine import device_in_words
 
 
 def render(options: RenderOptions) -> None:
-    """Renders, and says what came of it.
+    """Renders, and prints what was written.
 
     Raises:
-        InputError: where the device, the run, an option, or the place for the film is no good.
+        InputError: for a wrong device, run, option or output.
     """
     began = time.perf_counter()
     device = the_device(options.device)
     source = Path(options.run).expanduser()
     channels = the_channels(options.channels)
-    output = the_output(options, source)
+    output = beside(source) / f"render_{Path(options.path).stem}.webp"
+    if options.output is not None:
+        output = Path(options.output).expanduser()
     check_output(output, options.background == "transparent")
     found = open_scene_run(source, device)
     route = the_route(options, found)
@@ -42,17 +44,15 @@ def render(options: RenderOptions) -> None:
     style = Style(channels, background, depths)
     plan = the_plan(options, found.system, route, style)
 
-    draw_one = side_by_side if route.photos is None else beside_truth
-    there = make_film(
-        plan, lambda index: draw_one(found.system, route, index, style), len(route.cameras), output, options.fps
-    )
+    def frame(index: int) -> Picture:
+        return (side_by_side if route.photos is None else beside_truth)(found.system, route, index, style)
+
+    there = make_film(plan, frame, len(route.cameras), output, options.fps)
     synchronize(device)
     seconds = time.perf_counter() - began
-    size = f"{route.cameras.width} x {route.cameras.height}"
+    frames = f"{len(route.cameras)} frames of {route.cameras.width} x {route.cameras.height} pixels"
     before = f", {there} of them there already" if there else ""
-    print(
-        f"{output}: {len(route.cameras)} frames of {size} pixels in {seconds:.1f} s on {device_in_words(device)}{before}"
-    )
+    print(f"{output}: {frames} in {seconds:.1f} s on {device_in_words(device)}{before}")
 
 
 def the_channels(given: str | list[str]) -> tuple[str, ...]:
@@ -69,20 +69,12 @@ def the_channels(given: str | list[str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def the_output(options: RenderOptions, source: Path) -> Path:
-    """Where the film goes."""
-    if options.output is not None:
-        return Path(options.output).expanduser()
-    return beside(source) / f"render_{Path(options.path).stem}.webp"
-
-
 def the_route(options: RenderOptions, found: SceneRun) -> Route:
     """The views to show, at the size asked for."""
     scene = None
     if options.path in WITH_PHOTOS:
         if options.scale != 1 or options.background == "transparent":
-            key = "scale" if options.scale != 1 else "background"
-            value = options.scale if options.scale != 1 else options.background
+            key, value = ("scale", options.scale) if options.scale != 1 else ("background", options.background)
             raise InputError("config", key, str(value), f"scale=1 and a colour beside photos (path={options.path})")
         data = data_again(found.cfg, found.scene, options.photos)
         assert isinstance(data, RayDataModule)  # of a scene's run
@@ -124,7 +116,7 @@ def the_background(options: RenderOptions, system: NeRF3D, route: Route) -> tupl
 
 
 def the_plan(options: RenderOptions, system: NeRF3D, route: Route, style: Style) -> dict[str, Any]:
-    """All that frames depend on, as plain values."""
+    """Everything that the frames depend on, as plain values."""
     digest = hashlib.sha256()
     for tensor in (*system.state_dict().values(), route.cameras.K, route.cameras.c2w):
         digest.update(tensor.cpu().contiguous().numpy().tobytes())

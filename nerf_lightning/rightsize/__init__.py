@@ -1,1 +1,1 @@
-"""The smallest model that is good enough: a ladder of sizes, climbed while it pays; trainings in full confirm the choice."""
+"""The smallest model that is good enough: a ladder of sizes, climbed while it pays; full trainings confirm the choice."""

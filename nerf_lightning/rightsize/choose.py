@@ -9,10 +9,10 @@ from nerf_lightning.errors import InputError
 SHARE = 3.0
 """A rung is worth climbing to where it gains a `SHARE`th of what the choice may be below the best, for twice the bytes."""
 IDLE = 2
-"""Rungs in a row that are not worth it, after which climbing stops: one may be chance."""
+"""Rungs in a row that are not worth it, after which climbing stops: one may be random."""
 
 MORE = 1.0
-"""dB that a whole training is taken to bring beyond the climb's share of one: 2 to 15 were measured, in runs of 10 to 140 s."""
+"""dB that a full training is assumed to gain over the climb's shorter one: 2 to 15 were measured, in runs of 10 to 140 s."""
 CLOSE = 0.5
 """dB that an expectation may be wrong by."""
 
@@ -42,7 +42,7 @@ class Measured:
 
 
 def worth(before: Measured, after: Measured, slack: float, noise: float) -> bool:
-    """Whether the step from one rung to the next gains enough for its bytes, and more than chance.
+    """Whether the step from one rung to the next gains enough for its bytes, and more than seeds differ.
 
     Args:
         slack: dB that the choice may be below the best.

@@ -1,7 +1,7 @@
 """Climbing a ladder: one training that starts small and grows, keeping what was learned."""
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import stdev
@@ -27,13 +27,13 @@ Data = RayDataModule | PixelDataModule
 SEARCH = 0.75
 """Share of the budget that climbing the whole ladder takes."""
 VIEWS = 8
-"""Held-out views that a rung is judged by, and training views that say what its file must hold."""
+"""Held-out views that measure a rung, and training views that decide what its file must hold."""
 EXTRA_SEEDS = 2
-"""Further trainings of the smallest rung, from which the spread over seeds is told."""
+"""Further trainings of the smallest rung, to measure the spread over seeds."""
 AS_GOOD = 0.05
-"""dB by which a sampler may be worse than the best, of one and the same field."""
+"""dB by which a sampler may be worse than the best, on the same field."""
 LOOKS = 4
-"""Looks at every cell that a sampler needs to know a field."""
+"""Updates after which a sampler knows a field."""
 BARE = ("guard",)
 """Callbacks of a rung's training."""
 
@@ -50,7 +50,7 @@ class Rung(Measured):
 
 
 def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
-    """A copy of a configuration with other options in a group; unknown ones are told when the group is built."""
+    """A copy of a configuration with other options in a group; unknown ones raise when the group is built."""
     changed = copy.deepcopy(cfg)
     for key, value in options.items():
         OmegaConf.update(changed, f"{group}.{key}", value, force_add=True)
@@ -102,7 +102,7 @@ def quality(system: System, data: Data) -> float:
 
 
 def compact_bytes(cfg: DictConfig, system: System, data: Data) -> int:
-    """Size of the compact file of a system, about: as few views tell what it must hold."""
+    """Approximate size of a system's compact file: only a few views decide what it must hold."""
     seen = seen_cells(system, some_cameras(data, VIEWS)) if isinstance(data, RayDataModule) else None
     part = confined_to(system, seen)
     return len(encode(part, "byte", plain_config(cfg), scene_content(data)))
@@ -122,7 +122,7 @@ def climb(cfg: DictConfig, data: Data, rungs: list[Options], folder: Path) -> It
 
 
 def spread(cfg: DictConfig, data: Data, rungs: list[Options], first: Rung, folder: Path) -> tuple[float, float]:
-    """How far seeds differ: the standard deviation, dB, of the smallest rung over a few of them.
+    """The standard deviation of the smallest rung's PSNR over a few seeds, dB.
 
     Returns:
         It, and the seconds of training it took.
@@ -147,17 +147,14 @@ def settle(system: NeRF3D) -> None:
         )
 
 
-def coarsest_sampler(
-    cfg: DictConfig, data: Data, system: System, samplers: list[Options], told: Callable[[str], None]
-) -> Options:
-    """The coarsest of some samplers with which a trained field looks as good as with the finest.
+def coarsest_sampler(cfg: DictConfig, data: Data, system: System, samplers: list[Options]) -> Options:
+    """The coarsest of some samplers with which a trained field renders as well as with the best, and prints a line for each.
 
     Args:
         cfg: with whose sampler the field was trained.
-        data: to judge by.
+        data: whose held-out views measure it.
         system: the field.
         samplers: options, coarsest first.
-        told: gets a line for each.
     """
     if not samplers or not isinstance(system, NeRF3D) or not isinstance(data, RayDataModule):
         return {}
@@ -170,6 +167,6 @@ def coarsest_sampler(
         probe.sampler.look_through(data.scene.train.cameras)
         settle(probe)
         scores.append(quality(probe.eval(), data))
-        told(f"sampler {options}: {scores[-1]:.2f} dB")
+        print(f"sampler {options}: {scores[-1]:.2f} dB", flush=True)
     enough = max(scores) - AS_GOOD
     return next(options for options, score in zip(samplers, scores, strict=True) if score >= enough)

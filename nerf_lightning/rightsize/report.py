@@ -118,25 +118,10 @@ def chart(found: Found) -> Figure:
     bend = knee(grown)
     axes.plot(sizes[bend], grown[bend].psnr, "D", color=BLUE, ms=9, label=f"knee: rung {bend}")
     whole = found.full.values()
-    axes.plot(
-        [one.size / 1000 for one in whole],
-        [one.psnr for one in whole],
-        "s",
-        color=ORANGE,
-        ms=8,
-        label="trained in full",
-    )
-    chosen = found.full[found.choice]
-    axes.plot(
-        chosen.size / 1000,
-        chosen.psnr,
-        "o",
-        ms=19,
-        mfc="none",
-        mec=VERMILLION,
-        mew=2,
-        label=f"chosen: rung {found.choice}",
-    )
+    label = "trained in full"
+    axes.plot([one.size / 1000 for one in whole], [one.psnr for one in whole], "s", color=ORANGE, ms=8, label=label)
+    chosen, label = found.full[found.choice], f"chosen: rung {found.choice}"
+    axes.plot(chosen.size / 1000, chosen.psnr, "o", ms=19, mfc="none", mec=VERMILLION, mew=2, label=label)
     enough = found.target.psnr
     if enough is None:
         enough = max(one.psnr for one in whole) - (found.target.within_db or 0.0)

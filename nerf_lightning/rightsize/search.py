@@ -34,9 +34,9 @@ from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.quiet import quiet
 
 MOST_FULL = 2
-"""Trainings in full: the candidate, and what it is held against."""
+"""Trainings in full: the candidate, and the one it is compared with."""
 COMPACT_LOSS = 0.1
-"""dB that the small file may lose."""
+"""dB that the compact file may lose."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Full(Measured):
 
 @dataclass(frozen=True)
 class Found:
-    """What a search came to."""
+    """The result of a search."""
 
     target: Target
     ladder: Ladder
@@ -68,7 +68,7 @@ class Found:
     wall_seconds: float
     compact: Compact
     device: torch.device
-    """Where all of it was done."""
+    """Where all of it was computed."""
 
 
 def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Found:
@@ -103,7 +103,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     first, best = candidate(rungs, target), best_of(rungs)
     print(f"climbed to rung {len(rungs) - 1}: {why}; rung {first} seems enough", flush=True)
     model = set_options(cfg, "model", rungs[first].options)
-    sampler = coarsest_sampler(model, data, rungs[first].system, ladder.samplers, lambda line: print(line, flush=True))
+    sampler = coarsest_sampler(model, data, rungs[first].system, ladder.samplers)
     full: dict[int, Full] = {}
     while True:
         tried = {index: one.psnr for index, one in full.items()}

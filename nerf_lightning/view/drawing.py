@@ -39,7 +39,7 @@ class RayFigure:
     """N rays, and M samples on those that meet the bounds; world frame."""
 
     approach: Float[np.ndarray, "N 2 3"]
-    """From each camera to where the ray enters the bounds; a stump for rays that miss them."""
+    """From each camera to where the ray enters the bounds; a short piece of rays that miss them."""
     inside: Float[np.ndarray, "K 2 3"]
     """From near to far, for the K rays that meet the bounds."""
     samples: Float[np.ndarray, "M 3"]
@@ -96,7 +96,7 @@ def random_rays(cameras: Cameras, view: Int[Tensor, "R"], generator: Generator) 
 
 
 def ray_figure(rays: Rays, bounds: Bounds, samples: int, stump: float, generator: Generator | None) -> RayFigure:
-    """Rays and where the uniform sampler asks along them.
+    """Rays and the uniform sampler's positions along them.
 
     Args:
         rays: in the bounds' frame.
@@ -122,7 +122,7 @@ def ray_figure(rays: Rays, bounds: Bounds, samples: int, stump: float, generator
 
 
 def _no_density(positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-    """For samplers that never look at the field."""
+    """Stands in for a field: the uniform sampler never asks for density."""
     raise RuntimeError("a uniform sampler asked for density")
 
 
@@ -134,7 +134,7 @@ def box_edges(aabb: Float[Tensor, "2 3"]) -> Float[np.ndarray, "12 2 3"]:
 
 
 def path_segments(cameras: Cameras) -> Float[np.ndarray, "N 2 3"]:
-    """The line from view to view, closed where the last is about as near to the first as to the one before."""
+    """The line from view to view, closed if the last view is about as near to the first as to the one before it."""
     centres = cameras.centres.numpy()
     segments = np.stack([centres, np.roll(centres, -1, axis=0)], axis=1)
     lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
@@ -143,12 +143,12 @@ def path_segments(cameras: Cameras) -> Float[np.ndarray, "N 2 3"]:
 
 
 def scene_scale(scene: Scene) -> float:
-    """The cameras' distance to what they look at, in the scene's unit: what sizes on the page derive from."""
+    """The cameras' distance to what they look at, in the scene's unit."""
     return viewing_distance(scene.train.cameras.c2w, focus_point(scene.train.cameras.c2w))
 
 
 def overview(scene: Scene) -> Viewpoint:
-    """From where cameras and bounds are all in sight: behind the orbit's start, upright as the orbit's pictures are."""
+    """A view of all cameras and the bounds: from behind the orbit's start, upright as the orbit's pictures."""
     focus = focus_point(scene.train.cameras.c2w)
     up = torch.nn.functional.normalize(-scene.orbit.c2w[:, :3, 1].mean(0), dim=0)
     if float(up.norm()) < 0.5:  # a path that rolls over: no direction is up
@@ -167,7 +167,7 @@ def overview(scene: Scene) -> Viewpoint:
 
 
 def through(frustum: Frustum, distance: float, up: Float[np.ndarray, "3"]) -> Viewpoint:
-    """From where the photo was taken, turning about the point `distance` ahead, upright as the photo is."""
+    """The photo's own view, turning about the point `distance` ahead, upright as the photo."""
     right, down, ahead, position = frustum.c2w[:3].T
     level = up - (up @ right) * right  # the scene's up, rolled with the photo, keeps turning level
     if -level @ down < 0.05:

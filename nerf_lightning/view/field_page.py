@@ -1,4 +1,4 @@
-"""A trained field as a page in the browser: what it looks like from where the mouse goes, with the cameras that saw it."""
+"""A trained field as a page in the browser: turned with the mouse, with the cameras that saw it."""
 
 import math
 import threading
@@ -20,16 +20,16 @@ from nerf_lightning.view.page import Page
 from nerf_lightning.view.painter import Painter, Wish
 
 FIRST_SECONDS = 0.08
-"""That the first picture after a movement may take to render: with coding and transport the answer comes within 0.2 s."""
+"""Time to render the first picture after a movement: with encoding and transport it arrives within 0.2 s."""
 FINER = 2
-"""By how much each further picture of a view at rest is finer along each side."""
+"""Times as many pixels along each side in each further picture, while the camera rests."""
 BOX, INSIDE, SAMPLES = (110, 110, 110), (44, 160, 44), (214, 39, 40)
 QUALITY = 80
 """Of the JPEG that is sent, out of 100."""
 
 
 class Visitor:
-    """A browser that has the page open: what it wants to see, and how fine it has it.
+    """A browser that has the page open, and what it has been sent.
 
     Args:
         client: Viser's.
@@ -40,22 +40,22 @@ class Visitor:
         self.version = 0
         """Goes up whenever what it wants changes."""
         self.side = 0
-        """Pixels along the longer side of the picture it has of that; 0 for none."""
+        """Pixels along the longer side of the picture it has of this version; 0 for none."""
         self.painted = 0.0
-        """When it got that, seconds of the monotonic clock."""
+        """When it got its last picture, seconds of the monotonic clock."""
 
 
 class FieldPage(Page):
-    """Serves a field. Pictures are rendered by whoever calls `paint`; `run` does so for ever.
+    """Serves a field. `paint` renders one picture; `run` calls it for ever.
 
     Args:
         name: the page's title.
         system: what is shown.
-        orbit: from where it is looked at first.
-        scene: with photos, whose cameras can then be shown; None does without.
+        orbit: its first view is the page's.
+        scene: the photos, whose cameras can then be shown; None for none.
         host, port: see `Page`.
         photo_side: longest side of the photos on the frusta, pixels.
-        most: pixels along the longer side of a picture of a view at rest.
+        most: pixels along the longer side of the finest picture.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class FieldPage(Page):
             self.visitors.pop(client.client_id, None)
 
     def _want(self, *visitors: Visitor) -> None:
-        """What some visitors see is out of date; all of them where none is named."""
+        """Marks what some visitors see as out of date; all visitors if none is named."""
         with self.changed:
             for visitor in visitors or tuple(self.visitors.values()):
                 visitor.version += 1
@@ -110,17 +110,17 @@ class FieldPage(Page):
     def _add_controls(self, most: int) -> None:
         gui = self.server.gui
         gui.add_markdown(
-            "Drag to turn, right drag to move, scroll to come nearer. Click into the picture for a ray's samples."
+            "Drag to rotate, right-drag to move, scroll to zoom. Click into the picture to see a ray's samples."
         )
-        gui.add_button("back to the start").on_click(self.go_home)
+        gui.add_button("reset view").on_click(self.go_home)
         with gui.add_folder("picture"):
             self.channel = gui.add_dropdown("channel", CHANNELS)
             self.background = gui.add_dropdown("background", tuple(self.backgrounds))
             self.most = gui.add_slider("resolution", 64, 2048, 32, min(max(most, 64), 2048), hint="longer side, pixels")
             most_far = float(f"{3 * self.scale:.2g}")
             step = most_far / 200
-            self.near = gui.add_slider("near", 0.0, most_far, step, 0.0, hint="what is nearer is cut away")
-            self.far = gui.add_slider("far", 0.0, most_far, step, most_far, hint="what is farther is cut away")
+            self.near = gui.add_slider("near", 0.0, most_far, step, 0.0, hint="hide what is nearer")
+            self.far = gui.add_slider("far", 0.0, most_far, step, most_far, hint="hide what is farther")
             for control in (self.channel, self.background, self.most, self.near, self.far):
                 control.on_update(lambda _: self._want())
         with gui.add_folder("show"):
@@ -136,14 +136,14 @@ class FieldPage(Page):
         self.status = gui.add_markdown("")
 
     def click(self, origin: tuple[float, float, float], direction: tuple[float, float, float]) -> None:
-        """Somebody clicked into the picture: the next thing painted is that ray."""
+        """Called on a click into the picture: the next `paint` draws that ray."""
         ahead = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float32), dim=0)
         self.clicked = Rays(torch.tensor(origin, dtype=torch.float32)[None], ahead[None])
         with self.changed:
             self.changed.notify_all()
 
     def draw_ray(self, ray: Rays) -> None:
-        """One ray within the bounds, its samples, and what came of it in words."""
+        """Draws one ray within the bounds and its samples, and prints what was rendered along it."""
         device = self.system.device
         ray = ray.to(device)
         with torch.no_grad():
@@ -161,7 +161,7 @@ class FieldPage(Page):
         self.status.content = f"clicked: {len(samples)} samples, colour {rgb}, opacity {opacity:.2f}, depth {depth:.3f}"
 
     def wish(self, visitor: Visitor) -> Wish:
-        """What a visitor wants to see now."""
+        """The picture that a visitor asks for now."""
         camera = visitor.client.camera
         c2w = np.eye(4)
         c2w[:3, :3] = SO3(camera.wxyz).as_matrix()
@@ -173,7 +173,7 @@ class FieldPage(Page):
         )
 
     def waiting(self) -> Visitor | None:
-        """Whose picture is coarsest, of those who do not have it as fine as they want; None where all have."""
+        """The visitor with the coarsest picture; None if all have the finest they want."""
         with self.changed:
             behind = [one for one in self.visitors.values() if one.version and one.side < self.most.value]
             return min(behind, key=lambda one: (one.side, one.painted), default=None)
@@ -182,7 +182,7 @@ class FieldPage(Page):
         """Renders what is wanted most, once.
 
         Args:
-            seconds: that it may take, where this is the first picture of what somebody wants; finer ones take longer.
+            seconds: that the first picture of a view may take; finer ones take longer.
 
         Returns:
             Whether there was anything to do.
@@ -208,12 +208,12 @@ class FieldPage(Page):
         return True
 
     def again(self) -> None:
-        """Called when the field has changed: everybody gets a new picture."""
+        """Called when the field has changed: all visitors get a new picture."""
         self.painter.forget()
         self._want()
 
     def run(self, ended: Callable[[], bool] = lambda: False) -> None:
-        """Paints whenever somebody wants a picture, until `ended`."""
+        """Paints whenever a picture is wanted, until `ended`."""
         while not ended():
             if not self.paint():
                 with self.changed:
@@ -221,7 +221,7 @@ class FieldPage(Page):
 
 
 def home_of(orbit: Cameras) -> tuple[Viewpoint, float]:
-    """Where an orbit begins, as a viewer's camera, and how far it is from what it looks at."""
+    """The first view of an orbit, as a viewer's camera, and its distance from the subject."""
     focus = focus_point(orbit.c2w)
     up = torch.nn.functional.normalize(-orbit.c2w[:, :3, 1].mean(0), dim=0)
     distance = float((orbit.centres - focus).norm(dim=1).mean())

@@ -1,4 +1,4 @@
-"""What all pages in the browser share, served by Viser: a stage, cameras with their photos, lines, points and switches."""
+"""What all pages in the browser share, served by Viser: lights, cameras with their photos, lines, points and checkboxes."""
 
 import contextlib
 import io
@@ -33,8 +33,8 @@ class Page:
 
     Args:
         name: its title.
-        home: from where it is looked at first.
-        scale: what sizes on the page derive from, world units.
+        home: the first view.
+        scale: of everything drawn on the page, world units.
         host: address to listen on.
         port: where to listen; the next free one where it is taken.
     """
@@ -64,7 +64,7 @@ class Page:
             self.server.stop()
 
     def set_stage(self) -> None:
-        """Light, sizes and the first look; nothing that a browser would fetch from elsewhere."""
+        """Lights, sizes and the first view; nothing that a browser would load from elsewhere."""
         scene, gui, camera = self.server.scene, self.server.gui, self.server.initial_camera
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.set_panel_label(self.name)
@@ -80,7 +80,7 @@ class Page:
             client.camera.min_orbit_distance = min(1e-2, 1e-3 * self.scale)
 
     def add_cameras(self, shown: Scene, photo_side: int, visible: bool = True) -> None:
-        """Frusta and their names, in a group for each split, so that a group is shown and hidden as one."""
+        """Frusta and their names, one group for each split, shown and hidden as one."""
         scene = self.server.scene
         splits = (("training", shown.train, TRAINING), ("held out", shown.val, HELD_OUT))
         for word, views, colour in splits:
@@ -109,7 +109,7 @@ class Page:
                 scene.add_label(f"/{group}/names/{i}", frustum.name, position=position, font_screen_scale=0.8)
 
     def _visit(self, frustum: Frustum, view: int | None) -> Callable[[viser.SceneNodePointerEvent], None]:
-        """What a click on a frustum does: the browser's camera goes there."""
+        """A click on a frustum moves the browser's camera there."""
 
         def visit(event: viser.SceneNodePointerEvent) -> None:
             look_from(event.client, through(frustum, self.scale, self.home.up))
@@ -122,7 +122,7 @@ class Page:
         """Called when a training view is looked through."""
 
     def add_camera_switches(self) -> None:
-        """What to show of the cameras."""
+        """Checkboxes for what to show of the cameras."""
         gui = self.server.gui
         for word, group in self.groups.items():
             self.switch(word, group)
@@ -191,5 +191,5 @@ def look_from(client: viser.ClientHandle, viewpoint: Viewpoint) -> None:
 
 
 def _hushed() -> contextlib.AbstractContextManager[object]:
-    """Viser announces its start and stop whatever it is told; the verb has a line of its own."""
+    """Viser always announces its start and stop; the verb prints a line of its own."""
     return contextlib.redirect_stdout(io.StringIO())

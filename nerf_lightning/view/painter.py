@@ -1,4 +1,4 @@
-"""Pictures that are due soon: coarse at once, then finer, and dropped as soon as another one is wanted."""
+"""Pictures for a browser: coarse at first, then finer, and dropped as soon as they are out of date."""
 
 import math
 import time
@@ -19,14 +19,14 @@ from nerf_lightning.utils.device import synchronize
 from nerf_lightning.utils.evenly import evenly
 
 SLICE = 4
-"""So many times what is sampled together is painted between two looks at whether the picture is still wanted."""
+"""Chunks of rays rendered between two checks of whether the picture is still wanted."""
 FIRST_SIDE = 24
 """Pixels along the longer side below which no picture is worth sending."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What somebody wants to see."""
+    """The picture that a browser asks for."""
 
     c2w: Float[ndarray, "4 4"]
     """OpenCV frame, camera to world."""
@@ -37,13 +37,13 @@ class Wish:
     channel: str
     background: tuple[float, float, float]
     near: float
-    """World units along each ray; what is nearer is cut away."""
+    """World units along each ray; nearer parts are cut away."""
     far: float
     most: int
     """Pixels along the longer side of the finest picture."""
 
     def cameras(self, side: int) -> Cameras:
-        """As one view with so many pixels along its longer side."""
+        """One view, `side` pixels along its longer side."""
         width = max(1, round(side * min(1.0, self.aspect)))
         height = max(1, round(side / max(1.0, self.aspect)))
         focal = height / (2 * math.tan(self.fov / 2))
@@ -52,40 +52,40 @@ class Wish:
 
 
 class Painter:
-    """Renders wishes with a system, at sizes that its speed so far allows.
+    """Renders wishes with a system, at sizes that suit the speed measured so far.
 
     Args:
         system: trained, or in training.
-        orbit: views that tell the range of depths.
+        orbit: views from which the range of depths is found.
     """
 
     def __init__(self, system: NeRF3D, orbit: Cameras):
         self.system = system
         self.orbit = orbit
         self.rate = 50_000.0
-        """Rays a second, as last measured; a guess before."""
+        """Rays a second, measured; at first a guess."""
         self._depths: tuple[float, float] | None = None
 
     def side_within(self, wish: Wish, seconds: float) -> int:
-        """Pixels along the longer side of a picture that should take so long."""
+        """Pixels along the longer side of a picture that should take `seconds`."""
         area = self.rate * seconds
         ratio = min(wish.aspect, 1 / wish.aspect)
         return int(min(max(math.sqrt(area / ratio), FIRST_SIDE), wish.most))
 
     def depths(self) -> tuple[float, float]:
-        """What is bright and what is dark in pictures of depth."""
+        """The range of depths, from bright to dark."""
         if self._depths is None:
             self._depths = depth_range(self.system, self.orbit[torch.tensor(evenly(len(self.orbit), 3))])
         return self._depths
 
     def forget(self) -> None:
-        """Called when the field has changed: the range of depths is looked for again."""
+        """Called when the field has changed: the range of depths is out of date."""
         self._depths = None
 
     def paint(self, wish: Wish, side: int, wanted: Callable[[], bool]) -> UInt8[ndarray, "H W 3"] | None:
-        """A picture of one size; None where it was no longer wanted before it was done."""
+        """A picture of one size; None if it was no longer wanted before it was finished."""
         device, together = self.system.device, SLICE * self.system.chunk_rays
-        synchronize(device)  # what it still does for others is not the picture's time
+        synchronize(device)  # do not count work that is still queued
         began = time.perf_counter()
         cameras = wish.cameras(side).to(device)
         rays = cameras.view_rays(0)

@@ -15,18 +15,18 @@ from nerf_lightning.view.page import Page
 
 ORBIT, BOX = (148, 103, 189), (110, 110, 110)
 APPROACH, INSIDE, SAMPLES, FOCUS = (190, 190, 190), (44, 160, 44), (0, 70, 0), (214, 39, 40)
-ONE_EACH, MANY, NO_RAYS = "one ray a frustum", "many rays of one frustum", "none"
+ONE_EACH, MANY, NO_RAYS = "one ray from each camera", "many rays from one camera", "none"
 
 
 class ScenePage(Page):
-    """Serves a scene from a thread of its own until `stop`.
+    """Serves a scene until `stop`.
 
     Args:
         scene: what is shown.
         host: address to listen on.
-        port: where to listen; the next free one where it is taken.
+        port: where to listen; the next free one if it is taken.
         photo_side: longest side of the photos on the frusta, pixels.
-        rays: how many rays of one frustum.
+        rays: how many rays from one camera.
         samples: samples on each ray that meets the bounds.
     """
 
@@ -36,7 +36,7 @@ class ScenePage(Page):
         self.rays = rays
         self.samples = samples
         self.draw = 0
-        """Number of the draw of pixels: its seed."""
+        """Seed of the random pixels."""
         with self.server.atomic():
             self.set_stage()
             self.add_cameras(scene, photo_side)
@@ -59,7 +59,7 @@ class ScenePage(Page):
         gui = self.server.gui
         counts = f"{len(self.scene.train)} training cameras (blue), {len(self.scene.val)} held out (orange)"
         width, height = self.scene.resolution
-        gui.add_markdown(f"{counts}, {width} x {height} pixels. Click a frustum to look through it.")
+        gui.add_markdown(f"{counts}, {width} x {height} pixels. Click a camera to look through it.")
         gui.add_button("whole scene").on_click(self.go_home)
         with gui.add_folder("show"):
             for word in ("orbit", "box", "axes"):
@@ -67,13 +67,13 @@ class ScenePage(Page):
             self.add_camera_switches()
         with gui.add_folder("rays"):
             self.which = gui.add_dropdown("rays", (ONE_EACH, MANY, NO_RAYS))
-            self.camera = gui.add_slider(
-                "frustum", 0, len(self.scene.train) - 1, 1, 0, hint="whose rays: a training view"
-            )
+            self.camera = gui.add_slider("camera", 0, len(self.scene.train) - 1, 1, 0, hint="which training camera")
             self.jitter = gui.add_checkbox("jitter", False, hint="stratified samples, as in training")
             for control in (self.which, self.camera, self.jitter):
                 control.on_update(lambda _: self.draw_rays())
-            gui.add_button("draw again", hint="other random pixels").on_click(lambda _: self.draw_rays(again=True))
+            gui.add_button("other rays", hint="through new random pixels").on_click(
+                lambda _: self.draw_rays(again=True)
+            )
 
     def draw_rays(self, again: bool = False) -> None:
         """Draws the rays that the controls ask for; the same pixels as before unless `again`."""

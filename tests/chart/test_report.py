@@ -176,14 +176,17 @@ def test_points_without_rendering_times(make_run: MakeRun, tmp_path: Path):
 def test_garbage_of_all_kinds(make_run: MakeRun, tmp_path: Path):
     """No value a results.json can hold breaks the chart."""
     values = [None, "x", -1, 0, 1e308, [], [1], {}, {"a": 1}, True, float("nan"), float("inf"), "\x00<&$^_{"]
-    keys = ("scene", "background", "method", "seed", "machine", "load", "versions", "threads", "artifact_bytes",
-            "train_seconds", "psnr", "render_seconds_per_view", "curve", "status", "diagnosis", "steps")  # fmt: skip
-    for number, (key, value) in enumerate(itertools.product(keys, values)):
+    keys = [
+        ("psnr",), ("train_seconds",), ("scene", "versions"), ("background", "load"), ("method", "threads"),
+        ("seed", "artifact_bytes"), ("machine", "diagnosis"), ("status", "curve"), ("render_seconds_per_view", "steps"),
+    ]  # fmt: skip
+    for number, (spoiled, value) in enumerate(itertools.product(keys, values)):
         poorer = {
             "psnr": 30 - number / 100,
             "train_seconds": 5.0 + number,
             "render_seconds_per_view": 0.1 + number / 100,
         }
-        make_run(f"{key}{number}", {"recipe": f"{key}{number}"}, **(poorer | {key: value}))
+        name = f"{spoiled[0]}{number}"
+        make_run(name, {"recipe": name}, **(poorer | dict.fromkeys(spoiled, value)))
     write_report(find_runs(tmp_path), PUBLISHED, LIMITS, tmp_path / "out")
     assert (tmp_path / "out" / "chart.html").exists()

@@ -3,6 +3,7 @@
 import io
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,9 +57,8 @@ def test_points_are_the_meshs_vertices():
     run = ball_run(to_source())
     volume = sample_volume(run.system, RESOLUTION)
     cloud = trimesh.load(io.BytesIO(points_file(run, run.orbit, volume, None).content), file_type="ply")
-    mesh = trimesh.load(
-        io.BytesIO(mesh_file(run, run.orbit, volume, None, "ply").content), file_type="ply", process=False
-    )
+    written = io.BytesIO(mesh_file(run, run.orbit, volume, None, "ply").content)
+    mesh = trimesh.load(written, file_type="ply", process=False)
     assert isinstance(cloud, trimesh.PointCloud)
     np.testing.assert_allclose(np.asarray(cloud.vertices), mesh.vertices, atol=1e-6)
     assert np.array_equal(cloud.colors, mesh.visual.vertex_colors)
@@ -94,15 +94,12 @@ def test_a_box_reaches_no_farther_than_the_scene_and_one_beside_it_is_refused():
     run = ball_run(to_source())
     everything = torch.tensor([[-100.0] * 3, [100.0] * 3])
     assert torch.equal(region_of(run.system.field.bounds, everything, run.to_source), run.system.field.bounds.aabb)
-    with pytest.raises(
-        InputError, match=r"config: box: found \[-2.0.*expected something within \[4.98.* the scene's box"
-    ):
+    message = r"config: box: found \[-2.0.*expected something within \[4.98.* the scene's box"
+    with pytest.raises(InputError, match=message):
         volume_of(run, RESOLUTION, torch.tensor([[-2.0] * 3, [-1.0] * 3]))
 
 
 def test_boxes_of_any_shape_have_cubic_cells():
-    from dataclasses import replace
-
     system = ball_system()
     bounds = replace(system.field.bounds, aabb=torch.tensor([[-1.0, -0.5, -0.26], [1.0, 0.5, 0.26]]), pixel=0.02)
     system.field._bounds, system.field.aabb = bounds, bounds.aabb

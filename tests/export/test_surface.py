@@ -18,8 +18,9 @@ LOW = torch.tensor([-1.0, -1.0, -1.0])
 def volume(*balls: tuple[tuple[float, float, float], float]) -> Volume:
     """Balls (centre, radius) that are dense, softly at their skin."""
     empty = Volume(torch.zeros(N, N, N), LOW, CELL)
-    places = empty.places(torch.stack(torch.meshgrid(*[torch.arange(N)] * 3, indexing="ij"), -1).float())
-    depth = torch.stack([radius - (places - torch.tensor(centre)).norm(dim=-1) for centre, radius in balls]).amax(0)
+    depth = torch.stack(
+        [radius - (empty.centres - torch.tensor(centre)).norm(dim=-1) for centre, radius in balls]
+    ).amax(0)
     density = DENSE * torch.sigmoid(depth / SOFT)
     return Volume(density, LOW, CELL)
 
@@ -65,9 +66,7 @@ def test_the_threshold_stands_between_the_thin_and_the_dense():
     assert solid_from(np.zeros(0)) == 0.5 and solid_from(np.full(3, 0.6)) == 0.3
     assert solid_from(np.array([0.2, 0.2, 0.8])) == pytest.approx(0.5)
     fog = volume(((0, 0, 0), 0.5))
-    fog.density[fog.density < 0.3] = (
-        0.3  # a haze all over the box, which stops a quarter of the light on its way to the middle
-    )
+    fog.density.clamp_(min=0.3)  # a haze all over the box, which stops a quarter of the light on its way to the middle
     mesh = mesh_of(fog)
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.5).max() < 2 * CELL
 
@@ -83,16 +82,14 @@ def test_what_no_camera_sees_is_solid_and_what_one_sees_is_not():
     run = ball_run(torch.eye(4))
     one = sample_volume(run.system, N)
     lit = lit_cells(run.system, one, run.orbit)
-    places = one.places(torch.stack(torch.meshgrid(*[torch.arange(N)] * 3, indexing="ij"), -1).float())
-    radius = (places - CENTRE).norm(dim=-1).numpy()
+    radius = (one.centres - CENTRE).norm(dim=-1).numpy()
     assert not lit[radius < RADIUS - 2.5 * one.cell].any()
     in_view = lit[(radius > RADIUS + 2 * one.cell) & (radius < RADIUS + 4 * one.cell)]
     assert in_view.mean() > 0.95
     hollow = Volume(torch.where(torch.from_numpy(radius) < RADIUS - 3 * one.cell, 0.0, one.density), one.low, one.cell)
     inside = find_surface(hollow, lit, 0.5)
-    assert (np.linalg.norm(inside.vertices - CENTRE.numpy(), axis=1) > RADIUS - one.cell).all(), (
-        "its inner side stays unseen"
-    )
+    away = np.linalg.norm(inside.vertices - CENTRE.numpy(), axis=1)
+    assert (away > RADIUS - one.cell).all(), "its inner side stays unseen"
 
 
 def test_the_dark_below_a_floor_is_not_solid():

@@ -1,5 +1,6 @@
 """Frames become films, and interrupted ones go on."""
 
+import sys
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -57,12 +58,8 @@ def test_an_interrupted_film_goes_on_and_another_one_starts_anew(tmp_path: Path)
 
 def test_a_folder_keeps_its_frames(tmp_path: Path):
     assert make_film({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 0
-    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == [
-        "00000.png",
-        "00001.png",
-        "00002.png",
-        "frames.json",
-    ]
+    names = sorted(path.name for path in (tmp_path / "frames").iterdir())
+    assert names == ["00000.png", "00001.png", "00002.png", "frames.json"]
     assert make_film({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 3
     with pytest.raises(InputError, match="something else in it"):
         make_film({"what": 2}, plain, 3, tmp_path / "frames", fps=10)
@@ -91,8 +88,6 @@ def test_even():
 
 
 def test_without_pyav_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    import sys
-
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[video\]'"):
         check_output(tmp_path / "film.mp4", False)

@@ -27,19 +27,15 @@ def test_more_frames_stand_between_those_of_the_path():
     torch.testing.assert_close(fine.K, K.repeat(24, 1, 1))
     expected = circle(24).c2w
     torch.testing.assert_close(fine.c2w[:, :3, :3], expected[:, :3, :3], atol=0.02, rtol=0)  # the last one, too
-    assert (fine.centres - expected[:, :3, 3]).norm(dim=1).max() < 3 * (
-        1 - math.cos(math.pi / 12)
-    ) + 1e-4  # a chord's height
+    height = 3 * (1 - math.cos(math.pi / 12))  # of a chord
+    assert (fine.centres - expected[:, :3, 3]).norm(dim=1).max() < height + 1e-4
 
 
-def test_an_open_path_keeps_its_ends():
+def test_an_open_path_keeps_its_ends_and_fewer_frames_are_spread_over_it():
     path = circle(4)
     fine = along(path, 9, closed=False)
     torch.testing.assert_close(fine.c2w[[0, -1]], path.c2w[[0, -1]], atol=1e-6, rtol=0)
     assert len(along(path[:1], 5, closed=True)) == 1
-
-
-def test_fewer_frames_are_spread_over_the_path():
     assert torch.equal(along(circle(12), 4, closed=True).c2w, circle(12).c2w[torch.tensor([1, 4, 7, 10])])
 
 
@@ -93,22 +89,19 @@ def test_own_files(tmp_path: Path):
     torch.testing.assert_close(read.K, path.K)
 
 
+PATH = '{"width": 4, "height": 4, "K": [[%s,0,2],[0,1,2],[0,0,1]], "c2w": %s}'
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ("no json", "Expecting value"),
         ("[]", "expected width"),
         ('{"width": 4}', "no 'c2w'"),
-        ('{"width": 4, "height": 4, "K": [[1,0,2],[0,1,2],[0,0,1]], "c2w": []}', "0 views"),
-        ('{"width": 4, "height": 4, "K": [[1,0,2],[0,1,2],[0,0,1]], "c2w": [[1,2]]}', "invalid for input"),
-        (
-            '{"width": 4, "height": 4, "K": [[NaN,0,2],[0,1,2],[0,0,1]], "c2w": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}',
-            "not finite",
-        ),
-        (
-            '{"width": 4, "height": 4, "K": [[1,0,2],[0,1,2],[0,0,1]], "c2w": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}',
-            "no rotation",
-        ),
+        (PATH % (1, "[]"), "0 views"),
+        (PATH % (1, "[[1,2]]"), "invalid for input"),
+        (PATH % ("NaN", "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "not finite"),
+        (PATH % (1, "[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]"), "no rotation"),
     ],
 )
 def test_what_is_no_path_is_refused(content: str, message: str, tmp_path: Path):
@@ -118,9 +111,8 @@ def test_what_is_no_path_is_refused(content: str, message: str, tmp_path: Path):
 
 
 def test_other_words_are_refused():
-    with pytest.raises(
-        InputError, match=r"path: found 'dolly', expected one of orbit, spiral, test, train, or a \.json file"
-    ):
+    words = r"path: found 'dolly', expected one of orbit, spiral, test, train, or a \.json file"
+    with pytest.raises(InputError, match=words):
         find_route("dolly", None, circle(), None)
     with pytest.raises(InputError, match=r"missing\.json: found no such file"):
         find_route("missing.json", None, circle(), None)

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,33 +11,28 @@ import pytest
 import torch
 
 from nerf_lightning.config import cli
+from nerf_lightning.config.build import build_data
+from nerf_lightning.config.compose import composed
+from nerf_lightning.export.__main__ import task as export
 from nerf_lightning.render.__main__ import task
 from nerf_lightning.renderer import over
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.training.train import train
 
 Render = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def render(
-    small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Render:
+def render(small_run: Path, tmp_path: Path, verb) -> Render:
     """Renders a copy of the small run; returns exit code, output and errors."""
-    folder = tmp_path / "run"
-    shutil.copytree(small_run, folder)
-    monkeypatch.chdir(tmp_path)
+    shutil.copytree(small_run, tmp_path / "run")
 
     def run(*given: str) -> tuple[int, str, str]:
-        given = given if any(one.startswith("run=") for one in given) else ("run=run", *given)
-        monkeypatch.setattr(sys, "argv", ["render", *given])
-        code = 0
-        try:
-            cli.run("render", task, texts=("run", "path", "output", "background", "channels"))
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
+        run = () if any(one.startswith("run=") for one in given) else ("run=run",)
+        return verb(
+            lambda: cli.run("render", task, texts=("run", "path", "output", "background", "channels")), *run, *given
+        )
 
     return run
 
@@ -70,17 +64,12 @@ def test_photos_stand_beside_their_renders(render: Render, tmp_path: Path):
     assert len(frames) == 2
     frame = imageio.imread(frames[0])
     assert frame.shape[1] == 4 * 160 and frame.shape[0] > 160, "truth, render, error, depth, magnified, and a caption"
-    from nerf_lightning.config.build import build_data
-
     data = build_data(load_run(tmp_path / "run").cfg)
     truth = over(data.held_out(0).pixels, torch.zeros(256, 3)).view(16, 16, 3).numpy()
     assert np.abs(frame[5:160:10, 5:160:10] / 255 - truth).max() < 1 / 255
 
 
 def test_compact_files_too_and_the_same_command_does_nothing_twice(render: Render, tmp_path: Path):
-    from nerf_lightning.config.compose import composed
-    from nerf_lightning.export.__main__ import task as export
-
     export(composed(["run=run", "loss=9"], tmp_path, "export"))
     assert render("run=run/compact.npz", "frames=2", "background=transparent", "output=frames")[0] == 0
     assert imageio.imread(tmp_path / "frames" / "00001.png").shape == (16, 16, 4)
@@ -133,14 +122,8 @@ def test_half_written_runs_are_told(render: Render, tmp_path: Path):
 
 
 def test_pictures_have_no_paths(render: Render, tmp_path: Path):
-    from nerf_lightning.config.compose import composed
-    from nerf_lightning.training.train import train
-
     given = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=2", "~logger"]
-    train(
-        composed(
-            [*given, *(f"callbacks.{one}=null" for one in ("training_gif", "charts", "baselines"))], tmp_path / "flat"
-        )
-    )
+    given += [f"callbacks.{one}=null" for one in ("training_gif", "charts", "baselines")]
+    train(composed(given, tmp_path / "flat"))
     code, _, err = render("run=flat")
     assert code == 2 and "found a picture's run, expected a scene's run" in err

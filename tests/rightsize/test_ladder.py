@@ -34,12 +34,6 @@ def test_every_rung_of_the_shipped_ladders_can_be_built_and_is_larger_than_the_l
         build_system(set_options(cfg, "sampler", options), SCENE)
 
 
-def test_a_ladder_of_ones_own(tmp_path: Path):
-    path = tmp_path / "mine.yaml"
-    path.write_text("rungs: [{width: 8}, {width: 16}]")
-    assert read_ladder(str(path), SHIPPED).rungs == [{"width": 8}, {"width": 16}]
-
-
 @pytest.mark.parametrize(
     ("text", "key"),
     [
@@ -49,8 +43,10 @@ def test_a_ladder_of_ones_own(tmp_path: Path):
         ("rungs: [{}, {}]\nsamplers: 3", "samplers"),
     ],
 )
-def test_something_else_is_told(text: str, key: str, tmp_path: Path):
+def test_a_ladder_of_ones_own_and_what_is_none(text: str, key: str, tmp_path: Path):
     path = tmp_path / "mine.yaml"
+    path.write_text("rungs: [{width: 8}, {width: 16}]")
+    assert read_ladder(str(path), SHIPPED).rungs == [{"width": 8}, {"width": 16}]
     path.write_text(text)
     with pytest.raises(InputError, match=f"mine.yaml: {key}: found something else"):
         read_ladder(str(path), SHIPPED)
