@@ -16,11 +16,6 @@ SMALLEST = 64
 Distance = Callable[[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]], float]
 
 
-def weights() -> Path:
-    """Where torchvision looks for AlexNet's weights."""
-    return Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS
-
-
 def perceptual_distance(width: int, height: int) -> tuple[Distance | None, str]:
     """LPIPS with AlexNet of two pictures in [0, 1]: 0 for the same, smaller is better.
 
@@ -31,8 +26,9 @@ def perceptual_distance(width: int, height: int) -> tuple[Distance | None, str]:
         return None, f"photos of less than {SMALLEST} pixels"
     if importlib.util.find_spec("torchvision") is None:
         return None, "torchvision is not installed"
-    if not weights().exists():
-        return None, f"{weights()} is not there"
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS
+    if not weights.exists():
+        return None, f"{weights} is not there"
 
     from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
 

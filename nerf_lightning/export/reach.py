@@ -1,5 +1,6 @@
 """Which cells some cameras see: all that rendering from around them needs."""
 
+import copy
 import math
 
 import torch
@@ -54,8 +55,12 @@ def seen_cells(system: System, cameras: Cameras) -> Cells | None:
     return widened(seen.view(n, n, n)) & occupied
 
 
-def confine(system: System, cells: Cells) -> None:
-    """Leaves a system only what some cells need."""
-    assert isinstance(system, NeRF3D)  # as it has cells
-    system.field.prune(cells)
-    system.sampler.unpack({"occupied": cells.flatten()})
+def confined_to(system: System, cells: Cells | None) -> System:
+    """A copy of a system with only what some cells need, on the CPU, to be encoded; the system itself for None."""
+    if cells is None:
+        return system
+    part = copy.deepcopy(system).cpu()
+    assert isinstance(part, NeRF3D)  # as it has cells
+    part.field.prune(cells.cpu())
+    part.sampler.unpack({"occupied": cells.cpu().flatten()})
+    return part

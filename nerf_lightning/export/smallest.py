@@ -1,6 +1,5 @@
 """The smallest compact file of a run that still shows what the run shows."""
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -11,7 +10,7 @@ import torch
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.reach import Cells, confine, occupied_cells, seen_cells
+from nerf_lightning.export.reach import confined_to, occupied_cells, seen_cells
 from nerf_lightning.runs.compact import decode, encode
 from nerf_lightning.runs.folder import scene_content
 from nerf_lightning.system import System
@@ -52,15 +51,6 @@ def some_cameras(data: RayDataModule, most: int = MOST_VIEWS) -> Cameras:
     """Those of training views spread over all."""
     cameras = data.scene.train.cameras
     return cameras[torch.tensor(evenly(len(cameras), most))]
-
-
-def confined_to(system: System, cells: Cells | None) -> System:
-    """A copy of a system with only what some cells need, on the CPU, to be coded; the system itself for None."""
-    if cells is None:
-        return system
-    part = copy.deepcopy(system).cpu()
-    confine(part, cells.cpu())
-    return part
 
 
 def smallest(

@@ -12,8 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from nerf_lightning.callbacks import Budget
 from nerf_lightning.config.build import budget_options, build_system, build_trainer, device_of, frame_of, resolved
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
-from nerf_lightning.export.reach import seen_cells
-from nerf_lightning.export.smallest import confined_to, held_out_psnr, some_cameras
+from nerf_lightning.export.reach import confined_to, seen_cells
+from nerf_lightning.export.smallest import held_out_psnr, some_cameras
 from nerf_lightning.rightsize.choose import Measured
 from nerf_lightning.rightsize.ladder import Options
 from nerf_lightning.runs.compact import encode

@@ -33,7 +33,7 @@ def encode(system: System, precision: str, config: dict[str, Any], scene: dict[s
     """Codes a system as the content of a compact file.
 
     Args:
-        system: trained; `confine` it first to leave out what no camera sees.
+        system: trained; see `confined_to` to leave out what no camera sees.
         precision: "half" or "byte".
         config, scene: of its run, see `runs.folder`.
     """
