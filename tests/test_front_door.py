@@ -1,8 +1,6 @@
 """import nerf_lightning as nl: what the command line does, from Python."""
 
 import math
-import runpy
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,6 @@ from nerf_lightning.stability.toys import PILE, toy
 
 STEPS = 12
 FEW = ("callbacks.snapshots=null", "callbacks.orbit=null", "~logger")
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
 @pytest.fixture(scope="module")
@@ -73,12 +70,3 @@ def test_what_is_wrong_is_told(path: Path, tmp_path: Path):
         nl.train(path, steps=1, folder=tmp_path / "old")
     with pytest.raises(AttributeError, match="no attribute 'trian'"):
         nl.trian  # noqa: B018
-
-
-@pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda example: example.stem)
-def test_examples_run(example: Path, path: Path, tmp_path: Path, monkeypatch):
-    assert len(example.read_text(encoding="utf-8").splitlines()) <= 30
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [str(example), str(path), "0.5"])
-    runpy.run_path(str(example), run_name="__main__")
-    assert list(tmp_path.glob("*.png"))

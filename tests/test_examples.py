@@ -1,0 +1,82 @@
+"""What stands in examples/ runs as it is written: scripts in this process, the notebook in a Jupyter kernel."""
+
+import os
+import runpy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio.v3 as imageio
+import nbformat
+import pytest
+from capture.views import SIZE
+from nbclient import NotebookClient
+
+from nerf_lightning.capture.synthetic import Truth
+from nerf_lightning.dataset import save_npz
+from nerf_lightning.stability.toys import PILE, toy
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples"
+SCRIPTS = sorted(EXAMPLES.glob("*.py"))
+
+
+@pytest.fixture
+def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Runs a script with arguments in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(name: str, *arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", [name, *arguments])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+
+    return run
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "pile.npz"
+    save_npz(toy(PILE, size=16, views=8, held_out=2), path)
+    return path
+
+
+def test_scripts_are_short():
+    assert len(SCRIPTS) == 3, "each is run below"
+    for script in SCRIPTS:
+        lines = [line for line in script.read_text(encoding="utf-8").splitlines() if line.strip()]
+        assert len(lines) <= 30, script.name
+
+
+def test_train_and_render(example: Callable[..., None], scene: Path, tmp_path: Path):
+    example("train_and_render.py", str(scene), "0.5")
+    assert imageio.imread(tmp_path / "view.png").shape == (16, 32, 3)
+    assert (tmp_path / "field.npz").is_file()
+
+
+@pytest.mark.filterwarnings("ignore:.*LeafSpec.*:FutureWarning")  # Lightning's progress bar, with PyTorch as it is now
+def test_own_field(example: Callable[..., None], scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    example("own_field.py", str(scene), "10")
+    assert float(capfd.readouterr().out.split(" dB on")[0].split()[-1]) > 12, "it learns: a black picture has less"
+    assert imageio.imread(tmp_path / "own_field.png").shape == (16, 32, 3)
+
+
+def test_own_photos(example: Callable[..., None], made: tuple[Path, Truth], tmp_path: Path):
+    folder, _ = made
+    given = [str(folder / "calibration"), str(folder / "photos"), "--tag", str(SIZE)]
+    example("own_photos.py", *given, "--seconds", "0.5", "--pixels", "16")
+    assert imageio.imread(tmp_path / "orbit.webp").shape == (12, 16, 3)
+    assert (tmp_path / "field.npz").is_file()
+
+
+def test_tour(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    notebook = nbformat.read(EXAMPLES / "tour.ipynb", as_version=4)
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook.cells), (
+        "kept without outputs"
+    )
+    monkeypatch.setenv("TOUR_SCENE", str(scene))
+    monkeypatch.setenv("TOUR_STEPS", "5")
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    pictures = [out for cell in notebook.cells for out in cell.get("outputs", []) if "image/png" in out.get("data", {})]
+    assert len(pictures) == 3, "photos, render beside truth, curve"
+    assert (tmp_path / "field.npz").is_file()
