@@ -68,12 +68,12 @@ def test_own_photos(example: Callable[..., None], made: tuple[Path, Truth], tmp_
     assert (tmp_path / "field.npz").is_file()
 
 
-def test_tour(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_tour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     notebook = nbformat.read(EXAMPLES / "tour.ipynb", as_version=4)
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook.cells), (
         "kept without outputs"
     )
-    monkeypatch.setenv("TOUR_SCENE", str(scene))
+    monkeypatch.setenv("TOUR_SIZE", "16")
     monkeypatch.setenv("TOUR_STEPS", "5")
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
