@@ -14,7 +14,7 @@ from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.watch import Breakdown, Watch
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
-from nerf_lightning.model import Rectifier
+from nerf_lightning.model import SoftenableReLU
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.utils.options import AtLeast, Count
 from nerf_lightning.utils.seeding import Stream, step_generator
@@ -217,7 +217,7 @@ class Guard(L.Callback):
         system.on_fit_start()  # the sampler learns about the scene at the start
         if isinstance(system, NeRF3D):
             system.sampler.restart(step)
-        relus = [module for module in system.modules() if isinstance(module, Rectifier)]
+        relus = [module for module in system.modules() if isinstance(module, SoftenableReLU)]
         if relus and not self.softened and not apart:
             self.softened = True
             action = "started again with softplus in place of the ReLU that makes the density"

@@ -52,7 +52,7 @@ class Snapshots(L.Callback):
         if not 0 <= self.view < views:
             raise InputError("callbacks.snapshots.view", "", str(self.view), f"a held-out view from 0 to {views - 1}")
 
-    def take(self, trainer: L.Trainer, pl_module: System) -> None:
+    def write(self, trainer: L.Trainer, pl_module: System) -> None:
         if not trainer.is_global_zero:
             return
         with Budget.of(trainer).paused():
@@ -72,8 +72,8 @@ class Snapshots(L.Callback):
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         if self.due(trainer.global_step):
-            self.take(trainer, pl_module)
+            self.write(trainer, pl_module)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
         if not self.due(trainer.global_step):
-            self.take(trainer, pl_module)
+            self.write(trainer, pl_module)

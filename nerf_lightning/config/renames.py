@@ -8,6 +8,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 RENAMED = {
     "renderer.distortion": "renderer.distortion_loss_weight",
+    "sampler.transparent": "sampler.early_stop_eps",
+    "sampler.thin": "sampler.alpha_thre",
 }
 GRIDS = ("HashGridField", "TensoRFField", "VoxelField")
 """Models whose runs without the option `size` were made with a fixed size."""

@@ -94,12 +94,12 @@ def composite(
 
 
 def keep_visible_reference(
-    thickness: Tensor, packed: Packed, transparent: float, thin: float | Tensor, room: int | None = None
+    thickness: Tensor, packed: Packed, early_stop_eps: float, min_thickness: float | Tensor, room: int | None = None
 ) -> Kept:
     """`keep_visible` in plain PyTorch, for every device."""
     t, dt, ray, offsets = packed
     # NaN stays, so that somebody notices.
-    keep = ~((before(thickness, ray, offsets) > -math.log(transparent)) | (thickness < thin))
+    keep = ~((before(thickness, ray, offsets) > -math.log(early_stop_eps)) | (thickness < min_thickness))
     if room is not None:  # drops what an earlier call repeated to fill its room
         keep = keep & (dt > 0)
     counts = counted(keep)
@@ -114,8 +114,8 @@ def keep_visible_reference(
 def keep_visible(
     thickness: Float[Tensor, "N"],
     packed: Packed,
-    transparent: float,
-    thin: float | Float[Tensor, ""],
+    early_stop_eps: float,
+    min_thickness: float | Float[Tensor, ""],
     room: int | None = None,
 ) -> Kept:
     """Drops samples that light cannot reach, and those that hold nothing.
@@ -123,21 +123,21 @@ def keep_visible(
     Args:
         thickness: optical thickness of each sample, density times length.
         packed: midpoints, lengths, rays and offsets of N samples.
-        transparent: early-stop transmittance, above 0: below it a ray has ended.
-        thin: alpha threshold, as an optical thickness: a sample below it holds nothing.
+        early_stop_eps: early-stop transmittance, above 0: below it a ray has ended.
+        min_thickness: alpha threshold, as an optical thickness: a sample below it holds nothing.
         room: see `march`.
     """
     t, dt, ray, offsets = packed
     if room is not None or not fast(thickness, t, dt) or t.requires_grad or dt.requires_grad:
-        return keep_visible_reference(thickness, packed, transparent, thin, room)
+        return keep_visible_reference(thickness, packed, early_stop_eps, min_thickness, room)
     from nerf_lightning.kernels.cpu import composite, workers
 
     threads, keep, counts = workers(), np.empty(len(t), np.bool_), np.empty(len(offsets) - 1, np.int64)
     composite.visible(
         thickness.detach().contiguous().numpy(),
         offsets.numpy(),
-        transparent,
-        float(thin),
+        early_stop_eps,
+        float(min_thickness),
         keep,
         counts,
         threads,

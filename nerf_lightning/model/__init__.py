@@ -3,7 +3,7 @@
 from nerf_lightning.model.field import Field, PictureField
 from nerf_lightning.model.hashgrid import HashGrid, HashGridField
 from nerf_lightning.model.hashgrid2d import HashGrid2DField
-from nerf_lightning.model.layers.activation import Rectifier, density_activation, truncated_exp
+from nerf_lightning.model.layers.activation import SoftenableReLU, density_activation, truncated_exp
 from nerf_lightning.model.layers.encoding import sinusoidal
 from nerf_lightning.model.mlp import MLPField
 from nerf_lightning.model.picture import FourierField, PictureMLP, SirenField
@@ -19,7 +19,7 @@ __all__ = [
     "MLPField",
     "PictureField",
     "PictureMLP",
-    "Rectifier",
+    "SoftenableReLU",
     "SirenField",
     "TensoRFField",
     "VectorMatrix",

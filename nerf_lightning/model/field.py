@@ -19,7 +19,7 @@ def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
     parameter.data = data
 
 
-class Packable(torch.nn.Module):
+class AnyField(torch.nn.Module):
     """What fields in two and in three dimensions have in common."""
 
     grown_after: float = 0.0
@@ -27,30 +27,30 @@ class Packable(torch.nn.Module):
     sizing: str = ""
     """One line on how the field's size follows from the data; "" if it does not."""
 
-    def take(self, smaller: Any) -> None:
+    def warm_start_from(self, smaller: Any) -> None:
         """Copies the function of a smaller field of the same kind, as far as possible, leaving the rest free to learn.
 
         What cannot be copied starts fresh; here, that is everything.
         """
 
-    def packed(self) -> dict[str, Tensor]:
-        """The least that rendering needs, for `unpack`."""
+    def export_state(self) -> dict[str, Tensor]:
+        """The least that rendering needs, for `import_state`."""
         return dict(self.state_dict())
 
-    def unpack(self, packed: dict[str, Tensor]) -> None:
-        """Restores what `packed` returned.
+    def import_state(self, state: dict[str, Tensor]) -> None:
+        """Restores what `export_state` returned.
 
         Raises:
             RuntimeError, KeyError: if it came from another kind or size of field.
         """
-        self.load_state_dict(packed)
+        self.load_state_dict(state)
 
 
 PER_PIXEL = 2.0
 """Most cells per pixel width: many views together show more than one does, but finer cells hold noise."""
 
 
-class Field(InBounds, Packable):
+class Field(InBounds, AnyField):
     """A radiance field in world coordinates. Subclasses define `features` and `colour`, or `density` and `forward`.
 
     Networks work in units of the bounds' half-size; `forward` and `density` convert to 1 / world unit, so that a scene in
@@ -119,7 +119,7 @@ class Field(InBounds, Packable):
         return density / self.unit_length, self.colour(features, directions)
 
 
-class PictureField(Packable):
+class PictureField(AnyField):
     """A picture as a function of position: subclasses define `forward`.
 
     Args:

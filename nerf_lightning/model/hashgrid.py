@@ -65,7 +65,7 @@ class HashGrid(torch.nn.Module):
         return sum(self.sizes[:level]) + entry_of(vertices, self.cells[level], self.sizes[level])
 
     @torch.no_grad()
-    def take(self, smaller: "HashGrid") -> Int[Tensor, "I"]:
+    def warm_start_from(self, smaller: "HashGrid") -> Int[Tensor, "I"]:
         """Copies the levels whose resolutions occur here too; this grid's tables are as large or larger.
 
         Returns:
@@ -155,10 +155,10 @@ class HashGridField(Field):
             self.density_net[-1].get_parameter("bias")[0] = self.START
 
     @torch.no_grad()
-    def take(self, smaller: Field) -> None:
+    def warm_start_from(self, smaller: Field) -> None:
         """Copies the levels that both grids have, and both networks if no level is missing here."""
         assert isinstance(smaller, HashGridField)
-        columns = self.grid.take(smaller.grid)
+        columns = self.grid.warm_start_from(smaller.grid)
         if (columns >= 0).all():
             widen_all(self.density_net, smaller.density_net, columns)
             widen_all(self.colour_net, smaller.colour_net, torch.arange(self.GEOMETRY + smaller.terms))

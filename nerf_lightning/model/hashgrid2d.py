@@ -64,7 +64,7 @@ class HashGrid2DField(PictureField):
         self.net = layers(len(self.sizes) * features, width, 3)
 
     @torch.no_grad()
-    def take(self, smaller: PictureField) -> None:
+    def warm_start_from(self, smaller: PictureField) -> None:
         """Copies the levels and the network if every level has the same grid and table size here."""
         assert isinstance(smaller, HashGrid2DField)
         features, places = self.tables.shape[1], []

@@ -60,7 +60,7 @@ class MLPField(Field):
         )
 
     @torch.no_grad()
-    def take(self, smaller: Field) -> None:
+    def warm_start_from(self, smaller: Field) -> None:
         """Copies a network with the same encodings and skip; further layers of the trunk pass on their input."""
         assert isinstance(smaller, MLPField)
         like = ("skip", "position_frequencies", "direction_frequencies")

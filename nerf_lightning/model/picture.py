@@ -47,7 +47,7 @@ class PictureMLP(PictureField):
         self.frequencies = frequencies
         self.net = relu_layers([2 * (1 + 2 * frequencies), *[width] * depth, 3])
 
-    def take(self, smaller: PictureField) -> None:
+    def warm_start_from(self, smaller: PictureField) -> None:
         """Copies a network with as many layers and at most as many octaves, which come first here."""
         assert isinstance(smaller, PictureMLP)
         mine, its = ([layer for layer in net if isinstance(layer, torch.nn.Linear)] for net in (self.net, smaller.net))

@@ -56,7 +56,7 @@ class VectorMatrix(torch.nn.Module):
         replace_data(self.lines, lines.transpose(1, 2).contiguous())
 
     @torch.no_grad()
-    def take(self, smaller: "VectorMatrix", silent: bool) -> None:
+    def warm_start_from(self, smaller: "VectorMatrix", silent: bool) -> None:
         """Copies another volume's components and its size; further components are new.
 
         Args:
@@ -164,12 +164,12 @@ class TensoRFField(Field):
         return self.resolutions[last if progress >= self.grown else int(progress / self.grown * last)]
 
     @torch.no_grad()
-    def take(self, smaller: Field) -> None:
+    def warm_start_from(self, smaller: Field) -> None:
         """Copies everything and refines it to the finest size at once: the coarse sizes have done their work."""
         assert isinstance(smaller, TensoRFField)
         # Densities are a plain sum; new colour components have no effect while their weights are zero.
-        self.density_volume.take(smaller.density_volume, silent=True)
-        self.colour_volume.take(smaller.colour_volume, silent=False)
+        self.density_volume.warm_start_from(smaller.density_volume, silent=True)
+        self.colour_volume.warm_start_from(smaller.colour_volume, silent=False)
         for volume in (self.density_volume, self.colour_volume):
             if volume.cells < self.resolutions[-1]:
                 volume.resize(self.resolutions[-1])

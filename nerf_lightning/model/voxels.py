@@ -172,7 +172,7 @@ class VoxelField(Field):
         self.seen = torch.zeros(len(self.vertex), dtype=torch.int32, device=keep.device)
 
     @torch.no_grad()
-    def take(self, smaller: Field) -> None:
+    def warm_start_from(self, smaller: Field) -> None:
         """Copies everything; from there it grows to its finest size in the usual number of stages."""
         assert isinstance(smaller, VoxelField)
         cells = smaller.side - 1
@@ -191,13 +191,13 @@ class VoxelField(Field):
         rows = torch.cat([self.index.new_zeros(1), self.index[keep]]).long()
         self.hold(keep, [table.detach()[rows] for table in self.tables])
 
-    def packed(self) -> dict[str, Tensor]:
+    def export_state(self) -> dict[str, Tensor]:
         tables = zip(TABLES, self.tables, strict=True)
         return {"kept": self.index > 0, **{name: table.detach() for name, table in tables}}
 
     @torch.no_grad()
-    def unpack(self, packed: dict[str, Tensor]) -> None:
-        keep, tables = packed["kept"], [packed[name] for name in TABLES]
+    def import_state(self, state: dict[str, Tensor]) -> None:
+        keep, tables = state["kept"], [state[name] for name in TABLES]
         if any(len(table) != int(keep.sum()) + 1 for table in tables):
             raise RuntimeError("tables of another length than there are vertices")
         self.hold(keep, tables)

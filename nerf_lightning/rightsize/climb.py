@@ -88,7 +88,7 @@ def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = No
     device = device_of(cfg)
     system = build_system(cfg, frame_of(data), device)
     if start is not None:
-        system.take(start.cpu())  # where a new system is
+        system.warm_start_from(start.cpu())  # where a new system is
         start.to(device)
     trainer = build_trainer(cfg, folder, device)
     warm_up(system, data, device)

@@ -57,9 +57,9 @@ def encode(system: System, precision: str, config: dict[str, Any], scene: dict[s
 
 def parts(system: System) -> dict[str, dict[str, Tensor]]:
     """The tensors to keep of each part of a system."""
-    packed = {"field": system.field.packed()}
+    packed = {"field": system.field.export_state()}
     if isinstance(system, NeRF3D):
-        packed["sampler"] = system.sampler.packed()
+        packed["sampler"] = system.sampler.export_state()
     return packed
 
 
@@ -124,9 +124,9 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
     cfg = OmegaConf.create(check_config(config, path))
     system = build_system(cfg, frame, device)
     try:
-        system.field.unpack(_of("field", tensors))
+        system.field.import_state(_of("field", tensors))
         if isinstance(system, NeRF3D):
-            system.sampler.unpack(_of("sampler", tensors))
+            system.sampler.import_state(_of("sampler", tensors))
     except (KeyError, RuntimeError) as error:
         raise InputError(path, "", str(error), "the weights of the model it names") from error
     return RunFolder(cfg, system.eval().to(device), orbit, to_source, scene)

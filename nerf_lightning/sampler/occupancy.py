@@ -51,8 +51,8 @@ class OccupancySampler(Sampler):
         memory: updates after which a cell that light no longer reaches is skipped.
         seen_by: cells seen by fewer training cameras stay empty: what only one camera sees can be anything, such as fog in
             front of its lens.
-        transparent: early-stop transmittance, above 0: below it a ray has ended.
-        thin: alpha threshold: training drops steps of lower opacity; at most half the mean, so that fog trains too.
+        early_stop_eps: early-stop transmittance, above 0: below it a ray has ended.
+        alpha_thre: alpha threshold: training drops steps of lower opacity; at most half the mean, so that fog trains too.
     """
 
     thickness: Tensor
@@ -72,14 +72,14 @@ class OccupancySampler(Sampler):
         warmup: int = 256,
         memory: Count = 8,
         seen_by: int = 3,
-        transparent: float = 1e-4,
-        thin: float = 5e-3,
+        early_stop_eps: float = 1e-4,
+        alpha_thre: float = 5e-3,
     ):
         super().__init__(bounds)
-        if not 0 < transparent < 1:
-            raise InputError("sampler.transparent", "", str(transparent), "between 0 and 1")
-        if not 0 <= thin < 1:
-            raise InputError("sampler.thin", "", str(thin), "at least 0, below 1")
+        if not 0 < early_stop_eps < 1:
+            raise InputError("sampler.early_stop_eps", "", str(early_stop_eps), "between 0 and 1")
+        if not 0 <= alpha_thre < 1:
+            raise InputError("sampler.alpha_thre", "", str(alpha_thre), "at least 0, below 1")
         self.samples = samples
         self.resolution = resolution
         self.threshold = threshold
@@ -88,8 +88,8 @@ class OccupancySampler(Sampler):
         self.warmup = warmup
         self.memory = memory
         self.seen_by = seen_by
-        self.transparent = transparent
-        self.thin = thin
+        self.early_stop_eps = early_stop_eps
+        self.alpha_thre = alpha_thre
         cells = resolution**3
         self.register_buffer("thickness", torch.zeros(cells))
         self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
@@ -113,14 +113,14 @@ class OccupancySampler(Sampler):
         if generator is None:
             packed = self._march(rays, near, far, torch.zeros_like(near), self.occupied)
             # A picture must not depend on how its rays are split into calls: only training uses the mean to drop steps.
-            return Samples(*keep_visible(self._thickness(density, rays, packed), packed, self.transparent, 0.0))
+            return Samples(*keep_visible(self._thickness(density, rays, packed), packed, self.early_stop_eps, 0.0))
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.occupied if self.look_everywhere else self.lit
         rooms = [None, None] if self.per_ray is None else [math.ceil(ROOM * many * len(rays)) for many in self.per_ray]
         packed = self._march(rays, near, far, shift, cells, rooms[0])
         found = self._thickness(density, rays, packed)
-        thin = found.mean().mul(0.5).clamp_max(-math.log1p(-self.thin)) if len(found) else 0.0
-        kept = keep_visible(found, packed, self.transparent, thin, rooms[1])
+        fog = found.mean().mul(0.5).clamp_max(-math.log1p(-self.alpha_thre)) if len(found) else 0.0
+        kept = keep_visible(found, packed, self.early_stop_eps, fog, rooms[1])
         places = Samples(*kept).positions(rays)
         mark_cells(self.reached, self.updates, self.bounds, places)
         if rooms[0] is not None:
@@ -168,13 +168,13 @@ class OccupancySampler(Sampler):
         self.occupied &= self.allowed
         self.lit &= self.allowed
 
-    def packed(self) -> dict[str, Tensor]:
+    def export_state(self) -> dict[str, Tensor]:
         return {"occupied": self.occupied}
 
-    def unpack(self, packed: dict[str, Tensor]) -> None:
-        if packed["occupied"].shape != self.occupied.shape:
-            raise RuntimeError(f"an occupancy grid of {len(packed['occupied'])} cells, not {len(self.occupied)}")
-        self.occupied.copy_(packed["occupied"])
+    def import_state(self, state: dict[str, Tensor]) -> None:
+        if state["occupied"].shape != self.occupied.shape:
+            raise RuntimeError(f"an occupancy grid of {len(state['occupied'])} cells, not {len(self.occupied)}")
+        self.occupied.copy_(state["occupied"])
 
     def restart(self, step: int) -> None:
         self.first_step = step

@@ -83,18 +83,18 @@ class Sampler(InBounds):
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         raise TypeError(f"{type(self).__name__} must define forward(rays, density, generator) -> Samples")
 
-    def packed(self) -> dict[str, Tensor]:
-        """What rendering needs, for `unpack`."""
+    def export_state(self) -> dict[str, Tensor]:
+        """What rendering needs, for `import_state`."""
         return {}
 
-    def unpack(self, packed: dict[str, Tensor]) -> None:
-        """Restores what `packed` returned.
+    def import_state(self, state: dict[str, Tensor]) -> None:
+        """Restores what `export_state` returned.
 
         Raises:
             RuntimeError, KeyError: if it came from another kind or size of sampler.
         """
 
-    def take(self, other: "Sampler") -> None:
+    def warm_start_from(self, other: "Sampler") -> None:
         """Copies what another sampler of the same kind and size has learned."""
         self.load_state_dict(other.state_dict())
 

@@ -49,10 +49,10 @@ class NeRF3D(System):
         self.sampler.chunk = chunk
         self.renderer = renderer
 
-    def take(self, smaller: System) -> None:
-        super().take(smaller)
+    def warm_start_from(self, smaller: System) -> None:
+        super().warm_start_from(smaller)
         assert isinstance(smaller, NeRF3D)  # checked by the field
-        self.sampler.take(smaller.sampler)
+        self.sampler.warm_start_from(smaller.sampler)
 
     @property
     def data(self) -> RayDataModule:

@@ -81,10 +81,10 @@ class System(L.LightningModule):
         """Compiler of the parts of a training step, see `compiled.part`; None does not compile."""
         self.stats = StepStats(torch.tensor(math.nan), 0, 0)
 
-    def take(self, smaller: "System") -> None:
+    def warm_start_from(self, smaller: "System") -> None:
         """Continues from what a system with a smaller field of the same kind has learned."""
         field: Any = self.field
-        field.take(smaller.field)
+        field.warm_start_from(smaller.field)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         optimizer = self.make_optimizer(self.parameters())

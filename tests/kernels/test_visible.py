@@ -14,9 +14,9 @@ def packed(samples: Samples):
 
 
 @pytest.mark.parametrize("counts", COUNTS)
-@pytest.mark.parametrize("transparent", [1e-4, 0.5])
-@pytest.mark.parametrize("thin", [0.0, 1e-3, 0.2])
-def test_what_is_seen_agrees_with_a_loop(counts: list[int], transparent: float, thin: float, kernels: str):
+@pytest.mark.parametrize("early_stop_eps", [1e-4, 0.5])
+@pytest.mark.parametrize("min_thickness", [0.0, 1e-3, 0.2])
+def test_what_is_seen_agrees_with_a_loop(counts: list[int], early_stop_eps: float, min_thickness: float, kernels: str):
     samples = ragged(counts)
     density = 20 * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.7)
     kept, ends, i = [], [0], 0
@@ -24,28 +24,28 @@ def test_what_is_seen_agrees_with_a_loop(counts: list[int], transparent: float, 
         transmittance = 1.0
         for _ in range(count):
             thickness = float(density[i]) * float(samples.dt[i])
-            if transmittance >= transparent and thickness >= thin:
+            if transmittance >= early_stop_eps and thickness >= min_thickness:
                 kept.append(i)
             transmittance *= math.exp(-thickness)
             i += 1
         ends.append(len(kept))
-    t, dt, ray, offsets = keep_visible(density * samples.dt, packed(samples), transparent, thin)
+    t, dt, ray, offsets = keep_visible(density * samples.dt, packed(samples), early_stop_eps, min_thickness)
     assert torch.equal(t, samples.t[kept]) and torch.equal(dt, samples.dt[kept])
     assert torch.equal(ray, samples.ray[kept]) and offsets.tolist() == ends
 
 
 @pytest.mark.parametrize("counts", [[], [0, 0], MANY])
-@pytest.mark.parametrize("thin", [0.0, 0.1])
-def test_what_is_seen_agrees_with_the_reference(counts: list[int], thin: float):
+@pytest.mark.parametrize("min_thickness", [0.0, 0.1])
+def test_what_is_seen_agrees_with_the_reference(counts: list[int], min_thickness: float):
     samples = ragged(counts)
     density = 30 * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.5)
     results = {}
     for choice in ("auto", "reference"):
         use_kernels(choice)
-        results[choice] = keep_visible(density * samples.dt, packed(samples), 1e-3, thin)
+        results[choice] = keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness)
     assert all(torch.equal(a, b) for a, b in zip(*results.values(), strict=True))
     use_kernels("auto")
-    one = with_threads(lambda: keep_visible(density * samples.dt, packed(samples), 1e-3, thin), 1)
+    one = with_threads(lambda: keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness), 1)
     assert all(torch.equal(a, b) for a, b in zip(one, results["auto"], strict=True))
 
 

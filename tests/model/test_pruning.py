@@ -8,7 +8,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.model import Field, HashGridField, VoxelField
 from nerf_lightning.model.layers.pruning import vertices_in, widened
-from tests.model.test_take import BOX, hashgrid, mlp, tensorf, voxels
+from tests.model.test_warm_start import BOX, hashgrid, mlp, tensorf, voxels
 
 FIELDS = pytest.mark.parametrize("make", [hashgrid, tensorf, voxels, mlp])
 Make = Callable[[], Field]
@@ -68,7 +68,7 @@ def test_pruning_leaves_less():
 def test_what_is_packed_can_be_unpacked(make: Make):
     field, other = make(), make()
     field.prune(some_cells())
-    other.unpack(field.packed())
+    other.import_state(field.export_state())
     positions, directions = BOX.to_world(torch.rand(40, 3)), normalize(torch.randn(40, 3), dim=1)
     for found, was in zip(other(positions, directions), field(positions, directions), strict=True):
         assert torch.equal(found, was)
@@ -76,6 +76,6 @@ def test_what_is_packed_can_be_unpacked(make: Make):
 
 def test_tables_that_do_not_fit_their_vertices_are_refused():
     field = voxels()
-    packed = field.packed()
+    packed = field.export_state()
     with pytest.raises(RuntimeError, match="another length"):
-        field.unpack({**packed, "colours": packed["colours"][:-1]})
+        field.import_state({**packed, "colours": packed["colours"][:-1]})

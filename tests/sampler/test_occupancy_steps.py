@@ -12,7 +12,7 @@ from nerf_lightning.sampler import OccupancySampler, Samples
 from nerf_lightning.sampler.occupancy import ASKED
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-OPEN = {"transparent": 1e-30, "thin": 0.0}
+OPEN = {"early_stop_eps": 1e-30, "alpha_thre": 0.0}
 """Nothing is dropped for what the field says."""
 
 
@@ -57,19 +57,21 @@ def test_steps_follow_the_generator(box: Bounds, rays: Rays):
     assert not same(sampler(rays, fog, seeded()), sampler(rays, fog))
 
 
-@pytest.mark.parametrize("transparent", [1e-4, 0.3])
-@pytest.mark.parametrize("thin", [0.0, 5e-3, 0.1])
-def test_what_is_kept_agrees_with_a_loop(transparent: float, thin: float, box: Bounds, rays: Rays, kernels: str):
-    sampler = OccupancySampler(box, samples=40, resolution=6, transparent=transparent, thin=thin)
+@pytest.mark.parametrize("early_stop_eps", [1e-4, 0.3])
+@pytest.mark.parametrize("alpha_thre", [0.0, 5e-3, 0.1])
+def test_what_is_kept_agrees_with_a_loop(
+    early_stop_eps: float, alpha_thre: float, box: Bounds, rays: Rays, kernels: str
+):
+    sampler = OccupancySampler(box, samples=40, resolution=6, early_stop_eps=early_stop_eps, alpha_thre=alpha_thre)
     sampler.occupied = torch.rand(6**3) < 0.6
     steps, actual = bare(sampler, rays, sampler.occupied, seeded()), sampler(rays, waves, seeded())
     thickness = (waves(steps.positions(rays)) * steps.dt).tolist()
-    assert 0.5 * sum(thickness) / len(thickness) > thin
+    assert 0.5 * sum(thickness) / len(thickness) > alpha_thre
     kept, ends = [], [0]
     for first, last in zip(steps.offsets[:-1].tolist(), steps.offsets[1:].tolist(), strict=True):
         before = 0.0
         for i in range(first, last):
-            if math.exp(-before) >= transparent and 1 - math.exp(-thickness[i]) >= thin:
+            if math.exp(-before) >= early_stop_eps and 1 - math.exp(-thickness[i]) >= alpha_thre:
                 kept.append(i)
             before += thickness[i]
         ends.append(len(kept))
@@ -98,7 +100,7 @@ def test_a_picture_does_not_depend_on_how_its_rays_are_cut(box: Bounds, rays: Ra
 
 @pytest.mark.parametrize("density", [0.0, 1e-6, 1e-3])
 def test_a_thin_fog_is_kept(density: float, box: Bounds, rays: Rays):
-    sampler = OccupancySampler(box, samples=40, resolution=6, thin=0.1)
+    sampler = OccupancySampler(box, samples=40, resolution=6, alpha_thre=0.1)
     everything = bare(sampler, rays, sampler.occupied, seeded())
     samples = sampler(rays, lambda x: torch.full((len(x),), density), seeded())
     short = everything.dt < 0.5 * everything.dt.mean() * (density > 0)  # cut off where a ray ends
@@ -136,7 +138,13 @@ def test_no_rays_or_only_misses_give_no_samples(box: Bounds, rays: Rays, kernels
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("transparent", 0.0), ("transparent", 1.0), ("transparent", -1e-4), ("thin", -0.1), ("thin", 1.0)],
+    [
+        ("early_stop_eps", 0.0),
+        ("early_stop_eps", 1.0),
+        ("early_stop_eps", -1e-4),
+        ("alpha_thre", -0.1),
+        ("alpha_thre", 1.0),
+    ],
 )
 def test_other_transmittances_and_opacities_are_refused(key: str, value: float):
     with pytest.raises(InputError, match=f"sampler.{key}"):

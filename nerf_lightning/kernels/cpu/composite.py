@@ -60,21 +60,21 @@ def backward(
 
 
 @kernel
-def visible(thickness, offsets, transparent, thin, keep, counts, workers):
+def visible(thickness, offsets, early_stop_eps, min_thickness, keep, counts, workers):
     """Marks samples that light can reach and that hold something, and counts them for each ray [R].
 
     Args:
-        transparent: early-stop transmittance: below it a ray has ended.
-        thin: alpha threshold, as an optical thickness: a sample below it holds nothing.
+        early_stop_eps: early-stop transmittance: below it a ray has ended.
+        min_thickness: alpha threshold, as an optical thickness: a sample below it holds nothing.
     """
     rays = len(offsets) - 1
-    furthest = -math.log(transparent)
+    furthest = -math.log(early_stop_eps)
     for worker in prange(workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
             optical, kept = 0.0, 0
             for n in range(offsets[ray], offsets[ray + 1]):
                 step = thickness[n]
-                keep[n] = not (optical > furthest or step < thin)  # NaN stays, to be noticed
+                keep[n] = not (optical > furthest or step < min_thickness)  # NaN stays, to be noticed
                 kept += keep[n]
                 optical += step
             counts[ray] = kept

@@ -44,7 +44,7 @@ def shifted_softplus(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return torch.nn.functional.softplus(x - 1.0)
 
 
-class Rectifier(torch.nn.Module):
+class SoftenableReLU(torch.nn.Module):
     """ReLU, the original NeRF's density. Zero density has no gradient, so a field can die: `soften` is the way out."""
 
     soft: Tensor
@@ -77,7 +77,7 @@ def density_activation(name: str) -> Callable[[Tensor], Tensor]:
     """
     match name:
         case "relu":
-            return Rectifier()
+            return SoftenableReLU()
         case "softplus":
             return shifted_softplus
         case "exp":

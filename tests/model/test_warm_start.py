@@ -67,7 +67,7 @@ def test_it_is_the_same_function_and_learns_with_all_it_has(make: Callable[..., 
     directions = normalize(torch.randn(60, 3), dim=1)
     wanted = smaller(positions, directions)
     assert (larger(positions, directions)[1] - wanted[1]).abs().max() > 1e-3, "it was another one"
-    larger.take(smaller)
+    larger.warm_start_from(smaller)
     for found, was in zip(larger(positions, directions), wanted, strict=True):
         torch.testing.assert_close(found, was, rtol=1e-4, atol=1e-5)
     optimizer = torch.optim.Adam(larger.parameters(), lr=1e-2)
@@ -86,7 +86,7 @@ def test_it_is_the_same_function_and_learns_with_all_it_has(make: Callable[..., 
 
 def test_voxels_go_on_growing_from_the_size_they_took():
     smaller, larger = voxels(finest=6), voxels(coarsest=4, finest=12)
-    larger.take(smaller)
+    larger.warm_start_from(smaller)
     assert isinstance(larger, VoxelField)
     assert larger.resolutions[0] == 6 and larger.resolutions[-1] == 12
     larger.grow(1.0)
@@ -115,7 +115,7 @@ def picture_mlp(frequencies: int = 2, width: int = 8) -> PictureField:
 def test_pictures_are_the_same_too(make: Callable[..., PictureField], large: dict):
     smaller, larger = make(), make(**large)
     uv = torch.rand(50, 2)
-    larger.take(smaller)
+    larger.warm_start_from(smaller)
     torch.testing.assert_close(larger(uv), smaller(uv), rtol=1e-4, atol=1e-5)
 
 
@@ -123,6 +123,6 @@ def test_what_does_not_fit_starts_anew():
     """A level that is missing, other encodings: nothing is half taken over in a network."""
     larger, smaller = hashgrid(), HashGridField(BOX, levels=2, log2_entries=6, coarsest=5, finest=7, width=8)
     before = larger.density_net[0].weight.detach().clone()
-    larger.take(smaller)
+    larger.warm_start_from(smaller)
     assert torch.equal(larger.density_net[0].weight, before)
-    assert Field(BOX).take(Field(BOX)) is None
+    assert Field(BOX).warm_start_from(Field(BOX)) is None
