@@ -38,7 +38,9 @@ install_import_hook(checked_modules(), "typechecker.check")
 
 # ruff: noqa: E402
 import pytest
-from once import once
+from filelock import FileLock
+from numba.core.dispatcher import Dispatcher
+from once import once, shared_folder
 from pretend import device  # noqa: F401  (a fixture)
 from torch.nn.functional import normalize
 
@@ -62,8 +64,20 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     os.environ["NERF_LIGHTNING_CACHE"] = str(tmp_path_factory.mktemp("cache"))
 
 
+@pytest.fixture(autouse=True, scope="session")
+def kernels_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """On a new machine each kernel is compiled by one process; the others wait for it and load what it has cached."""
+    compile, folder = Dispatcher.compile, shared_folder(tmp_path_factory)
+
+    def compile_once(self: Dispatcher, signature: object) -> object:
+        with FileLock(folder / f"{self.py_func.__module__}.{self.py_func.__qualname__}.lock"):
+            return compile(self, signature)
+
+    Dispatcher.compile = compile_once
+
+
 @pytest.fixture(autouse=True)
-def same_chance() -> None:
+def same_random_numbers() -> None:
     torch.manual_seed(0)
 
 

@@ -12,11 +12,15 @@ from filelock import FileLock
 T = TypeVar("T")
 
 
+def shared_folder(factory: pytest.TempPathFactory) -> Path:
+    """One for all processes of a test run."""
+    folder = factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder  # each has a folder of its own in there
+
+
 def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], T]) -> T:
     """What `make` returned for a new folder, in this process or another one."""
-    shared = factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:  # each has a folder of its own in there
-        shared = shared.parent
+    shared = shared_folder(factory)
     found = shared / f"{name}.pickle"
     with FileLock(shared / f"{name}.lock"):
         if not found.exists():

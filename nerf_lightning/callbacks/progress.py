@@ -12,6 +12,7 @@ from nerf_lightning.callbacks.attached import attached, data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.system import System
+from nerf_lightning.utils.progress import animates
 
 
 def clock(seconds: float) -> str:
@@ -22,13 +23,13 @@ def clock(seconds: float) -> str:
 
 
 class Progress(L.Callback):
-    """Shows how far the run is: a bar on a terminal, elsewhere a line from time to time.
+    """Shows how far the run is: a bar on a terminal or in a notebook (with ipywidgets), elsewhere a line from time to time.
 
     The time left is the rest of the budget plus the rendering still to come (measurements, test, orbit), at the speed of the
     last view rendered.
 
     Args:
-        every_seconds: between lines, when there is no terminal.
+        every_seconds: between lines, when there is no bar.
     """
 
     def __init__(self, every_seconds: float = 15):
@@ -81,7 +82,7 @@ class Progress(L.Callback):
         self.console.quiet = not trainer.is_global_zero  # only the first of several processes prints
 
     def open(self, name: str) -> None:
-        if self.bar is None and self.console.is_terminal and not self.console.quiet:
+        if self.bar is None and animates(self.console) and not self.console.quiet:
             columns = (
                 TextColumn("{task.description}"),
                 BarColumn(),

@@ -2,7 +2,7 @@
 
 import copy
 import logging
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -36,6 +36,7 @@ from nerf_lightning.system.compiled import BACKEND, check_compiler
 from nerf_lightning.utils.allocator import keep_freed_memory
 from nerf_lightning.utils.machine import CROWDED, crowding
 from nerf_lightning.utils.options import AtLeast, Count, check_options
+from nerf_lightning.utils.progress import animates
 from nerf_lightning.utils.quiet import quiet
 from nerf_lightning.utils.seeding import Stream, step_generator
 
@@ -170,7 +171,8 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
     """
     compiled = device.type == "cpu" or system.backend is not None
     told = " (the first time they are compiled: half a minute)" if compiled else ""
-    with Console().status(f"getting the kernels ready{told}"):
+    console = Console()
+    with console.status(f"getting the kernels ready{told}") if animates(console) else nullcontext():
         trial = copy.deepcopy(system).to(device)
         if isinstance(trial, NeRF3D):
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for

@@ -1,6 +1,7 @@
 """A progress bar for a loop."""
 
 from collections.abc import Iterable, Iterator
+from importlib.util import find_spec
 from typing import TypeVar
 
 from rich.console import Console
@@ -9,9 +10,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 T = TypeVar("T")
 
 
+def animates(console: Console) -> bool:
+    """Whether a console can show a moving bar: a terminal can, and a notebook with ipywidgets."""
+    return console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
+
+
 def tracked(items: Iterable[T], total: int, words: str) -> Iterator[T]:
-    """Yields the items while a bar shows their count and the time left; on terminals only."""
+    """Yields the items while a bar shows their count and the time left; where it can move."""
     console = Console(stderr=True)
     columns = TextColumn(words), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not animates(console)) as bar:
         yield from bar.track(items, total=total)
