@@ -178,7 +178,7 @@ def unbind(system: NeRF3D) -> None:
 @pytest.mark.parametrize("precision", ["bf16-mixed", "16-mixed"])
 @pytest.mark.parametrize("name", MODELS)
 def test_halves_train_every_method(name: str, precision: str, device: torch.device, tmp_path: Path):
-    quick = ["callbacks.snapshots=null", "callbacks.heldout=null", "callbacks.orbit=null", "budget.steps=4"]
+    quick = ["callbacks.snapshots=null", "callbacks.heldout=null", "callbacks.orbit=null", "budget.steps=2"]
     cfg = composed([*options(name), *ON_IT, *quick, f"trainer.precision={precision}"], tmp_path)
     data = build_data(cfg)
     system = build_system(cfg, frame_of(data), device)
@@ -290,9 +290,9 @@ MOST = {"tensorf": 250, "hashgrid": 250, "voxels": 250, "mlp": 220}
 
 @pytest.mark.parametrize("name", MOST)
 def test_a_step_asks_little_of_the_device(name: str, device: torch.device, tmp_path: Path):
-    """As shipped, of a field that has its size; reading a result, or how large it is, makes the host wait."""
+    """As shipped, of a field that has its size; reading a result, or its size, makes the host wait."""
     small = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1"]
-    system, data = system_of([f"recipe={name}_medium", *small, "sampler.warmup=0"], tmp_path)
+    system, data = system_of([f"recipe={name}_medium", *small, "sampler.warmup=0", "sampler.update_every=4"], tmp_path)
     assert isinstance(system, NeRF3D)
     system, period, counts = system.to(device), system.sampler.update_every, []
     optimizer = system.configure_optimizers()
@@ -311,7 +311,7 @@ def test_a_step_asks_little_of_the_device(name: str, device: torch.device, tmp_p
     for count in counts[-period + 2 :]:
         assert count.operations <= MOST[name], count.names.most_common()
         assert count.waits == 0, count.names.most_common()
-    assert 0 < fmean(count.waits for count in counts[-period:]) <= 0.5
+    assert 0 < sum(count.waits for count in counts[-period:]) <= 8, "for an update"
 
 
 @pytest.mark.parametrize("name", ["hashgrid2d", "picture_mlp", "fourier", "siren"])

@@ -55,28 +55,28 @@ def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(
     from nerf_lightning.callbacks import Checkpoints
 
     small = ["-m", "+experiment=smoke_2d", "dataset.max_side=16", "model.width=8", "seed=0,1", *BARE]
-    assert inside(*small, "budget.steps=20", "name=whole")[0] == 0
+    assert inside(*small, "budget.steps=10", "name=whole")[0] == 0
     save = Checkpoints.save
 
     def saved_and_broken(self, trainer, name):
         save(self, trainer, name)
-        if trainer.global_step == 11:
+        if trainer.global_step == 6:
             raise OSError("no space left on device")
 
     monkeypatch.setattr(Checkpoints, "save", saved_and_broken)
     steps = "callbacks.checkpoints.every_seconds=1e-6"
-    code, out, err = inside(*small, "budget.steps=20", "name=broken", steps)
+    code, out, err = inside(*small, "budget.steps=10", "name=broken", steps)
     assert code == 1 and "no space left" in err
     monkeypatch.setattr(Checkpoints, "save", save)
-    code, out, err = inside(*small, "budget.steps=20", "name=broken", steps)
+    code, out, err = inside(*small, "budget.steps=10", "name=broken", steps)
     assert code == 0 and out.count("goes on from its last checkpoint") == 2
     whole, broken = (next((tmp_path / "outputs" / name).glob("sweep_*")) / "seed=1" for name in ("whole", "broken"))
     first, second = (torch.load(path / "checkpoints" / "last.ckpt", weights_only=True) for path in (whole, broken))
-    assert first["global_step"] == second["global_step"] == 20
+    assert first["global_step"] == second["global_step"] == 10
     assert all(torch.equal(first["state_dict"][key], second["state_dict"][key]) for key in first["state_dict"])
     text = (broken / "config.yaml").read_text()
     (broken / "config.yaml").write_text(text.replace("lr: 0.01", "lr: 0.02"))
-    code, out, err = inside(*small, "budget.steps=20", "name=broken", steps)
+    code, out, err = inside(*small, "budget.steps=10", "name=broken", steps)
     assert "seed=0: done before" in out and "seed=1: starts" in out
     assert not (broken / "error.txt").exists()
 
@@ -119,7 +119,7 @@ def test_two_processes_share_a_run_and_leave_one_folder(inside, tmp_path: Path):
     options = [
         "+experiment=picture",
         "dataset.max_side=32",
-        "budget.steps=150",
+        "budget.steps=100",
         "trainer.accelerator=cpu",
         "threads=1",
     ] + BARE
@@ -136,7 +136,7 @@ def test_two_processes_share_a_run_and_leave_one_folder(inside, tmp_path: Path):
         assert told.count("everything is in") == 1
     one, two = results
     assert abs(one["psnr"] - two["psnr"]) < 0.2 and one["psnr"] > 15
-    assert (two["steps"], two["status"]) == (150, "finished")
+    assert (two["steps"], two["status"]) == (100, "finished")
 
 
 def test_a_missing_launcher_says_what_to_install(inside, monkeypatch):
