@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from benchmarks.methods import train
+from benchmarks.synthetic.photos import Flaws, Truth, write_capture
 from nerf_lightning.cameras import look_at
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.pack import pack
@@ -15,7 +16,6 @@ from nerf_lightning.capture.poses.pose import mark_poses
 from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.poses.walk import choose
 from nerf_lightning.capture.run import Capture, capture
-from nerf_lightning.capture.synthetic import Flaws, Truth, write_capture
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import TagLayout, flat_pose
 from nerf_lightning.dataset.formats.npz import save_npz

@@ -11,11 +11,11 @@ import trimesh
 
 from benchmarks.capture import FLAWS, LENS, SHEETS, SIZE, home
 from benchmarks.methods import train
+from benchmarks.synthetic.photos import write_capture
+from benchmarks.synthetic.tabletop import Tabletop
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.run import capture
-from nerf_lightning.capture.synthetic import write_capture
-from nerf_lightning.capture.tabletop import Tabletop
 from nerf_lightning.capture.tags.layout import TagLayout
 from nerf_lightning.dataset.bricks.model import bulldozer
 from nerf_lightning.export.mesh import mesh_file

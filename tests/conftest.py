@@ -44,8 +44,8 @@ from once import once, shared_folder
 from pretend import device  # noqa: F401  (a fixture)
 from torch.nn.functional import normalize
 
+from benchmarks.synthetic.photos import Flaws, Truth, write_capture
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.capture.synthetic import Flaws, Truth, write_capture
 from nerf_lightning.kernels import use_kernels
 
 

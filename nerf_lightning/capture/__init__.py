@@ -1,1 +1,1 @@
-"""Stage 0, photos -> scene: tags, lens, cameras, undistortion, packing; and synthetic captures to test them on."""
+"""Photos -> scene: tags, lens, cameras, undistortion, packing."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
+from benchmarks.synthetic.viewpoints import in_frame, object_cameras, sheet_cameras
 from nerf_lightning.capture.outcome import Outcome, calibration_outcomes, photo_outcomes, thinned
 from nerf_lightning.capture.pack import pack
 from nerf_lightning.capture.poses.calibrate import calibrate
@@ -21,7 +22,6 @@ from nerf_lightning.capture.report.write import write_report
 from nerf_lightning.capture.run import Capture, Placed
 from nerf_lightning.capture.tags.detect import Mark, Sighting
 from nerf_lightning.capture.tags.layout import SQUARE, TagLayout, flat_pose
-from nerf_lightning.capture.viewpoints import in_frame, object_cameras, sheet_cameras
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.drawing.ink import ORANGE, SKY, magnification, pixels_of, readable, rgb, shortened
 

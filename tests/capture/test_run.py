@@ -11,6 +11,8 @@ import yaml
 from capture.views import LENS, SIX, SIZE, SMALL
 from once import once
 
+from benchmarks.synthetic.photos import Truth
+from benchmarks.synthetic.tabletop import Tabletop
 from nerf_lightning.cameras import transform
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.pack import pack
@@ -18,8 +20,6 @@ from nerf_lightning.capture.photos import find_photos
 from nerf_lightning.capture.poses.calibrate import calibrate
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
 from nerf_lightning.capture.run import Capture, capture
-from nerf_lightning.capture.synthetic import Truth
-from nerf_lightning.capture.tabletop import Tabletop
 from nerf_lightning.capture.tags.detect import guess_family, sight, tag_detector
 from nerf_lightning.capture.tags.layout import TagLayout, flat_pose, read_layout
 from nerf_lightning.dataset import open_scene

@@ -8,11 +8,11 @@ import pytest
 import yaml
 from capture.views import SIX, SMALL, camera
 
+from benchmarks.synthetic.photos import Flaws, render_photo
+from benchmarks.synthetic.viewpoints import object_cameras
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.poses.geometry import to_matrix
 from nerf_lightning.capture.poses.structure import capture_without_tags, upright
-from nerf_lightning.capture.synthetic import Flaws, render_photo
-from nerf_lightning.capture.viewpoints import object_cameras
 from nerf_lightning.dataset import open_scene
 from nerf_lightning.errors import InputError
 

@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 from capture.views import SIZE
 
+from benchmarks.synthetic.photos import Truth
 from nerf_lightning.capture.__main__ import task
-from nerf_lightning.capture.synthetic import Truth
 from nerf_lightning.config import cli
 
 main = partial(cli.run, "capture", task)

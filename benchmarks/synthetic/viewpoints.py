@@ -1,4 +1,4 @@
-"""Where the cameras of a synthetic capture stand: poses that photograph a sheet from everywhere, and walk around an object."""
+"""Where the cameras of a synthetic capture stand: all around a sheet of tags, and all around an object."""
 
 import itertools
 
@@ -7,15 +7,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from benchmarks.synthetic.tabletop import Tabletop
 from nerf_lightning.cameras import look_at
 from nerf_lightning.capture.poses.geometry import inverse, move, normalised, project
-from nerf_lightning.capture.tabletop import Tabletop
 from nerf_lightning.capture.tags.layout import TagLayout
 from nerf_lightning.dataset.lens import Lens
-from nerf_lightning.errors import InputError
 
 GOLDEN = (np.sqrt(5) - 1) / 2
-"""Multiples of it modulo 1 fill [0, 1] evenly, however many are taken."""
+"""Its multiples modulo 1 fill [0, 1] evenly, whatever their number."""
 RIM = 0.02
 """Share of the frame's width that stays free between a tag and the frame's edge."""
 STEEPEST = 45.0
@@ -25,21 +24,12 @@ ELEVATIONS = (28.0, 68.0)
 
 
 def sheet_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Float[np.ndarray, "count 4 4"]:
-    """Poses for calibration: all tags in every photo, and in each photo at another side or corner of the frame.
+    """Poses for calibration, camera to world in metres: every photo shows all tags, each near another part of the frame.
 
-    Tilts of up to 45 degrees toward all sides, any roll, distances from as near as possible to a third further.
-
-    Args:
-        layout: tags lying in the plane z = 0.
-        lens: through which they must be seen.
-        count: how many.
-        seed: other poses for another one.
-
-    Returns:
-        Camera to world, metres.
+    Tilts of up to 45 degrees toward all sides, any roll, distances from as near as possible to a third farther.
     """
     rng = np.random.default_rng(seed)
-    # With their white rim, without which no detector finds them.
+    # With the white rim that detectors need.
     tags = np.concatenate([1.4 * layout.corners(tag) - 0.4 * layout.poses[tag][:3, 3] for tag in layout.poses])
     centre = (tags.min(0) + tags.max(0)) / 2
     # The frame's middle, corners and sides, the corners twice as often: there the distortion shows.
@@ -50,6 +40,7 @@ def sheet_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Float
         turn, roll = 2 * np.pi * ((start[1] + i * GOLDEN**2) % 1), rng.uniform(-np.pi, np.pi)
         spread = 1 + 0.3 * rng.random()
         direction = _direction(turn, np.pi / 2 - tilt)
+        # The nearest distance at which all tags are in the frame, by bisection.
         near, far = 0.1 * layout.size, 1e3 * layout.size
         for _ in range(40):
             middle = np.sqrt(near * far)
@@ -58,28 +49,19 @@ def sheet_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Float
         c2w = _placed(centre, spread * far * direction, roll)
         # As far toward the goal as all tags stay in the frame.
         goal = (goals[i % len(goals)] + 1) / 2 * (lens.width, lens.height)
-        shares = np.linspace(1, 0, 41)
-        places = (_aimed(lens, c2w, centre, (1 - s) * np.array([lens.cx, lens.cy]) + s * goal) for s in shares)
-        out.append(next((place for place in places if in_frame(lens, place, tags).all()), c2w))
+        middle_pixel = np.array([lens.cx, lens.cy])
+        aimed = (_aimed(lens, c2w, centre, (1 - s) * middle_pixel + s * goal) for s in np.linspace(1, 0, 41))
+        out.append(next((pose for pose in aimed if in_frame(lens, pose, tags).all()), c2w))
     return np.array(out)
 
 
 def object_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Float[np.ndarray, "count 4 4"]:
-    """Poses all around the bulldozer, from changing heights and distances, a little tilted, with tags in view.
+    """Poses at even steps around the bulldozer, camera to world in metres, at changing heights and distances.
 
-    All of the bulldozer is in every frame, and so are two tags that it does not hide (one if there is only one).
-
-    Args:
-        layout: tags lying in the plane z = 0.
-        lens: through which they must be seen.
-        count: how many, at even steps around the object.
-        seed: other poses for another one.
-
-    Returns:
-        Camera to world, metres.
+    Every photo shows all of the bulldozer, and two tags that it does not hide (one if there is only one).
 
     Raises:
-        InputError: where the tags lie so that hardly a place shows the object and two of them.
+        ValueError: hardly any place shows the object and two tags.
     """
     rng = np.random.default_rng(seed)
     top = Tabletop(layout)
@@ -92,7 +74,7 @@ def object_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Floa
     for i in range(count):
         near = 1.0
         for attempt in range(100):
-            # From low down the object hides what is behind it: other heights are tried, and places farther along.
+            # From low down the object hides what is behind it: try other heights, and places farther along.
             turn = 2 * np.pi * (start + (i + rng.uniform(-0.3, 0.3)) / count + 0.002 * attempt * rng.uniform(-1, 1))
             height = (start + i * GOLDEN + (0.1 + 0.01 * attempt) * rng.uniform(-1, 1)) % 1
             elevation = np.radians(ELEVATIONS[0] + (ELEVATIONS[1] - ELEVATIONS[0]) * height)
@@ -104,15 +86,13 @@ def object_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Floa
                 break
             near *= 1.02  # from further away more is in the frame
         else:
-            raise InputError(
-                "object_cameras", "layout", "no view of the object and two tags", "tags nearer to each other"
-            )
+            raise ValueError("no view shows the object and two tags: they lie too far apart")
         out.append(c2w)
     return np.array(out)
 
 
 def in_frame(lens: Lens, c2w: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]) -> Bool[np.ndarray, "M"]:
-    """Which points a photo shows, if nothing stands before them, a little inside its edges."""
+    """Which points lie within a photo's frame, a little inside its edges."""
     rim = RIM * lens.width
     local = move(inverse(c2w), points)
     # Beyond the frame's corners the distortion's polynomial may turn back: what seems to be in the frame is not.
@@ -128,12 +108,8 @@ def in_frame(lens: Lens, c2w: Float[np.ndarray, "4 4"], points: Float[np.ndarray
 
 def tags_in_view(top: Tabletop, lens: Lens, c2w: Float[np.ndarray, "4 4"]) -> list[int]:
     """The tags that a photo of the object shows whole: in the frame, not under the object, not behind it."""
-    seen = []
-    for tag in sorted(top.free_tags):
-        corners = top.layout.corners(tag)
-        if in_frame(lens, c2w, corners).all() and not top.in_front(c2w[:3, 3], corners).any():
-            seen.append(tag)
-    return seen
+    corners = {tag: top.layout.corners(tag) for tag in sorted(top.free_tags)}
+    return [t for t, c in corners.items() if in_frame(lens, c2w, c).all() and not top.in_front(c2w[:3, 3], c).any()]
 
 
 def _direction(turn: float, elevation: float) -> Float[np.ndarray, "3"]:

@@ -12,12 +12,11 @@ from nerf_lightning.dataset.bricks.model import bulldozer
 from nerf_lightning.dataset.bricks.shading import shade
 from nerf_lightning.dataset.bricks.solids import Solids
 from nerf_lightning.dataset.bricks.trace import nearest, shadow
-from nerf_lightning.errors import InputError
 
 INK, PAPER, WALL = 0.09, 0.90, 0.75
 """Shades of grey in sRGB."""
 WOOD, GRAIN = np.array([0.56, 0.44, 0.33]), np.array([0.10, 0.10, 0.09])
-"""sRGB of the table, and how far its texture goes up and down."""
+"""sRGB of the table, and the amplitude of its texture."""
 RIM = 0.3
 """Metres of table all around the paper."""
 LENGTH = 0.12
@@ -33,30 +32,27 @@ class Tabletop:
     """
 
     def __init__(self, layout: TagLayout):
-        for tag, pose in layout.poses.items():
-            if not np.allclose(pose[2], [0, 0, 1, 0]):
-                raise InputError(
-                    "tabletop", f"layout.poses.{tag}", f"{pose[2]}", "a tag lying face up in the plane z = 0"
-                )
+        if not all(np.allclose(pose[2], [0, 0, 1, 0]) for pose in layout.poses.values()):
+            raise ValueError("tags must lie face up in the plane z = 0")
         self.layout = layout
         corners = {tag: layout.corners(tag)[:, :2] for tag in layout.poses}
         every = np.concatenate(list(corners.values()))
+        patterns = family(layout.dictionary)
         # Twice the white rim of one module that detectors ask for, in the family with the largest modules.
         margin = layout.size / 3
         self.paper: Float[np.ndarray, "2 2"] = np.stack([every.min(0) - margin, every.max(0) + margin])
         self.middle: Float[np.ndarray, "2"] = self.paper.mean(0)
         self.radius = float(np.linalg.norm(self.paper[1] - self.middle)) + RIM
-        side = family(layout.dictionary).markerSize + 2
-        self._modules = {
-            tag: cv2.aruco.generateImageMarker(family(layout.dictionary), tag, side) > 127 for tag in layout.poses
-        }
+        side = patterns.markerSize + 2
+        self._modules = {tag: cv2.aruco.generateImageMarker(patterns, tag, side) > 127 for tag in layout.poses}
 
         low, high = bulldozer().aabb
         self.scale = LENGTH / (high[1] - low[1])
         """Metres a unit of the bulldozer's own frame, which is moved but not turned."""
         size = self.scale * (high - low)
         spot = self.middle
-        free = {tag for tag in corners if self._apart(corners[tag], spot, size[:2])}
+        low_spot, high_spot = spot - size[:2] / 2, spot + size[:2] / 2
+        free = {t for t, c in corners.items() if ((c.min(0) > high_spot) | (c.max(0) < low_spot)).any()}
         if 2 * len(free) < len(corners):
             spot = np.array([self.middle[0], self.paper[1, 1] + 0.6 * LENGTH])
             free = set(corners)
@@ -67,34 +63,20 @@ class Tabletop:
         self.shift = self.box[0] - self.scale * low
         """World = scale * own frame + shift."""
 
-    @staticmethod
-    def _apart(corners: Float[np.ndarray, "4 2"], spot: Float[np.ndarray, "2"], size: Float[np.ndarray, "2"]) -> bool:
-        """Whether the box around a tag and a box lie apart."""
-        return bool(((corners.min(0) > spot + size / 2) | (corners.max(0) < spot - size / 2)).any())
-
     def colours(
         self, eye: Float[np.ndarray, "3"], directions: Float[np.ndarray, "N 3"], with_object: bool
     ) -> Float[np.ndarray, "N 3"]:
-        """What rays from a point above the table see.
-
-        Args:
-            eye: world frame.
-            directions: unit, world frame.
-            with_object: whether the bulldozer stands there.
-
-        Returns:
-            sRGB in [0, 1].
-        """
+        """sRGB in [0, 1] that rays with these unit directions see, from a point above the table; world frame."""
         with np.errstate(divide="ignore"):
             t = np.where(directions[:, 2] < 0, -eye[2] / directions[:, 2], np.inf)
         down = np.flatnonzero(np.isfinite(t))
         points = eye[:2] + t[down, None] * directions[down, :2]
         near = ((points - self.middle) ** 2).sum(-1) < self.radius**2
-        table = down[near]
+        table, points = down[near], points[near]
         out = np.full((len(directions), 3), WALL)
-        out[table] = self.ground(points[near])
+        out[table] = self.ground(points)
         if with_object:
-            out[table] *= np.where(self._shaded(points[near]), SHADE, 1)[:, None]
+            out[table] *= np.where(self._shaded(points), SHADE, 1)[:, None]
             self._add_object(out, eye, directions, t)
         return out
 
@@ -132,7 +114,7 @@ class Tabletop:
         directions: Float[np.ndarray, "N 3"],
         t: Float[np.ndarray, "N"],
     ) -> None:
-        """Paints the bulldozer over what lies further than it; `t` is how far that is."""
+        """Paints the bulldozer over whatever is farther away; `t` is the distance of that."""
         origin = (eye - self.shift) / self.scale
         some = _in_cone(bulldozer(), origin, directions)
         if not len(some):
@@ -162,7 +144,7 @@ def _wood(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
 def _in_cone(
     solids: Solids, origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "N 3"]
 ) -> Int[np.ndarray, "P"]:
-    """Numbers of the solids that a bundle of rays may meet: whose bounding sphere reaches into the cone around them."""
+    """Indices of the solids that some rays may hit: those whose bounding sphere reaches into the cone around the rays."""
     axis = directions.mean(0)
     axis /= np.linalg.norm(axis)
     opening = np.arccos(np.clip((directions @ axis).min(), -1, 1))

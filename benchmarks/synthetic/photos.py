@@ -1,0 +1,135 @@
+"""Photos of a printed sheet and an object, taken by known cameras through a known lens."""
+
+import functools
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import imageio.v3 as imageio
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from benchmarks.synthetic.tabletop import Tabletop
+from benchmarks.synthetic.viewpoints import object_cameras, sheet_cameras
+from nerf_lightning.capture.poses.geometry import normalised
+from nerf_lightning.capture.tags.layout import TagLayout
+from nerf_lightning.dataset.bricks.trace import shadow
+from nerf_lightning.dataset.lens import Lens
+
+SUPERSAMPLING = 3
+"""Samples a pixel along each side."""
+BLOCK = 32
+"""Side of the blocks in pixels that are traced at once: as many rays as stay in a core's cache."""
+
+
+@dataclass(frozen=True)
+class Flaws:
+    """What a real camera adds."""
+
+    blur: float = 0.5
+    """Standard deviation of a Gaussian, pixels."""
+    noise: float = 2.0
+    """Standard deviation of Gaussian noise, in steps of the 8-bit values."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a capture must find."""
+
+    lens: Lens
+    layout: TagLayout
+    calibration: dict[str, Float[np.ndarray, "4 4"]]
+    """Camera to world in metres, by file name, for the photos of the sheet alone."""
+    photos: dict[str, Float[np.ndarray, "4 4"]]
+    """The same for the photos of the object."""
+
+
+def render_photo(
+    layout: TagLayout, lens: Lens, c2w: Float[np.ndarray, "4 4"], with_object: bool, flaws: Flaws, seed: int
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A photo of the tabletop, sRGB.
+
+    Each pixel is the mean of a grid of exact rays, taken in sRGB, so that an edge runs where half of a pixel's area is dark.
+    (A sensor takes the mean in linear light, which makes bright areas a little larger; detectors that fit edges in sRGB would
+    then be blamed for it.)
+
+    Args:
+        layout: tags lying in the plane z = 0.
+        lens: with or without distortion.
+        c2w: the camera, above the table; metres.
+        with_object: whether the bulldozer stands on the table.
+        flaws: what is added to the exact picture.
+        seed: of the noise.
+    """
+    tabletop = Tabletop(layout)
+    exact = np.empty((lens.height, lens.width, 3), np.float32)
+    grid = _tangents(lens)
+    for top in range(0, lens.height, BLOCK):
+        for left in range(0, lens.width, BLOCK):
+            block = np.s_[top : top + BLOCK, left : left + BLOCK]
+            rays = grid[block].reshape(-1, 2) @ c2w[:3, :2].T + c2w[:3, 2]
+            rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+            colours = tabletop.colours(c2w[:3, 3], rays, with_object)
+            exact[block] = colours.reshape(*grid[block].shape[:3], 3).mean(2)
+    photo: np.ndarray = 255 * exact
+    if flaws.blur > 0:
+        photo = cv2.GaussianBlur(photo, (0, 0), flaws.blur)
+    photo += flaws.noise * np.random.default_rng(seed).standard_normal(photo.shape, np.float32)
+    return np.rint(photo).clip(0, 255).astype(np.uint8)
+
+
+@functools.lru_cache(maxsize=1)
+def _tangents(lens: Lens) -> Float[np.ndarray, "H W S 2"]:
+    """x / z and y / z of all samples in the camera frame; kept, because undoing the distortion takes as long as a photo.
+
+    The samples of a pixel form a grid that is sheared both ways, so that no two share a row or a column: edges along the
+    frame come out as smooth as others.
+    """
+    n = SUPERSAMPLING
+    i, j = (k.reshape(-1) for k in np.meshgrid(np.arange(n), np.arange(n)))
+    col, row = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
+    x, y = col[..., None] + (i + (j + 0.5) / n) / n, row[..., None] + (j + (n - i - 0.5) / n) / n
+    pixels = np.stack([x, y], axis=-1)
+    lines = [normalised(lens, line.reshape(-1, 2)).astype(np.float32) for line in pixels]
+    return np.stack(lines).reshape(pixels.shape)
+
+
+def write_capture(
+    folder: Path,
+    layout: TagLayout,
+    lens: Lens,
+    sheet_views: int,
+    object_views: int,
+    flaws: Flaws,
+    seed: int = 0,
+) -> Truth:
+    """Writes `calibration/000.png ...`, photos of the sheet alone, and `photos/000.png ...`, photos with the object.
+
+    Args:
+        folder: made if it does not exist.
+        layout: tags lying in the plane z = 0.
+        lens, flaws: of all photos.
+        sheet_views, object_views: how many photos of each kind.
+        seed: of cameras and noise; the same one gives the same bytes.
+    """
+    _tangents(lens)  # made once, before the threads ask for it, and so is the shadow
+    shadow()
+    seeds = iter(np.random.SeedSequence(seed).generate_state(2 + sheet_views + object_views).tolist())
+    poses = {
+        "calibration": sheet_cameras(layout, lens, sheet_views, next(seeds)),
+        "photos": object_cameras(layout, lens, object_views, next(seeds)),
+    }
+    named = {kind: {f"{i:03d}.png": c2w for i, c2w in enumerate(c2ws)} for kind, c2ws in poses.items()}
+
+    def write(kind: str, name: str, photo_seed: int) -> None:
+        photo = render_photo(layout, lens, named[kind][name], kind == "photos", flaws, photo_seed)
+        imageio.imwrite(folder / kind / name, photo)
+
+    jobs = [(kind, name, next(seeds)) for kind, photos in named.items() for name in photos]
+    for kind in named:
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        list(pool.map(lambda job: write(*job), jobs))
+    return Truth(lens, layout, **named)
