@@ -18,8 +18,6 @@ from nerf_lightning.capture.tags.layout import TagLayout
 from nerf_lightning.dataset.bricks.trace import shadow
 from nerf_lightning.dataset.lens import Lens
 
-SUPERSAMPLING = 3
-"""Samples a pixel along each side."""
 BLOCK = 32
 """Side of the blocks in pixels that are traced at once: as many rays as stay in a core's cache."""
 
@@ -47,7 +45,13 @@ class Truth:
 
 
 def render_photo(
-    layout: TagLayout, lens: Lens, c2w: Float[np.ndarray, "4 4"], with_object: bool, flaws: Flaws, seed: int
+    layout: TagLayout,
+    lens: Lens,
+    c2w: Float[np.ndarray, "4 4"],
+    with_object: bool,
+    flaws: Flaws,
+    seed: int,
+    samples: int = 3,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """A photo of the tabletop, sRGB.
 
@@ -62,10 +66,11 @@ def render_photo(
         with_object: whether the bulldozer stands on the table.
         flaws: what is added to the exact picture.
         seed: of the noise.
+        samples: rays a pixel, along each side.
     """
     tabletop = Tabletop(layout)
     exact = np.empty((lens.height, lens.width, 3), np.float32)
-    grid = _tangents(lens)
+    grid = _tangents(lens, samples)
     for top in range(0, lens.height, BLOCK):
         for left in range(0, lens.width, BLOCK):
             block = np.s_[top : top + BLOCK, left : left + BLOCK]
@@ -81,13 +86,12 @@ def render_photo(
 
 
 @functools.lru_cache(maxsize=1)
-def _tangents(lens: Lens) -> Float[np.ndarray, "H W S 2"]:
+def _tangents(lens: Lens, n: int) -> Float[np.ndarray, "H W S 2"]:
     """x / z and y / z of all samples in the camera frame; kept, because undoing the distortion takes as long as a photo.
 
     The samples of a pixel form a grid that is sheared both ways, so that no two share a row or a column: edges along the
     frame come out as smooth as others.
     """
-    n = SUPERSAMPLING
     i, j = (k.reshape(-1) for k in np.meshgrid(np.arange(n), np.arange(n)))
     col, row = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
     x, y = col[..., None] + (i + (j + 0.5) / n) / n, row[..., None] + (j + (n - i - 0.5) / n) / n
@@ -104,6 +108,8 @@ def write_capture(
     object_views: int,
     flaws: Flaws,
     seed: int = 0,
+    steps: int | None = None,
+    samples: int = 3,
 ) -> Truth:
     """Writes `calibration/000.png ...`, photos of the sheet alone, and `photos/000.png ...`, photos with the object.
 
@@ -113,18 +119,20 @@ def write_capture(
         lens, flaws: of all photos.
         sheet_views, object_views: how many photos of each kind.
         seed: of cameras and noise; the same one gives the same bytes.
+        steps: of the photos of the object around a full turn; None spreads them evenly.
+        samples: see `render_photo`.
     """
-    _tangents(lens)  # made once, before the threads ask for it, and so is the shadow
+    _tangents(lens, samples)  # made once, before the threads ask for it, and so is the shadow
     shadow()
     seeds = iter(np.random.SeedSequence(seed).generate_state(2 + sheet_views + object_views).tolist())
     poses = {
         "calibration": sheet_cameras(layout, lens, sheet_views, next(seeds)),
-        "photos": object_cameras(layout, lens, object_views, next(seeds)),
+        "photos": object_cameras(layout, lens, object_views, next(seeds), steps),
     }
     named = {kind: {f"{i:03d}.png": c2w for i, c2w in enumerate(c2ws)} for kind, c2ws in poses.items()}
 
     def write(kind: str, name: str, photo_seed: int) -> None:
-        photo = render_photo(layout, lens, named[kind][name], kind == "photos", flaws, photo_seed)
+        photo = render_photo(layout, lens, named[kind][name], kind == "photos", flaws, photo_seed, samples)
         imageio.imwrite(folder / kind / name, photo)
 
     jobs = [(kind, name, next(seeds)) for kind, photos in named.items() for name in photos]

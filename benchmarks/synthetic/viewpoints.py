@@ -55,8 +55,12 @@ def sheet_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Float
     return np.array(out)
 
 
-def object_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Float[np.ndarray, "count 4 4"]:
-    """Poses at even steps around the bulldozer, camera to world in metres, at changing heights and distances.
+def object_cameras(
+    layout: TagLayout, lens: Lens, count: int, seed: int, steps: int | None = None
+) -> Float[np.ndarray, "count 4 4"]:
+    """Poses around the bulldozer, camera to world in metres, at changing heights and distances.
+
+    A full turn takes `steps` of them; None: `count`.
 
     Every photo shows all of the bulldozer, and two tags that it does not hide (one if there is only one).
 
@@ -75,7 +79,11 @@ def object_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Floa
         near = 1.0
         for attempt in range(100):
             # From low down the object hides what is behind it: try other heights, and places farther along.
-            turn = 2 * np.pi * (start + (i + rng.uniform(-0.3, 0.3)) / count + 0.002 * attempt * rng.uniform(-1, 1))
+            turn = (
+                2
+                * np.pi
+                * (start + (i + rng.uniform(-0.3, 0.3)) / (steps or count) + 0.002 * attempt * rng.uniform(-1, 1))
+            )
             height = (start + i * GOLDEN + (0.1 + 0.01 * attempt) * rng.uniform(-1, 1)) % 1
             elevation = np.radians(ELEVATIONS[0] + (ELEVATIONS[1] - ELEVATIONS[0]) * height)
             distance = near * rng.uniform(1.0, 1.4) * reach * 2 * max(lens.fx, lens.fy) / min(lens.width, lens.height)

@@ -4,22 +4,27 @@ from pathlib import Path
 import pytest
 from capture.views import SIZE
 
-from benchmarks.synthetic.photos import Truth
 from nerf_lightning.capture.__main__ import task
+from nerf_lightning.capture.outputs import Packing
+from nerf_lightning.capture.run import Capture
 from nerf_lightning.config import cli
 
 main = partial(cli.run, "capture", task)
 
 
-def test_one_command_makes_a_scene_with_its_report(verb, made: tuple[Path, Truth], tmp_path: Path):
-    folder, _ = made
-    given = [f"calibration={folder}/calibration", f"photos={folder}/photos", f"tags.size={SIZE}", "resize=120"]
-    code, out, err = verb(main, *given, "output=mine/scene.npz")
+def test_one_command_makes_a_scene_with_its_report(verb, packed: tuple[Path, Capture], monkeypatch: pytest.MonkeyPatch):
+    """What it writes is tested with `capture` and `write_report`, and the command in docs/ runs whole."""
+    given, reports = [], []
+    monkeypatch.setattr("nerf_lightning.capture.run.capture", lambda *options: given.append(options) or packed[1])
+    monkeypatch.setattr("nerf_lightning.capture.report.write.write_report", lambda *options: reports.append(options))
+    code, out, err = verb(
+        main, "calibration=sheet", "photos=object", f"tags.size={SIZE}", "resize=120", "output=mine/scene.npz"
+    )
     assert code == 0, err
-    assert "of 8 photos placed" in out and "+experiment=capture dataset.path=mine/scene.npz" in out
-    written = sorted(str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file())
-    report = [f"mine/scene_report/{name}.png" for name in ("cameras", "coverage", "errors", "tags")]
-    assert written == ["mine/calibration.yaml", "mine/cameras.json", "mine/scene.npz", *report]
+    packing = Packing(Path("mine/scene.npz"), longest=120)
+    assert given == [(Path("sheet"), Path("object"), SIZE, packing, "auto", "auto", None)]
+    assert reports == [(packed[1], Path("mine/scene_report"))]
+    assert "8 of 8 photos placed" in out and "+experiment=capture dataset.path=mine/scene.npz" in out
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,22 @@
+"""Fixtures that tests of captures share."""
+
+from pathlib import Path
+
+import pytest
+from capture.views import SIZE
+from once import once
+
+from benchmarks.synthetic.photos import Truth
+from nerf_lightning.capture.outputs import Packing
+from nerf_lightning.capture.run import Capture, capture
+
+
+@pytest.fixture(scope="session")
+def packed(made: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Capture]:
+    """What a capture of it writes, in a folder, and returns."""
+
+    def make(folder: Path) -> tuple[Path, Capture]:
+        packing = Packing(folder / "scene.npz", longest=200, holdout=4)
+        return folder, capture(made[0] / "calibration", made[0] / "photos", SIZE, packing)
+
+    return once(tmp_path_factory, "packed", make)
