@@ -1,4 +1,4 @@
-"""How well a capture finds the cameras, told on synthetic photos, whose cameras are known; and what that costs in the field."""
+"""How well a capture finds the known cameras of synthetic photos, and what its errors cost a field."""
 
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ PHOTOS, VIEWS = 30, 40
 STEPS = 4500
 """Of both fields alike: seconds would let a busy machine decide."""
 FLIPPED = np.radians(5)
-"""A pose that is so much farther off than the other solution counts as flipped."""
+"""A pose that is farther off than the other solution by more than this counts as flipped."""
 
 
 def accuracy(folder: Path, seed: int) -> tuple[list[dict[str, Any]], dict[str, tuple[Capture, Truth]]]:
@@ -93,8 +93,8 @@ def layout_error(solved: Solved, layout: TagLayout) -> float:
 
 
 def stroll(count: int, seed: int, tilt: float, pace: int) -> list[np.ndarray]:
-    """World to camera along a random walk before a tag: `tilt` degrees off its normal at most times, a turn every `pace`
-    photos or so."""
+    """World to camera along a random walk in front of a tag: mostly within `tilt` degrees of its normal, with a turn about
+    every `pace` photos."""
     rng = np.random.default_rng(seed)
     kernel = np.exp(-(np.linspace(-3, 3, pace) ** 2))
     kernel /= np.linalg.norm(kernel)
@@ -111,23 +111,32 @@ def stroll(count: int, seed: int, tilt: float, pace: int) -> list[np.ndarray]:
     return [inverse(pose) for pose in upright.numpy() @ turns]
 
 
-def flips(seeds: list[int], count: int = 500, noise: float = 0.5) -> list[dict[str, Any]]:
+def flips(seeds: list[int], count: int = 500) -> list[dict[str, Any]]:
     """Flipped poses among photos of a single tag, of PnP alone and with the photos' order."""
+    return [
+        {
+            "walk": f"{tilt:g} degrees, {pace} photos a turn",
+            "seed": seed,
+            "photos": count,
+            **flips_of_walk(seed, count, tilt, pace),
+        }
+        for tilt, pace in ((15.0, 40), (10.0, 40), (15.0, 20))
+        for seed in seeds
+    ]
+
+
+def flips_of_walk(seed: int, count: int, tilt: float, pace: int, noise: float = 0.5) -> dict[str, int]:
+    """The same of one walk, see `stroll`; `noise` in pixels."""
     lens = Lens(1024, 768, 900.0, 900.0, 512.0, 384.0)
     points = SHEETS["one tag"].corners(0)
-    rows = []
-    for tilt, pace in ((15.0, 40), (10.0, 40), (15.0, 20)):
-        for seed in seeds:
-            truth, rng = stroll(count, seed, tilt, pace), np.random.default_rng(seed + 100)
-            seen = [(points, project(lens, pose, points) + noise * rng.standard_normal((4, 2))) for pose in truth]
-            options = [mark_poses(lens, Mark(*pair)) for pair in seen]
-            errors = [[angle_between(pose, h.pose) for h in found] for pose, found in zip(truth, options, strict=True)]
-            flipped = {
-                way: sum(bool(e[i] > min(e) + FLIPPED) for e, i in zip(errors, chosen, strict=True))
-                for way, chosen in (("alone", [0] * count), ("in_order", choose(lens, options, seen)))
-            }
-            rows.append({"walk": f"{tilt:g} degrees, {pace} photos a turn", "seed": seed, "photos": count, **flipped})
-    return rows
+    truth, rng = stroll(count, seed, tilt, pace), np.random.default_rng(seed + 100)
+    seen = [(points, project(lens, pose, points) + noise * rng.standard_normal((4, 2))) for pose in truth]
+    options = [mark_poses(lens, Mark(*pair)) for pair in seen]
+    errors = [[angle_between(pose, h.pose) for h in found] for pose, found in zip(truth, options, strict=True)]
+    return {
+        way: sum(bool(e[i] > min(e) + FLIPPED) for e, i in zip(errors, chosen, strict=True))
+        for way, chosen in (("alone", [0] * count), ("in_order", choose(lens, options, seen)))
+    }
 
 
 def fields(folder: Path, found: Capture, truth: Truth, seed: int) -> list[dict[str, Any]]:

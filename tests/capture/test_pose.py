@@ -1,8 +1,9 @@
 from dataclasses import replace
 
 import numpy as np
-from capture.views import LENS, ONE, SIX, SIZE, camera, cameras, sightings
+from capture.views import LENS, SIX, SIZE, camera, cameras, sightings
 
+from benchmarks.capture import flips_of_walk
 from nerf_lightning.capture.poses.geometry import (
     angle_between,
     folds,
@@ -58,42 +59,18 @@ def test_all_tags_of_a_photo_settle_its_pose():
     assert photo_poses(LENS, seen.marks, {99: np.eye(4)}) == []
 
 
-def walk(count: int, seed: int, tilt: float = 15.0) -> list[np.ndarray]:
-    """World to camera along a slow random walk in front of a tag, mostly a few degrees off its normal."""
-    rng = np.random.default_rng(seed)
-    kernel = np.exp(-(np.linspace(-3, 3, 40) ** 2))
-    kernel /= np.linalg.norm(kernel)
-    a, b, further, roll = (np.convolve(rng.standard_normal(count + 39), kernel, "valid") for _ in range(4))
-    a, b, distance = np.radians(tilt / 2) * a, np.radians(tilt / 2) * b, 0.5 + 0.1 * further.clip(-2, 2)
-    eyes = distance[:, None] * np.stack([np.sin(a), np.sin(b) * np.cos(a), np.cos(a) * np.cos(b)], axis=1)
-    return [inverse(camera(eye, [0, 0, 0], 0.3 * r)) for eye, r in zip(eyes, roll, strict=True)]
-
-
-def flips(truth: list[np.ndarray], options: list, chosen: list[int]) -> int:
-    """Photos whose chosen solution is farther from the truth than the other one, by more than 5 degrees."""
-    wrong = 0
-    for pose, found, choice in zip(truth, options, chosen, strict=True):
-        errors = [angle_between(pose, hypothesis.pose) for hypothesis in found]
-        wrong += errors[choice] > min(errors) + np.radians(5)
-    return wrong
-
-
 def test_neighbours_tell_a_flipped_tag():
-    truth, rng = walk(200, 1), np.random.default_rng(101)
-    points = ONE.corners(0)
-    seen = [(points, project(LENS, pose, points) + 0.5 * rng.standard_normal((4, 2))) for pose in truth]
-    options = [mark_poses(LENS, Mark(*pair)) for pair in seen]
-    assert flips(truth, options, [0] * 200) >= 4
-    assert flips(truth, options, choose(LENS, options, seen)) == 0
+    found = flips_of_walk(seed=3, count=80, tilt=15.0, pace=40)
+    assert found["alone"] >= 4 and found["in_order"] == 0
 
 
 def test_photos_without_order_keep_their_best():
-    c2w, rng = cameras(30, 5, tilt=45), np.random.default_rng(7)
+    c2w, rng = cameras(15, 5, tilt=45), np.random.default_rng(7)
     points = SIX.corners(4)
     seen = [(points, project(LENS, inverse(pose), points) + 0.1 * rng.standard_normal((4, 2))) for pose in c2w]
     options = [mark_poses(LENS, Mark(SIZE * SQUARE, pixels)) for _, pixels in seen]
     world = [(SIZE * SQUARE, pixels) for _, pixels in seen]
-    assert choose(LENS, options, world) == [0] * 30
+    assert choose(LENS, options, world) == [0] * 15
 
 
 def test_a_lens_that_folds_the_picture_is_told():

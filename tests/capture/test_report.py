@@ -6,6 +6,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+from capture.views import SIX as SHEET
 from jaxtyping import TypeCheckError
 
 from benchmarks.synthetic.viewpoints import in_frame, object_cameras, sheet_cameras
@@ -21,11 +22,10 @@ from nerf_lightning.capture.report.error_chart import cell_means, corners_and_re
 from nerf_lightning.capture.report.write import write_report
 from nerf_lightning.capture.run import Capture, Placed
 from nerf_lightning.capture.tags.detect import Mark, Sighting
-from nerf_lightning.capture.tags.layout import SQUARE, TagLayout, flat_pose
+from nerf_lightning.capture.tags.layout import SQUARE
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.drawing.ink import ORANGE, SKY, magnification, pixels_of, readable, rgb, shortened
 
-SHEET = TagLayout("DICT_4X4_50", 0.06, {3 * r + c: flat_pose(0.09 * c, -0.09 * r) for r in range(2) for c in range(3)})
 LENS = Lens(320, 240, 290.0, 290.0, 160.0, 120.0, (-0.2, 0.0, 0.0, 0.0, 0.0))
 NOWHERE = Path("photo.png")
 TURNED = "240x320 pixels, held the other way: 320x240 is what was calibrated"

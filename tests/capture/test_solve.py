@@ -60,13 +60,13 @@ def test_tags_are_linked_by_the_surest_way():
 
 
 def test_calibration_with_one_tag():
-    found = calibrate(FOLDER, sightings(ONE, cameras(30, tilt=45, distance=0.35)), None)
+    found = calibrate(FOLDER, sightings(ONE, cameras(20, tilt=45, distance=0.35)), None)
     assert abs(found.lens.fx / LENS.fx - 1) < 0.015
     assert set(found.dropped.values()) <= {"no tag found"} and found.rms < 0.2
 
 
 def test_calibration_with_a_sheet_of_unknown_layout():
-    found = calibrate(FOLDER, sightings(SIX, cameras(20)), None)
+    found = calibrate(FOLDER, sightings(SIX, cameras(15)), None)
     assert abs(found.lens.fx / LENS.fx - 1) < 0.0015
     assert abs(found.lens.distortion[0] + 0.2) < 0.01
     assert 0 < found.deviations["focal"] < 3
@@ -77,12 +77,12 @@ def test_few_photos_get_a_simple_lens():
     found = calibrate(FOLDER, sightings(SIX, cameras(3)), None)
     assert found.lens.distortion == (0, 0, 0, 0, 0) and set(found.deviations) == {"focal"}
     straight = replace(LENS, distortion=(0.0, 0.0, 0.0, 0.0, 0.0), cx=512.0, cy=384.0)
-    many = calibrate(FOLDER, sightings(SIX, cameras(16), straight), None)
+    many = calibrate(FOLDER, sightings(SIX, cameras(10), straight), None)
     assert max(abs(k) for k in many.lens.distortion) < 0.02
 
 
 def test_a_photo_that_contradicts_the_others_is_dropped_by_name():
-    seen = sightings(SIX, cameras(12))
+    seen = sightings(SIX, cameras(9))
     shifted = {
         tag: Mark(SIZE * SQUARE, m.pixels + [30 * (tag % 2), 25 * (tag % 3)]) for tag, m in seen[7].marks.items()
     }
@@ -95,11 +95,11 @@ def test_a_photo_that_contradicts_the_others_is_dropped_by_name():
 
 
 def test_a_tag_half_hidden_does_not_cost_the_photo():
-    seen = sightings(SIX, cameras(12))
+    seen = sightings(SIX, cameras(9))
     hidden = seen[7].marks[2].pixels + np.array([[30.0, 20.0], [0, 0], [0, 0], [0, 0]])
     seen[7] = replace(seen[7], marks=seen[7].marks | {2: Mark(SIZE * SQUARE, hidden)})
     found = calibrate(FOLDER, seen, None)
-    assert found.dropped == {} and len(found.used) == 12
+    assert found.dropped == {} and len(found.used) == 9
     assert sorted(found.used[7].marks) == [0, 1, 3, 4, 5]
     assert found.rms < 0.2
 
@@ -115,5 +115,5 @@ def test_what_cannot_be_calibrated_says_why():
 
 def test_a_small_view_is_warned_of():
     far = Lens(1024, 768, 900.0, 900.0, 512.0, 384.0)
-    found = calibrate(FOLDER, sightings(SIX, cameras(12, distance=1.2), far), None)
+    found = calibrate(FOLDER, sightings(SIX, cameras(6, distance=1.2), far), None)
     assert any("of the picture" in text for text in found.warnings)
