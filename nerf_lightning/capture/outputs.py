@@ -1,11 +1,13 @@
-"""What a capture writes: the scene, and `cameras.json` beside it."""
+"""What a capture writes: the scene, with `cameras.json` and `calibration.yaml` beside it."""
 
+import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from jaxtyping import Float
 
 from nerf_lightning.capture.pack import pack
@@ -13,20 +15,25 @@ from nerf_lightning.dataset.formats.npz import save_npz
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import write_json
+from nerf_lightning.utils.files import atomic, write_json
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Placed:
-    """What became of one photo."""
+    """A photo with its camera, or the reason why it has none."""
 
     name: str
-    status: str
-    """placed, or left out."""
-    reason: str
-    """Why it was left out; "" where it was not."""
-    c2w: Float[np.ndarray, "4 4"] | None
-    reprojection_px: float | None
+    reason: str = ""
+    """Why it was left out; "" if it was placed."""
+    c2w: Float[np.ndarray, "4 4"] | None = None
+    """OpenCV frame, metres."""
+    reprojection_px: float | None = None
+
+    @property
+    def status(self) -> str:
+        return "left out" if self.c2w is None else "placed"
 
 
 @dataclass(frozen=True)
@@ -46,52 +53,59 @@ class Packing:
             raise InputError("config", "output", str(self.output), "a file name that ends in .npz")
 
     def check(self, photos: Sequence[Path]) -> None:
-        """Before long work: whether the photo that the orbit goes through is among those to be placed.
-
-        Raises:
-            InputError: where it is not.
-        """
+        """Refuses, before long work, an orbit through a photo that is not there."""
         if self.orbit is not None and self.orbit not in [path.name for path in photos]:
             raise InputError("config", "orbit", self.orbit, f"a photo's name, such as {photos[0].name}")
 
 
-def write_scene(folder: Path, photos: list[Placed], lens: Lens, packing: Packing) -> Scene:
-    """Packs the placed photos of a folder and writes the scene and `cameras.json`.
+def write_scene(folder: Path, photos: list[Placed], lens: Lens, packing: Packing, calibration: dict[str, Any]) -> Scene:
+    """Packs the placed photos of a folder and writes everything.
+
+    Args:
+        folder: where the photos are.
+        photos: all of them; a warning names each that was left out.
+        lens: of the photos as they are.
+        packing: the scene to write.
+        calibration: what `calibration.yaml` says besides the lens.
 
     Raises:
         InputError: see `pack`.
     """
-    kept = [(folder / photo.name, photo.c2w) for photo in photos if photo.c2w is not None]
+    for photo in photos:
+        if photo.c2w is None:
+            log.warning("%s left out: %s", photo.name, photo.reason)
+    c2w = {folder / photo.name: photo.c2w for photo in photos if photo.c2w is not None}
+    name = packing.name or packing.output.stem
     scene = pack(
-        [path for path, _ in kept],
-        np.stack([c2w for _, c2w in kept]),
+        list(c2w),
+        np.stack(list(c2w.values())),
         lens,
-        packing.name or packing.output.stem,
+        name,
         str(folder),
         packing.longest,
         packing.holdout,
         packing.orbit,
     )
     save_npz(scene, packing.output)
-    K = scene.train.cameras.K[0].tolist()
-    write_json(packing.output.with_name("cameras.json"), {"photos": [_entry(photo, K) for photo in photos]})
-    return scene
-
-
-def _entry(photo: Placed, K: list[list[float]]) -> dict[str, Any]:
-    """A photo as `cameras.json` holds it: K of the undistorted, resized picture; c2w in the OpenCV frame, metres."""
-    entry = asdict(photo)
-    entry["c2w"] = None if photo.c2w is None else photo.c2w.tolist()
-    entry["K"] = None if photo.c2w is None else K
-    return {key: entry[key] for key in ("name", "status", "reason", "K", "c2w", "reprojection_px")}
-
-
-def lens_entry(lens: Lens) -> dict[str, Any]:
-    """The lens as `calibration.yaml` holds it: of the photos as they are, pixel centres at +0.5."""
-    distortion = (float(k) for k in lens.distortion)
-    return {
-        "width": lens.width,
-        "height": lens.height,
+    K = scene.train.cameras.K[0].tolist()  # of the undistorted, resized pictures
+    entries = [
+        {
+            "name": photo.name,
+            "status": photo.status,
+            "reason": photo.reason,
+            "K": None if photo.c2w is None else K,
+            "c2w": None if photo.c2w is None else photo.c2w.tolist(),
+            "reprojection_px": photo.reprojection_px,
+        }
+        for photo in photos
+    ]
+    write_json(packing.output.with_name("cameras.json"), {"photos": entries})
+    content = {
+        **{key: getattr(lens, key) for key in ("width", "height")},
         **{key: float(getattr(lens, key)) for key in ("fx", "fy", "cx", "cy")},
-        "distortion": dict(zip(("k1", "k2", "p1", "p2", "k3"), distortion, strict=True)),
+        "distortion": dict(zip(("k1", "k2", "p1", "p2", "k3"), map(float, lens.distortion), strict=True)),
+        **calibration,
     }
+    with atomic(packing.output.with_name("calibration.yaml")) as temporary:
+        temporary.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")
+    return scene

@@ -2,14 +2,19 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
 
 from nerf_lightning.errors import InputError
 
+T = TypeVar("T")
+
 EXTENSIONS = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 UNREAD = {".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".webp", ".avif", ".mov", ".mp4"}
-"""What cameras also write, and nothing here reads."""
+"""Files of cameras and phones that nothing here reads."""
 
 
 def natural(path: Path) -> list[tuple[int, int, str]]:
@@ -39,10 +44,17 @@ def find_photos(folder: Path, key: str) -> list[Path]:
     return photos
 
 
+def spread(items: Sequence[T], most: int) -> list[T]:
+    """At most this many, evenly chosen, the first and the last among them."""
+    if len(items) <= most:
+        return list(items)
+    return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int)]
+
+
 def of_one_size(
     folder: Path, sizes: Mapping[str, tuple[int, int]], size: tuple[int, int] | None = None
 ) -> dict[str, str]:
-    """Photos whose size is not the commonest (or not `size`), and what is wrong with each.
+    """Photos that do not have the commonest size (or `size`), and what is wrong with each.
 
     Args:
         folder: where they are, for the message.

@@ -1,4 +1,4 @@
-"""The whole way from two folders of photos to a scene file, and what stands beside it."""
+"""From two folders of photos to a scene file and the files beside it."""
 
 import logging
 from collections.abc import Sequence
@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from nerf_lightning.capture.outputs import Packing, Placed, lens_entry, write_scene
+from nerf_lightning.capture.outputs import Packing, Placed, write_scene
 from nerf_lightning.capture.photos import find_photos, of_one_size
 from nerf_lightning.capture.poses.calibrate import Calibration, calibrate, off_by, without
 from nerf_lightning.capture.poses.geometry import inverse
@@ -18,21 +17,20 @@ from nerf_lightning.capture.tags.detect import Sighting, guess_family, sight, ta
 from nerf_lightning.capture.tags.layout import read_layout
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import atomic
 
 log = logging.getLogger(__name__)
 
 NEAREST, FARTHEST = 0.03, 30.0
-"""Metres between which cameras stand from tags; beyond, a size was given in other units."""
+"""Plausible distances of cameras from tags, metres; others mean that the size was given in another unit."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Everything found out, for the report."""
+    """All results, for the report."""
 
     calibration: Calibration
     sightings: list[Sighting]
-    """Of the photos to be placed, those of the calibrated size."""
+    """Of the photos to be placed that have the calibrated size."""
     solved: Solved
     photos: list[Placed]
     scene: Scene
@@ -55,11 +53,11 @@ def capture(
         size: side of a tag's black square, metres.
         packing: the scene to write.
         dictionary: of the tags, or "auto".
-        layout: "auto" solves from the photos where the tags lie; else a YAML file that says it (see `read_layout`).
+        layout: "auto" finds from the photos where the tags lie; otherwise a YAML file says it (see `read_layout`).
         board: a ChArUco board instead of tags on their own.
 
     Raises:
-        InputError: whatever is wrong with the photos, in words.
+        InputError: whatever is wrong with the options or photos.
     """
     if not 0 < size < 10:
         raise InputError("config", "tags.size", f"{size:g}", "the side of a tag's black square in metres, such as 0.06")
@@ -93,20 +91,45 @@ def capture(
     lens = lens_found.lens
     log.info("focal length %.1f pixels, reprojection error %.2f pixels", lens.fx, lens_found.rms)
     solved, reasons = _place(usable, lens_found, known)
-    _plausible(photos, solved, size)
-    results = [_result(s, i, solved, reasons, turned) for i, s in _numbered(sightings, usable)]
-    for photo in results:
-        if photo.status != "placed":
-            log.warning("%s left out: %s", photo.name, photo.reason)
-    scene = write_scene(photos, results, lens, packing)
-    _write_calibration(packing.output.with_name("calibration.yaml"), lens_found, solved, family, size)
+    # A wrong unit of the size, mostly.
+    distance = float(np.median([np.linalg.norm(inverse(w2c)[:3, 3]) for w2c in solved.w2c.values()]))
+    if not NEAREST < distance < FARTHEST:
+        raise InputError(
+            "config",
+            "tags.size",
+            f"{size:g}, which puts the cameras of {photos} {distance:.3g} m away from the tags",
+            f"{NEAREST} to {FARTHEST:g} m",
+            "give the side of the black square in metres: 6 cm are 0.06",
+        )
+    errors = {usable[i].name: float(rms) for i, rms in zip(solved.placed, solved.refined.rms, strict=True)}
+    c2w = {usable[i].name: inverse(w2c) for i, w2c in solved.w2c.items()}
+    reasons |= turned
+    results = [
+        Placed(s.name, "", c2w[s.name], errors[s.name]) if s.name in c2w else Placed(s.name, reasons[s.name])
+        for s in sightings
+    ]
+    details = {
+        "standard_deviations": lens_found.deviations,
+        "reprojection_px": lens_found.rms,
+        "photos_used": [s.name for s in lens_found.used],
+        "photos_left_out": lens_found.dropped,
+        "coverage": lens_found.coverage,
+        "largest_tilt_degrees": float(np.degrees(lens_found.tilt)),
+        "warnings": lens_found.warnings,
+        "tags": {
+            "dictionary": family,
+            "size": size,
+            "to_world": {tag: pose.tolist() for tag, pose in solved.tags.items()},
+        },
+    }
+    scene = write_scene(photos, results, lens, packing, details)
     return Capture(lens_found, usable, solved, results, scene)
 
 
 def _place(
     usable: Sequence[Sighting], found: Calibration, known: dict[int, np.ndarray] | None
 ) -> tuple[Solved, dict[str, str]]:
-    """Places photos, leaving out tags and photos that the others contradict."""
+    """Places photos without the tags and photos that contradict the others; returns the reasons for those left out too."""
     reasons = {s.name: "no tag found" for s in usable if not s.marks}
     left = list(usable)
     while True:
@@ -125,49 +148,3 @@ def _place(
             return solved, reasons | lost
         reasons |= {usable[i].name: off_by(error, off.usual) for i, error in off.photos.items()}
         left = [without(s, off.marks.get(i)) for i, s in enumerate(left)]
-
-
-def _plausible(folder: Path, solved: Solved, size: float) -> None:
-    """Refuses distances at which nobody photographs tags: a size in millimetres, mostly."""
-    distance = float(np.median([np.linalg.norm(inverse(w2c)[:3, 3]) for w2c in solved.w2c.values()]))
-    if not NEAREST < distance < FARTHEST:
-        raise InputError(
-            "config",
-            "tags.size",
-            f"{size:g}, which puts the cameras of {folder} {distance:.3g} m away from the tags",
-            f"{NEAREST} to {FARTHEST:g} m",
-            "give the side of the black square in metres: 6 cm are 0.06",
-        )
-
-
-def _numbered(sightings: Sequence[Sighting], usable: Sequence[Sighting]) -> list[tuple[int, Sighting]]:
-    """Every sighting with its number among the usable ones, -1 for the others."""
-    number = {s.name: i for i, s in enumerate(usable)}
-    return [(number.get(s.name, -1), s) for s in sightings]
-
-
-def _result(sighting: Sighting, number: int, solved: Solved, reasons: dict[str, str], turned: dict[str, str]) -> Placed:
-    if number in solved.w2c:
-        error = float(solved.refined.rms[solved.placed.index(number)])
-        return Placed(sighting.name, "placed", "", inverse(solved.w2c[number]), error)
-    return Placed(sighting.name, "left out", reasons.get(sighting.name) or turned[sighting.name], None, None)
-
-
-def _write_calibration(path: Path, found: Calibration, solved: Solved, family: str, size: float) -> None:
-    """The lens, how sure it is, and where the tags lay."""
-    content = lens_entry(found.lens) | {
-        "standard_deviations": found.deviations,
-        "reprojection_px": found.rms,
-        "photos_used": [s.name for s in found.used],
-        "photos_left_out": found.dropped,
-        "coverage": found.coverage,
-        "largest_tilt_degrees": float(np.degrees(found.tilt)),
-        "warnings": found.warnings,
-        "tags": {
-            "dictionary": family,
-            "size": size,
-            "to_world": {tag: pose.tolist() for tag, pose in solved.tags.items()},
-        },
-    }
-    with atomic(path) as temporary:
-        temporary.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")

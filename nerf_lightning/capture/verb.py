@@ -1,16 +1,12 @@
 """The capture verb's configuration -> the work. Heavy imports wait until the configuration is checked."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.options import AtLeast, Count, check_options
-
-if TYPE_CHECKING:
-    from nerf_lightning.capture.outputs import Placed
-    from nerf_lightning.capture.tags.board import Board
 
 NEEDED = {
     "tags": {"calibration": "FOLDER", "photos": "FOLDER", "tags.size": "0.06"},
@@ -19,7 +15,7 @@ NEEDED = {
 """By kind of poses: what must be given, and an example."""
 
 PRINTED, PRINTED_FAMILY, PRINTED_SIZE = "sheet_2x3", "DICT_4X4_50", 0.06
-"""What is printed where nothing else is said."""
+"""What `print` writes by default."""
 
 
 def options(
@@ -57,43 +53,45 @@ def capture_from(cfg: DictConfig) -> None:
     check_options("", options, given)
     check_options("tags", tag_options, given["tags"])
     check_options("tags.board", board_options, given["tags"]["board"])
+    tags = given["tags"]
     if given["print"] is not None:
-        _print(given["tags"], Path(given["print"]))
+        _print(tags, Path(given["print"]))
         return
     if given["poses"] not in NEEDED:
         raise InputError("config", "poses", given["poses"], "tags or colmap")
     for key, example in NEEDED[given["poses"]].items():
         if OmegaConf.select(cfg, key) is None:
             raise InputError("config", key, "nothing", "a value", f"give {key}={example}")
-    if given["poses"] == "tags" and given["tags"]["layout"] == "charuco":
-        for key, value in given["tags"]["board"].items():
+    if given["poses"] == "tags" and tags["layout"] == "charuco":
+        for key, value in tags["board"].items():
             if value is None:
                 raise InputError("config", f"tags.board.{key}", "nothing", "a value", "count the board's squares")
+
+    from rich.console import Console
 
     from nerf_lightning.capture.outputs import Packing
     from nerf_lightning.capture.poses.structure import capture_without_tags
     from nerf_lightning.capture.report.write import draw_cameras, write_report
     from nerf_lightning.capture.run import capture
+    from nerf_lightning.capture.tags.board import Board
 
     packing = Packing(Path(given["output"]), given["resize"], given["holdout"], given["orbit"], given["name"])
-    photos, report = Path(given["photos"]), packing.output.with_name(packing.output.stem + "_report")
+    folder, report = Path(given["photos"]), packing.output.with_name(packing.output.stem + "_report")
     if given["poses"] == "colmap":
-        placed, scene = capture_without_tags(photos, packing)
-        draw_cameras(placed, scene, report)
+        photos, scene = capture_without_tags(folder, packing)
+        draw_cameras(photos, scene, report)
     else:
-        tags = given["tags"]
-        found = capture(
-            Path(given["calibration"]),
-            photos,
-            float(tags["size"]),
-            packing,
-            tags["dictionary"],
-            tags["layout"],
-            _board(tags),
-        )
+        board = Board(**tags["board"]) if tags["layout"] == "charuco" else None
+        sheets, size = Path(given["calibration"]), float(tags["size"])
+        found = capture(sheets, folder, size, packing, tags["dictionary"], tags["layout"], board)
         write_report(found, report)
-        placed = found.photos
-    _announce(placed, packing.output, report)
+        photos = found.photos
+    placed, console = sum(photo.status == "placed" for photo in photos), Console(highlight=False, soft_wrap=True)
+    output = packing.output
+    console.print(
+        f"{placed} of {len(photos)} photos placed; {output}, with cameras.json and calibration.yaml beside it"
+    )
+    console.print(f"look at {report}, then: python -m nerf_lightning +experiment=capture dataset.path={output}")
 
 
 def _print(tags: dict[str, Any], file: Path) -> None:
@@ -104,23 +102,3 @@ def _print(tags: dict[str, Any], file: Path) -> None:
     sheet = PRINTED if tags["layout"] == "auto" else tags["layout"]
     family = PRINTED_FAMILY if tags["dictionary"] == "auto" else tags["dictionary"]
     write_page(read_layout(Path(sheet), family, float(tags["size"] or PRINTED_SIZE)), file)
-
-
-def _board(tags: dict[str, Any]) -> "Board | None":
-    """The ChArUco board, where one is meant."""
-    from nerf_lightning.capture.tags.board import Board
-
-    if tags["layout"] != "charuco":
-        return None
-    return Board(tags["board"]["columns"], tags["board"]["rows"], float(tags["board"]["square"]))
-
-
-def _announce(photos: "list[Placed]", output: Path, report: Path) -> None:
-    from rich.console import Console
-
-    placed = sum(photo.status == "placed" for photo in photos)
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(
-        f"{placed} of {len(photos)} photos placed; {output}, with cameras.json and calibration.yaml beside it"
-    )
-    console.print(f"look at {report}, then: python -m nerf_lightning +experiment=capture dataset.path={output}")

@@ -64,12 +64,12 @@ def capture(tmp_path_factory):
     solved = solve(found.lens, [s.marks for s in seen["object"]], None)
     c2w = np.stack([inverse(solved.w2c[i]) for i in range(6)])
     photos = [
-        Placed(f"object{i}.png", "placed", "", pose, float(error))
+        Placed(f"object{i}.png", "", pose, float(error))
         for i, (pose, error) in enumerate(zip(c2w, solved.refined.rms, strict=True))
     ]
     photos += [
-        Placed("blank-object.png", "left out", "no tag found", None, None),
-        Placed("turned-object.png", "left out", TURNED, None, None),
+        Placed("blank-object.png", "no tag found"),
+        Placed("turned-object.png", TURNED),
     ]
     scene = pack([s.path for s in seen["object"][:6]], c2w, found.lens, "small", "tests", longest=64)
     return Capture(found, seen["object"], solved, photos, scene)
@@ -87,7 +87,7 @@ def test_four_pictures_are_written(capture, tmp_path):
 
 
 def test_a_photo_that_is_gone_is_named_and_nothing_is_left_behind(capture, tmp_path):
-    gone = replace(capture, photos=[*capture.photos, Placed("gone.png", "left out", "no tag found", None, None)])
+    gone = replace(capture, photos=[*capture.photos, Placed("gone.png", "no tag found")])
     with pytest.raises(ValueError, match="gone.png"):
         write_report(gone, tmp_path)
     assert not list(tmp_path.iterdir())

@@ -1,6 +1,6 @@
-"""Poses from marks: all solutions that flat tags allow."""
+"""Camera poses from marks: every solution that flat tags allow."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -54,7 +54,7 @@ def polished(lens: Lens, pose: Float[np.ndarray, "4 4"], points: np.ndarray, pix
 
 
 def distinct(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best ones, best first, none twice."""
+    """The best ones, best first, without repeats."""
     kept: list[Hypothesis] = []
     for hypothesis in sorted(hypotheses, key=lambda h: h.squares):
         if np.isfinite(hypothesis.squares) and all(angle_between(hypothesis.pose, k.pose) > SAME for k in kept):
@@ -66,7 +66,7 @@ def mark_poses(lens: Lens, mark: Mark) -> list[Hypothesis]:
     """Tag to camera from one flat mark: one solution or two, best first.
 
     A flat target seen from afar looks the same from two sides (Collins and Bartoli 2014, "Infinitesimal plane-based pose
-    estimation"): which one is right, its own reprojection error often cannot tell.
+    estimation"), and its own reprojection error often cannot tell which one is right.
     """
     tangents = normalised(lens, mark.pixels)
     found, turns, shifts, _ = cv2.solvePnPGeneric(mark.points, tangents, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
@@ -83,13 +83,19 @@ def photo_poses(lens: Lens, marks: dict[int, Mark], tags: dict[int, Float[np.nda
         marks: by tag; those without a place in `tags` are left out.
         tags: tag to world.
     """
-    known = {tag: mark for tag, mark in marks.items() if tag in tags}
-    if not known:
+    if not any(tag in tags for tag in marks):
         return []
-    points = np.concatenate([move(tags[tag], mark.points) for tag, mark in known.items()])
-    pixels = np.concatenate([mark.pixels for mark in known.values()])
-    starts = [
-        hypothesis.pose @ inverse(tags[tag]) for tag, mark in known.items() for hypothesis in mark_poses(lens, mark)
-    ]
+    points, pixels = points_and_pixels(marks, tags)
+    alone = {tag: mark_poses(lens, mark) for tag, mark in marks.items() if tag in tags}
+    starts = [hypothesis.pose @ inverse(tags[tag]) for tag, found in alone.items() for hypothesis in found]
     rough = distinct([Hypothesis(start, squares_of(lens, start, points, pixels)) for start in starts])
     return distinct([polished(lens, hypothesis.pose, points, pixels) for hypothesis in rough])
+
+
+def points_and_pixels(
+    marks: dict[int, Mark], tags: Mapping[int, Float[np.ndarray, "4 4"]]
+) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M 2"]]:
+    """Points of a photo's known tags in the world, and where the photo shows them."""
+    known = {tag: mark for tag, mark in marks.items() if tag in tags}
+    points = [move(tags[tag], mark.points) for tag, mark in known.items()]
+    return np.concatenate(points), np.concatenate([mark.pixels for mark in known.values()])

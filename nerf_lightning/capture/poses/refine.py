@@ -10,9 +10,14 @@ from scipy.sparse import csr_matrix
 from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS, Bundle, Problem
 
 OUTLIER = 1.0
-"""Pixels beyond which a residual counts about linearly instead of squared."""
+"""Pixels beyond which a residual counts roughly linearly instead of squared."""
 DENSE = 600
 """Unknowns up to which the normal equations are solved exactly."""
+
+
+def rms_length(residuals: Float[np.ndarray, "_ 2"]) -> float:
+    """Root mean square length."""
+    return float(np.sqrt((residuals**2).sum(1).mean()))
 
 
 @dataclass(frozen=True)
@@ -25,24 +30,23 @@ class Refined:
     deviations: dict[str, float]
     """Standard deviations of the lens parameters that were free, from the normal equations and the residuals' own size."""
     bic: float
-    """Bayesian information criterion: lower is better, more parameters must pay for themselves."""
+    """Bayesian information criterion (Schwarz 1978): lower is better; it charges for every parameter."""
 
     @property
     def rms(self) -> Float[np.ndarray, "P"]:
         """Root mean square distance in pixels, by photo."""
-        return np.array([np.sqrt((r**2).sum(1).mean()) if len(r) else 0.0 for r in self.residuals])
+        return np.array([rms_length(r) for r in self.residuals])
 
-    def mark_rms(self, photo: int) -> dict[int, float]:
-        """Root mean square distance in pixels of each mark of a photo, by the tag's number."""
+    def by_mark(self, photo: int) -> dict[int, Float[np.ndarray, "_ 2"]]:
+        """Residuals of a photo by the tag's number."""
         marks = self.bundle.marks[photo]
         ends = np.cumsum([len(mark.pixels) for mark in marks.values()])[:-1]
-        parts = zip(marks, np.split(self.residuals[photo], ends), strict=True)
-        return {tag: float(np.sqrt((part**2).sum(1).mean())) for tag, part in parts}
+        return dict(zip(marks, np.split(self.residuals[photo], ends), strict=True))
 
     @property
     def total_rms(self) -> float:
         """Root mean square distance in pixels over all points."""
-        return float(np.sqrt((np.concatenate(self.residuals) ** 2).sum(1).mean()))
+        return rms_length(np.concatenate(self.residuals))
 
 
 def refine(
@@ -51,7 +55,7 @@ def refine(
     fixed_tags: frozenset[int] = frozenset({0}),
     free_twists: bool = False,
 ) -> Refined:
-    """Minimises the reprojection error over everything that is free, robustly.
+    """Minimises the reprojection error over everything that is free, with a robust loss.
 
     Args:
         bundle: where to start; every photo holds at least one mark.

@@ -1,6 +1,6 @@
-"""Where the tags lie, told from the photos themselves, and where the cameras stood."""
+"""Where the tags lie and where the cameras stood, from the photos alone."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf_lightning.capture.poses.bundle import Bundle, simplified
-from nerf_lightning.capture.poses.geometry import folds, inverse, move
-from nerf_lightning.capture.poses.pose import Hypothesis, mark_poses, photo_poses
-from nerf_lightning.capture.poses.refine import Refined, refine
+from nerf_lightning.capture.poses.geometry import folds, inverse
+from nerf_lightning.capture.poses.pose import Hypothesis, mark_poses, photo_poses, points_and_pixels
+from nerf_lightning.capture.poses.refine import Refined, refine, rms_length
 from nerf_lightning.capture.poses.walk import choose
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.dataset.lens import Lens
@@ -21,7 +21,7 @@ AGREE_ANGLE = np.radians(10.0)
 AGREE_SHIFT = 0.25
 """... by less than this share of the tags' distance (or of a tag, where they touch)."""
 OUTLIER = 4.0
-"""A photo is off if its error is so many times the median, and also above ..."""
+"""A photo is off if its error is more than this times the median, and also above ..."""
 OUTLIER_PIXELS = 1.0
 """... this at 1000 pixels along the longest side."""
 
@@ -99,27 +99,24 @@ def solve(
     Args:
         lens: a first guess, or the calibrated lens.
         marks: by photo, in the order taken.
-        layout: tag to world, where it is known; None solves it from the photos. Its frame is then that of the tag seen most.
-        free_lens: what of the lens may change too; see `refine`.
+        layout: tag to world; None solves it from the photos, in the frame of the tag seen most.
+        free_lens: parameters of the lens that may change too; see `refine`.
 
     Returns:
         None where no photo could be placed.
     """
     alone = [{tag: mark_poses(lens, mark) for tag, mark in photo.items()} for photo in marks]
-    counts: dict[int, int] = defaultdict(int)
-    for poses in alone:
-        for tag, found in poses.items():
-            counts[tag] += bool(found)
-    if not any(counts.values()):
+    counts = Counter(tag for poses in alone for tag, found in poses.items() if found)
+    if not counts:
         return None
     # The smallest id among the most seen, so that the frame does not depend on the order of photos.
-    reference = max(sorted(counts), key=lambda tag: counts[tag])
+    reference = max(sorted(counts), key=counts.__getitem__)
     tags = layout if layout is not None else arrange(relative_poses(alone), reference)
     options = {i: photo_poses(lens, photo, tags) for i, photo in enumerate(marks)}
     placed = [i for i, found in options.items() if found]
     if not placed:
         return None
-    seen = [_points(marks[i], tags) for i in placed]
+    seen = [points_and_pixels(marks[i], tags) for i in placed]
     chosen = choose(lens, [options[i] for i in placed], seen)
     w2c = np.stack([options[i][c].pose for i, c in zip(placed, chosen, strict=True)])
     numbers = sorted({tag for i in placed for tag in marks[i] if tag in tags})
@@ -136,16 +133,16 @@ def solve(
 
 
 def settle(bundle: Bundle, models: Sequence[tuple[str, ...]], fixed: frozenset[int]) -> Refined:
-    """Refines with each lens model, tags flat or twisted, and takes what Schwarz's criterion (BIC) favours among lenses that
-    do not fold the picture.
+    """Refines with each lens model and takes the one of lowest BIC whose lens does not fold the picture; then the same with
+    twisted tags.
 
-    What a model of a lens does not set free keeps its plain value; a model without anything free keeps the lens.
+    Parameters that a model does not free have their plain value; a model that frees none keeps the lens.
     """
     fits: list[Refined] = []
     for free in models:
         start = fits[-1].bundle if fits else bundle  # models grow: each starts where the one before ended
         fits.append(refine(replace(start, lens=simplified(start.lens, free)), free, fixed))
-    # The plainest model stays, whatever comes of it: there must be one.
+    # The plainest model is the fallback.
     sound = [fit for fit in fits if not folds(fit.bundle.lens)] or fits[:1]
     best = min(sound, key=lambda fit: fit.bic)
     twisted = refine(best.bundle, models[fits.index(best)], fixed, free_twists=True)
@@ -171,11 +168,11 @@ def misfits(solved: Solved) -> Misfits:
     limit = max(OUTLIER * usual, OUTLIER_PIXELS * side / 1000)
     photos, marks = {}, {}
     for i in np.flatnonzero(rms > limit).tolist():
-        by_mark = solved.refined.mark_rms(i)
+        by_mark = {tag: rms_length(rest) for tag, rest in solved.refined.by_mark(i).items()}
         if 2 * sum(error > limit for error in by_mark.values()) > len(by_mark):
             photos[solved.placed[i]] = float(rms[i])
         else:
-            marks[solved.placed[i]] = tags[max(by_mark.items(), key=lambda pair: pair[1])[0]]
+            marks[solved.placed[i]] = tags[max(by_mark, key=by_mark.__getitem__)]
     return Misfits(photos, marks, usual)
 
 
@@ -190,12 +187,3 @@ def packed(refined: Refined, tags: Sequence[int], placed: Sequence[int], fixed: 
         list(placed),
         fixed,
     )
-
-
-def _points(
-    marks: dict[int, Mark], tags: Mapping[int, Pose]
-) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M 2"]]:
-    """All points of a photo in the world, and their pixels."""
-    known = {tag: mark for tag, mark in marks.items() if tag in tags}
-    points = np.concatenate([move(tags[tag], mark.points) for tag, mark in known.items()])
-    return points, np.concatenate([mark.pixels for mark in known.values()])

@@ -11,11 +11,10 @@ import cv2
 import imageio.v3 as imageio
 import numpy as np
 import torch
-import yaml
 from jaxtyping import Float
 
 from nerf_lightning.cameras import focus_point
-from nerf_lightning.capture.outputs import Packing, Placed, lens_entry, write_scene
+from nerf_lightning.capture.outputs import Packing, Placed, write_scene
 from nerf_lightning.capture.photos import find_photos, of_one_size
 from nerf_lightning.capture.poses.geometry import inverse
 from nerf_lightning.dataset.extent import viewing_distance
@@ -24,7 +23,6 @@ from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.progress import tracked
 
 if TYPE_CHECKING:
@@ -42,8 +40,8 @@ OVERLAP = "take more photos, in small steps around the subject, sharp, of someth
 def capture_without_tags(folder: Path, packing: Packing) -> tuple[list[Placed], Scene]:
     """Places photos by structure from motion (Schoenberger and Frahm 2016), and writes what `capture` writes.
 
-    The scale is unknown: the unit is the cameras' median distance to what they look at, which is the origin; z points up, as
-    far as the photos were held level.
+    Photos do not tell the scale: the unit is the cameras' median distance to what they look at, which is the origin. z points
+    up, as far as the photos were held level.
 
     Args:
         folder: of photos taken with one camera without zooming.
@@ -77,27 +75,22 @@ def capture_without_tags(folder: Path, packing: Packing) -> tuple[list[Placed], 
     for path in paths:
         if path.name in poses:
             error = _error(images[numbers[path.name]], model) * scale
-            photos.append(Placed(path.name, "placed", "", poses[path.name], error))
+            photos.append(Placed(path.name, "", poses[path.name], error))
         else:
             reason = turned.get(path.name, "it shares too few points with the other photos")
-            log.warning("%s left out: %s", path.name, reason)
-            photos.append(Placed(path.name, "left out", reason, None, None))
-    scene = write_scene(folder, photos, lens, packing)
-    content = lens_entry(lens) | {
-        "reprojection_px": float(
-            np.sqrt(np.mean([photo.reprojection_px**2 for photo in photos if photo.reprojection_px]))
-        ),
+            photos.append(Placed(path.name, reason))
+    errors = [photo.reprojection_px for photo in photos if photo.reprojection_px]
+    details = {
+        "reprojection_px": float(np.sqrt(np.mean(np.square(errors)))),
         "photos_used": names,
         "photos_left_out": {photo.name: photo.reason for photo in photos if photo.reason},
         "unit": "the cameras' median distance to what they look at",
     }
-    with atomic(packing.output.with_name("calibration.yaml")) as temporary:
-        temporary.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")
-    return photos, scene
+    return photos, write_scene(folder, photos, lens, packing, details)
 
 
 def _copies(paths: list[Path], folder: Path) -> dict[str, tuple[int, int]]:
-    """Upright copies of no more than SIDE pixels, numbered, so that names cannot harm; returns the photos' own sizes."""
+    """Writes upright copies of at most SIDE pixels, numbered, so that no file name matters; returns the photos' own sizes."""
     folder.mkdir()
     sizes = {}
     for number, path in tracked(enumerate(paths), len(paths), "reading photos"):

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from nerf_lightning.capture.photos import spread
 from nerf_lightning.capture.tags.layout import SQUARE
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.errors import InputError
@@ -97,7 +98,7 @@ def tag_detector(dictionary: str, size: float) -> Detector:
         corners, ids, _ = detector.detectMarkers(grey)
         found = [] if ids is None else [int(i) for i in np.asarray(ids).reshape(-1)]
         twice = {tag for tag, count in Counter(found).items() if count > 1}
-        # A pattern seen twice is a reflection, a second print or a mistake: nobody can tell which one is meant.
+        # A tag seen twice is a reflection, a second print or a mistake: there is no telling which one is meant.
         return {
             tag: Mark(size * SQUARE, np.asarray(four, np.float64).reshape(4, 2) + 0.5)
             for tag, four in zip(found, corners, strict=True)
@@ -124,12 +125,12 @@ def sight(paths: Sequence[Path], detector: Detector) -> list[Sighting]:
 
 
 def guess_family(paths: Sequence[Path], photos: int = 4) -> str:
-    """The family of which most tags are found in a few of the photos.
+    """The family with most tags in a few of the photos.
 
     Raises:
         InputError: where none of the common families is found.
     """
-    chosen = [paths[i] for i in np.linspace(0, len(paths) - 1, min(photos, len(paths))).round().astype(int)]
+    chosen = spread(paths, photos)
     small = []
     for path in chosen:
         grey = read_grey(path)
@@ -142,7 +143,7 @@ def guess_family(paths: Sequence[Path], photos: int = 4) -> str:
         parameters.errorCorrectionRate = 0.0
         detector = cv2.aruco.ArucoDetector(family(name), parameters)
         counts[name] = sum(len(detector.detectMarkers(grey)[0]) for grey in small)
-    best = max(COMMON, key=lambda name: counts[name])
+    best = max(COMMON, key=counts.__getitem__)
     if not counts[best]:
         raise InputError(
             paths[0].parent,
