@@ -1,4 +1,4 @@
-"""A map of a capture: where cameras stood and looked, where tags lay, and what was made of it."""
+"""A map of a capture: the cameras, the tags, and the scene's box and orbit."""
 
 from collections.abc import Sequence
 
@@ -19,9 +19,9 @@ FRUSTUM = 0.06
 """Height of a camera's pyramid as a share of the map's width."""
 EDGES = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
 NUMBERS = 120
-"""Cameras up to which each has its number."""
+"""Most cameras that are numbered; of more, every N-th is."""
 WIDE, HIGH = 13.0, 17.0
-"""Inches that the map may take."""
+"""Largest size of the map, inches."""
 
 
 def frustum(K: Float[np.ndarray, "3 3"], width: int, height: int, depth: float) -> Float[np.ndarray, "5 3"]:
@@ -32,16 +32,15 @@ def frustum(K: Float[np.ndarray, "3 3"], width: int, height: int, depth: float) 
 
 def tag_corners(capture: Capture) -> dict[int, Float[np.ndarray, "M 3"]]:
     """Corners in the world of the tags that placed photos show, by id; metres."""
-    solved = capture.solved
     points = {tag: mark.points for sighting in capture.sightings for tag, mark in sighting.marks.items()}
-    return {tag: move(pose, points[tag]) for tag, pose in solved.tags.items() if tag in points}
+    return {tag: move(pose, points[tag]) for tag, pose in capture.solved.tags.items() if tag in points}
 
 
 def camera_map(photos: Sequence[Placed], scene: Scene, tags: dict[int, Float[np.ndarray, "M 3"]]) -> Figure:
-    """Everything from above, and from the side below it, at one scale.
+    """A view from above, and one from the side below it, at the same scale.
 
     Args:
-        photos: all of the capture; those without a pose only count.
+        photos: all of the capture; those without a pose are only counted.
         scene: made of them.
         tags: corners in the world by id.
     """
@@ -59,8 +58,8 @@ def camera_map(photos: Sequence[Placed], scene: Scene, tags: dict[int, Float[np.
     unit = "metres" if tags else "in the scene's unit"
     span = high - low
     scale = min(WIDE / span[0], HIGH / (span[1] + span[2]))
-    size = scale * span[0] + 1.5, scale * (span[1] + span[2]) + 2.5
-    figure = Figure(figsize=(max(size[0], 8.0), size[1]), dpi=DPI, layout="constrained")
+    size = max(scale * span[0] + 1.5, 8.0), scale * (span[1] + span[2]) + 2.5
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
     above, beside = figure.subplots(2, 1, height_ratios=(span[1], span[2]), sharex=True)
     for axes, up, name in ((above, 1, "from above"), (beside, 2, "from the side")):
         axes.set(xlim=(low[0], high[0]), ylim=(low[up], high[up]), aspect="equal", ylabel=f"{'xyz'[up]}, {unit}")
@@ -72,7 +71,15 @@ def camera_map(photos: Sequence[Placed], scene: Scene, tags: dict[int, Float[np.
     for tag, corners in tags.items():
         x, y = corners[:, :2].mean(0)
         above.annotate(str(tag), (x, y), ha="center", va="center", fontsize=9, color=VERMILLION, annotation_clip=True)
-    figure.legend(handles=_key(len(photos), bool(tags)), loc="outside upper center", ncols=4, frameon=False)
+    key = [
+        Line2D([], [], color=BLUE, label=f"cameras, numbered 1 to {len(photos)} as the photos are"),
+        Line2D([], [], color=GREY, linestyle="--", label="box of the scene"),
+        Line2D([], [], color=ORANGE, linewidth=2, label="orbit"),
+    ]
+    if tags:
+        label = "tags, with their ids"
+        key[1:1] = [Line2D([], [], color="black", marker="s", markerfacecolor="0.8", linestyle="", label=label)]
+    figure.legend(handles=key, loc="outside upper center", ncols=4, frameon=False)
     return figure
 
 
@@ -95,18 +102,6 @@ def _draw(
     axes.add_collection(LineCollection(lines, colors=BLUE, linewidths=0.8, alpha=0.8))
     step = -(-len(frusta) // NUMBERS)
     for number, points in frusta[::step]:
-        # Behind the camera, where nothing of it is drawn.
+        # Behind the camera, where there are no lines.
         behind = points[0] - 0.35 * points[1:].mean(0) + 0.35 * points[0]
         axes.annotate(str(number), behind[plane], ha="center", va="center", fontsize=8, annotation_clip=True)
-
-
-def _key(photos: int, tags: bool) -> list[Line2D]:
-    square = Line2D(
-        [], [], color="black", marker="s", markerfacecolor="0.8", linestyle="", label="tags, with their ids"
-    )
-    return [
-        Line2D([], [], color=BLUE, label=f"cameras, numbered 1 to {photos} as the photos are"),
-        *([square] if tags else []),
-        Line2D([], [], color=GREY, linestyle="--", label="box of the scene"),
-        Line2D([], [], color=ORANGE, linewidth=2, label="orbit"),
-    ]

@@ -1,4 +1,4 @@
-"""Contact sheets: small photos with the tags found in them outlined, and what became of each photo."""
+"""Contact sheets: small photos with their tags outlined, and the error of each photo or why it was left out."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -32,13 +32,8 @@ SHIFT = 4
 def annotated(
     photo: UInt8[np.ndarray, "H W 3"], outcome: Outcome, width: int, height: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A photo made to fit into a box, its tags outlined with their ids, and a cross where each corner projects to.
-
-    Args:
-        photo: sRGB, upright, of the size that its marks speak of.
-        outcome: of this photo.
-        width, height: of the box, pixels.
-    """
+    """A photo (sRGB, upright, at full size) scaled to fit into a box of `width` x `height` pixels: its tags are outlined with
+    their ids, and a cross shows where each corner projects to."""
     rows, cols = photo.shape[:2]
     scale = min(width / cols, height / rows)
     size = max(1, round(cols * scale)), max(1, round(rows * scale))
@@ -53,9 +48,8 @@ def annotated(
         _lines(small, [outline], True, rgb(ORANGE), 2)
         _label(small, str(tag), outline.mean(0), float(np.sqrt(cv2.contourArea(outline))))
     for tag, residuals in outcome.residuals.items():
-        for x, y in drawn(outcome.marks[tag].pixels + residuals):
-            arms = [np.array([[x - 5, y], [x + 5, y]]), np.array([[x, y - 5], [x, y + 5]])]
-            _lines(small, arms, False, rgb(SKY), 1)
+        for place in drawn(outcome.marks[tag].pixels + residuals):
+            _lines(small, [place + [[-5, 0], [5, 0]], place + [[0, -5], [0, 5]]], False, rgb(SKY), 1)
     return small
 
 
@@ -82,26 +76,26 @@ def _label(image: UInt8[np.ndarray, "H W 3"], text: str, middle: Float[np.ndarra
 
 
 def heading(title: str, outcomes: Sequence[Outcome], shown: Sequence[Outcome]) -> str:
-    """What stands above a folder's photos."""
+    """The line above a folder's photos."""
     left_out = sum(bool(o.reason) for o in outcomes)
     text = f"{title}: {len(outcomes)} photos, {left_out or 'none'} left out"
     return text if len(shown) == len(outcomes) else f"{text}; {len(shown)} evenly chosen ones are shown"
 
 
 def contact_sheet(folders: Mapping[str, Sequence[Outcome]], aspect: float) -> Figure:
-    """All photos of each folder one below the other, thinned out where there are many.
+    """The photos of each folder, one folder below the other; an even choice where there are many.
 
     Args:
         folders: their outcomes, by title.
         aspect: width / height of most photos.
     """
-    strips: list[UInt8[np.ndarray, "H W 3"]] = [np.full((2 * LINE, WIDTH, 3), 255, np.uint8)]
+    strips = [_blank(2 * LINE)]
     texts: list[tuple[float, float, str, str, float]] = [(GAP, 2 * LINE - 10, KEY, "black", POINTS)]
     top = 2 * LINE
     for title, outcomes in folders.items():
         shown = thinned(outcomes, MOST)
         texts.append((GAP, top + HEADING - 14, heading(title, outcomes, shown), "black", POINTS + 7))
-        strips.append(np.full((HEADING, WIDTH, 3), 255, np.uint8))
+        strips.append(_blank(HEADING))
         top += HEADING
         columns = min(6, max(3, ceil(sqrt(1.5 * len(shown)))))
         width = (WIDTH - GAP) // columns - GAP
@@ -111,7 +105,7 @@ def contact_sheet(folders: Mapping[str, Sequence[Outcome]], aspect: float) -> Fi
         for first in range(0, len(shown), columns):
             row = shown[first : first + columns]
             captions = [textwrap.wrap(readable(o.caption), int(width / (0.85 * POINTS))) for o in row]
-            strip = np.full((height + LINE * max(map(len, captions)) + 2 * GAP, WIDTH, 3), 255, np.uint8)
+            strip = _blank(height + LINE * max(map(len, captions)) + 2 * GAP)
             for i, (outcome, lines) in enumerate(zip(row, captions, strict=True)):
                 left, image = GAP + i * (width + GAP), small[first + i]
                 strip[: image.shape[0], left : left + image.shape[1]] = image
@@ -124,24 +118,21 @@ def contact_sheet(folders: Mapping[str, Sequence[Outcome]], aspect: float) -> Fi
     return _figure(np.concatenate(strips), texts)
 
 
+def _blank(height: int) -> UInt8[np.ndarray, "H W 3"]:
+    return np.full((height, WIDTH, 3), 255, np.uint8)
+
+
 def _thumbnail(outcome: Outcome, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
     photo = np.ascontiguousarray(read_pixels(outcome.path, upright=True)[..., :3])
     return annotated(photo, outcome, width, height)
 
 
 def _figure(sheet: UInt8[np.ndarray, "H W 3"], texts: list[tuple[float, float, str, str, float]]) -> Figure:
-    """A picture, pixel by pixel, with text on it: x, y of its left end's base line, text, colour, points."""
+    """A picture, pixel by pixel, with texts on it: x and y of the start of the base line, the text, its colour and size."""
     height, width = sheet.shape[:2]
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     figure.figimage(sheet, origin="upper")
     for x, y, text, colour, points in texts:
-        figure.text(
-            x / width,
-            1 - y / height,
-            text,
-            color=colour,
-            fontsize=points,
-            fontfamily=FONT,
-            parse_math=False,
-        )
+        place = x / width, 1 - y / height
+        figure.text(*place, text, color=colour, fontsize=points, fontfamily=FONT, parse_math=False)
     return figure

@@ -1,4 +1,4 @@
-"""What a calibration rests on and what it found: where in the picture corners were seen, and the lens's distortion."""
+"""Where in the picture a calibration saw corners, and the lens it found."""
 
 import cv2
 import numpy as np
@@ -39,27 +39,22 @@ def coverage_chart(found: Calibration) -> Figure:
 def parameters(found: Calibration) -> str:
     """The lens in numbers, each with its standard deviation if it was set free."""
     values = dict(zip(LENS_PARAMETERS, lens_vector(found.lens), strict=True))
-    free = [
-        f"{name} {values[name]:.{_decimals(spread)}f} ± {spread:.{_decimals(spread)}f} {UNITS.get(name, '')}".strip()
-        for name, spread in found.deviations.items()
-    ]
+    free = []
+    for name, spread in found.deviations.items():
+        digits = int(np.clip(1 - np.floor(np.log10(max(spread, 1e-9))), 0, 6))  # two of the standard deviation
+        free.append(f"{name} {values[name]:.{digits}f} ± {spread:.{digits}f} {UNITS.get(name, '')}".strip())
     fixed = [name for name in LENS_PARAMETERS if name not in found.deviations]
     return "set free:  " + ",   ".join(free) + (f";   kept plain: {', '.join(fixed)}" if fixed else "")
 
 
-def _decimals(spread: float) -> int:
-    """Decimals that show two digits of a standard deviation."""
-    return int(np.clip(1 - np.floor(np.log10(max(spread, 1e-9))), 0, 6))
-
-
 def displacement(lens: Lens, pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
-    """How far the distortion moves what a pinhole camera would show at these pixels."""
+    """How far the distortion moves points that a pinhole camera would show at these pixels."""
     rays = (pixels - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
     return project(lens, np.eye(4), np.column_stack([rays, np.ones(len(rays))])) - pixels
 
 
 def _distortion(figure: Figure, axes: Axes, lens: Lens) -> None:
-    """A straight grid, and what the lens makes of it."""
+    """A straight grid, and how the lens bends it."""
     as_picture(axes, lens.width, lens.height)
     x, y = np.meshgrid(np.linspace(0, lens.width, 97), np.linspace(0, lens.height, 73))
     moved = displacement(lens, np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(*x.shape, 2)

@@ -1,4 +1,4 @@
-"""How well the solved cameras explain the photos: the error by photo, and the residuals over the picture."""
+"""How well the solved cameras fit the photos: the error by photo, and the residuals by place in the picture."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,15 +12,15 @@ from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.drawing.ink import BLUE, DPI, FONT, SKY, VERMILLION, as_picture, magnification, readable, shortened
 
 NAMES = 60
-"""Photos whose names fit below the bars."""
+"""Most photos whose names fit below the bars."""
 CELLS = 12, 9
-"""Into which the picture is divided for mean residuals, along its longer and its shorter side."""
+"""Cells for mean residuals, along the longer and the shorter side of the picture."""
 FEWEST = 4
 """Corners a cell must hold for its mean to be shown."""
 
 
 def error_chart(folders: Mapping[str, Sequence[Outcome]], lens: Lens) -> Figure:
-    """For each folder, the error of every photo, and the residuals of all corners over the picture's area."""
+    """For each folder, the error of every photo, and the residuals of all corners by their place in the picture."""
     figure = Figure(figsize=(18, 6.5 * len(folders)), dpi=DPI, layout="constrained")
     grid = figure.subplots(len(folders), 2, squeeze=False, width_ratios=(1.15, 1))
     for (left, right), (title, outcomes) in zip(grid, folders.items(), strict=True):
@@ -53,7 +53,7 @@ def _bars(axes: Axes, title: str, outcomes: Sequence[Outcome]) -> None:
 
 
 def _residuals(axes: Axes, title: str, outcomes: Sequence[Outcome], lens: Lens) -> None:
-    """Thin arrows for corners, thick ones for the means of neighbours: noise cancels there, a misfit of the lens stays."""
+    """Thin arrows for corners, thick ones for the means of neighbours: there noise cancels, a lens error does not."""
     as_picture(axes, lens.width, lens.height)
     seen, rest = corners_and_residuals(outcomes)
     if not len(seen):

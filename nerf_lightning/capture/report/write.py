@@ -18,22 +18,18 @@ from nerf_lightning.utils.files import atomic
 
 
 def write_report(capture: Capture, folder: Path) -> list[Path]:
-    """Writes what to look at after a capture.
+    """Writes the pictures to look at after a capture.
 
     - `tags.png`: the photos of both folders with their tags, and why some were left out;
-    - `errors.png`: the reprojection error by photo, and where in the picture corners are off and whither;
+    - `errors.png`: the reprojection error by photo, and where in the picture corners are off, in which direction;
     - `coverage.png`: where in the picture the calibration saw corners, and the lens's distortion;
     - `cameras.png`: the cameras, the tags, the box and the orbit of the scene, from above and from the side.
-
-    Args:
-        capture: its photos are read again, where they were.
-        folder: made if it does not exist.
 
     Returns:
         The files, in this order.
 
     Raises:
-        InputError: a photo that can no longer be read.
+        InputError: a photo can no longer be read: all are read again.
     """
     lens = capture.calibration.lens
     folders = {"calibration": calibration_outcomes(capture), "photos": photo_outcomes(capture)}

@@ -10,7 +10,7 @@ from nerf_lightning.capture.tags.detect import Detector, Mark, family
 from nerf_lightning.errors import InputError
 
 FEWEST = 6
-"""Corners below which a photo does not count: four fix a pose, more tell when it is wrong."""
+"""Corners that a photo must show: four fix a pose, more show when it is wrong."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Board:
     square: float
 
     def __post_init__(self) -> None:
-        for key, least in (("columns", 3), ("rows", 3)):
-            if getattr(self, key) < least:
-                raise InputError("config", f"tags.board.{key}", str(getattr(self, key)), f"at least {least} squares")
+        for key, squares in (("columns", self.columns), ("rows", self.rows)):
+            if squares < 3:
+                raise InputError("config", f"tags.board.{key}", str(squares), "at least 3 squares")
 
 
 def board_detector(dictionary: str, size: float, board: Board) -> Detector:
@@ -39,10 +39,9 @@ def board_detector(dictionary: str, size: float, board: Board) -> Detector:
     Args:
         dictionary: OpenCV's name of the tags' family.
         size: side of the tags, metres.
-        board: its squares.
 
     Raises:
-        InputError: tags that do not fit into the squares, or more squares than the family has tags.
+        InputError: tags that do not fit into the squares, or more white squares than the family has tags.
     """
     if not size < board.square:
         raise InputError("config", "tags.board.square", f"{board.square:g}", f"more than tags.size, which is {size:g}")

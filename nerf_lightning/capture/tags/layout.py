@@ -1,4 +1,4 @@
-"""TagLayout: which tags there are, how large they are, and where they lie in the world."""
+"""TagLayout: the tags, their size, and where they lie in the world."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +33,7 @@ class TagLayout:
     """Tag to world, by the tag's id."""
 
     def corners(self, tag: int) -> Float[np.ndarray, "4 3"]:
-        """Corners of one tag in the world, in OpenCV's order."""
+        """Corners of one tag in the world, in the order of `SQUARE`."""
         pose = self.poses[tag]
         return self.size * SQUARE @ pose[:3, :3].T + pose[:3, 3]
 
@@ -45,14 +45,14 @@ def flat_pose(x: float, y: float, degrees: float = 0.0) -> Float[np.ndarray, "4 
 
 
 def read_layout(path: Path, dictionary: str, size: float) -> TagLayout:
-    """Reads a flat sheet: `tags: {id: {x: metres, y: metres, turn: degrees}}`, `turn` being optional.
+    """Reads a flat sheet: `tags: {id: {x: metres, y: metres, turn: degrees}}`; `turn` is optional.
 
     Args:
         path: a YAML file, or the name of one that comes with the package ("sheet_2x3").
         dictionary, size: see `TagLayout`.
 
     Raises:
-        InputError: a missing file, one that is no YAML, or entries that are not numbers.
+        InputError: a missing file, a file that is not YAML, or entries that are not numbers.
     """
     shipped = SHEETS / f"{path.name}.yaml"
     if not path.exists() and path.parent == Path() and shipped.exists():

@@ -16,7 +16,7 @@ from nerf_lightning.utils.files import atomic
 A4 = 0.210, 0.297
 """Metres."""
 RULER = 0.1
-"""Length of the line that tells whether the printer kept the size, metres."""
+"""Length of the line that shows whether the printer kept the size, metres."""
 INCH = 0.0254
 
 
@@ -24,7 +24,7 @@ def write_page(layout: TagLayout, file: Path) -> None:
     """Writes a flat sheet of tags as a PDF of its true size.
 
     Raises:
-        InputError: no PDF is asked for, or the tags do not fit on the page.
+        InputError: the file is no PDF, or the tags do not fit on the page.
     """
     if file.suffix.lower() != ".pdf":
         raise InputError("config", "print", str(file), "a file name that ends in .pdf")
@@ -55,21 +55,15 @@ def page(layout: TagLayout) -> Figure:
     for tag, pose in layout.poses.items():
         black = cv2.aruco.generateImageMarker(family(layout.dictionary), tag, side) < 128
         turn = float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0])))
-        for row, first, last in _runs(black):
-            own = np.array([first * module, (side - 1 - row) * module, 0]) - [layout.size / 2, layout.size / 2, 0]
-            x, y, _ = pose[:3, :3] @ own + pose[:3, 3]
-            axes.add_patch(Rectangle((x, y), (last - first) * module, module, angle=turn, color="black", linewidth=0.2))
+        for row, modules in enumerate(black):
+            runs = np.flatnonzero(np.diff(np.pad(modules.astype(int), 1))).reshape(-1, 2)
+            for first, last in runs.tolist():
+                own = np.array([first * module - layout.size / 2, (side - 1 - row) * module - layout.size / 2, 0])
+                x, y, _ = pose[:3, :3] @ own + pose[:3, 3]
+                width = (last - first) * module
+                axes.add_patch(Rectangle((x, y), width, module, angle=turn, color="black", linewidth=0.2))
     words = f"{layout.dictionary}, tags of {100 * layout.size:g} cm. Print without scaling: this line is 10 cm long."
     bottom = centre[1] - A4[1] / 2 + 0.009
     axes.plot(centre[0] + np.array([-0.5, 0.5]) * RULER, [bottom, bottom], color="black", linewidth=0.8)
     axes.text(centre[0], bottom + 0.002, words, ha="center", va="bottom", fontsize=7)
     return figure
-
-
-def _runs(black: np.ndarray) -> list[tuple[int, int, int]]:
-    """Row, first column and end of each run of black modules."""
-    out = []
-    for row, modules in enumerate(black):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], modules.astype(int), [0]])))
-        out += [(row, int(first), int(last)) for first, last in edges.reshape(-1, 2)]
-    return out
