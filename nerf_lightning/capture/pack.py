@@ -17,10 +17,10 @@ from nerf_lightning.dataset.scene import Scene, Views
 from nerf_lightning.errors import InputError
 
 NEAR = 0.25
-"""Sampling starts at this share of the nearest camera's distance to the subject: nobody holds a lens closer."""
+"""Sampling starts at this share of the nearest camera's distance to the subject."""
 SUBJECT = 0.5
-"""The box's share of what the photos show across at the subject. Around an object there are tags, which are in the photos too;
-they may lie outside the box, where a field has less and less detail."""
+"""The box's share of the width that photos show at the subject. The tags around an object may lie outside the box, where a
+field has less detail the farther out."""
 FRAMES = 60
 
 
@@ -40,20 +40,20 @@ def pack(
     holdout: int = 10,
     orbit: str | None = None,
 ) -> Scene:
-    """Makes a scene of photos that have been placed.
+    """Makes a scene of placed photos.
 
-    Undistortion zooms in until no pixel lacks a source, so that no black border is ever trained on. The scene's frame is the
-    tags': metres, z out of the paper. The box is a cube around what the cameras look at, half as wide as the photos show there;
-    what is beyond is kept too, the coarser the farther.
+    Undistortion zooms in until every pixel has a source, so that there is no black border. The scene's frame is that of the
+    tags: metres, z out of the paper. The box is a cube around what the cameras look at, half as wide as the photos show there;
+    the scene is unbounded.
 
     Args:
         paths: the photos, all of the lens's size.
         c2w: camera to world, OpenCV frame, metres.
-        lens: that took them.
+        lens: of the photos.
         name, source: see `Scene`.
         longest: side of the scene's photos in pixels; None keeps their size.
-        holdout: every so-manieth photo is held out.
-        orbit: name of the photo through whose camera the orbit goes; None takes one at a middling height.
+        holdout: every N-th photo is held out.
+        orbit: name of the photo through whose camera the orbit goes; None takes one at medium height.
 
     Raises:
         InputError: fewer than two photos, or no photo of that name.
@@ -75,11 +75,16 @@ def pack(
     train = Views(images[~held], cameras[~held])
     centre = focus_point(train.cameras.c2w)
     distances = (train.cameras.centres - centre).norm(dim=1)
-    # The camera nearest to the middle of all in distance and height, unless one is named.
-    middling = (distances - distances.median()).abs() + (poses[~held, 2, 3] - poses[~held, 2, 3].median()).abs()
-    through = train.cameras.centres[middling.argmin()]
     if orbit is not None:
         through = poses[[path.name for path in paths].index(orbit), :3, 3]
+    else:  # the camera nearest to the medians of distance and height
+        heights = poses[~held, 2, 3]
+        off = (distances - distances.median()).abs() + (heights - heights.median()).abs()
+        through = train.cameras.centres[off.argmin()]
+    offset = through - centre
+    radius = float(offset.norm())
+    elevation = float(torch.asin((offset[2] / max(radius, 1e-9)).clamp(-0.99, 0.99)))
+    circle = orbit_around(centre, torch.tensor([0.0, 0.0, 1.0]), radius, elevation, FRAMES)
     near = NEAR * min(viewing_distance(train.cameras.c2w, centre), float(distances.min()))
     cube = torch.from_numpy(visible_cube(train.cameras)).float()
     aabb = centre + SUBJECT * (cube - centre)
@@ -88,14 +93,6 @@ def pack(
         source=source,
         train=train,
         val=Views(images[held], cameras[held]),
-        orbit=Cameras(train.cameras.K[:1].repeat(FRAMES, 1, 1), _circle(through, centre), width, height),
+        orbit=Cameras(train.cameras.K[:1].repeat(FRAMES, 1, 1), circle, width, height),
         bounds=Bounds(aabb, unbounded=True, near=near),
     )
-
-
-def _circle(through: Float[torch.Tensor, "3"], centre: Float[torch.Tensor, "3"]) -> Float[torch.Tensor, "F 4 4"]:
-    """A circle around the vertical through the subject, on which a given camera lies; all look at the subject."""
-    offset = through - centre
-    radius = float(offset.norm())
-    elevation = float(torch.asin((offset[2] / max(radius, 1e-9)).clamp(-0.99, 0.99)))
-    return orbit_around(centre, torch.tensor([0.0, 0.0, 1.0]), radius, elevation, FRAMES)

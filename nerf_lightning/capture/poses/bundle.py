@@ -1,4 +1,4 @@
-"""Lens, camera poses and tag poses together, and how far off from where they were seen they project all marks."""
+"""Lens, camera poses and tag poses together: reprojection residuals and their derivatives."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ LENS_PARAMETERS = ("focal", "aspect", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 @dataclass(frozen=True)
 class Bundle:
-    """All unknowns, and what was seen.
+    """All unknowns, and the marks that were seen.
 
     Photos and tags are numbered; `marks[p]` maps a tag's number to its mark in photo p.
     """
@@ -29,7 +29,7 @@ class Bundle:
     """Tag to world, by tag."""
     marks: list[dict[int, Mark]]
     twists: Float[np.ndarray, "T"]
-    """How far the corners of each tag stand out of its plane, in turn up and down, metres: paper is seldom flat."""
+    """How far the corners of each tag stand out of its plane, alternately up and down, metres: paper is seldom flat."""
 
 
 def lens_vector(lens: Lens) -> Float[np.ndarray, "9"]:
@@ -43,7 +43,7 @@ def lens_with(lens: Lens, vector: Float[np.ndarray, "9"]) -> Lens:
 
 
 def simplified(lens: Lens, free: tuple[str, ...]) -> Lens:
-    """The lens with plain values (square pixels, centred, no distortion) where a model sets nothing free; as it is for ()."""
+    """The lens with plain values (square pixels, centred, no distortion) for what is not free; unchanged for ()."""
     if not free:
         return lens
     plain = np.array([lens.fx, 1.0, lens.width / 2, lens.height / 2, 0, 0, 0, 0, 0])
@@ -52,8 +52,8 @@ def simplified(lens: Lens, free: tuple[str, ...]) -> Lens:
 
 
 def _warp(points: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M"]:
-    """How high a twist by 1 lifts each point: x y, 1 at the corners. Of all ways to bend a square, only this one lifts its
-    corners out of their common plane."""
+    """How high a twist by 1 lifts each point: x y, 1 at the corners. Only this bend of a square lifts its corners out of their
+    common plane."""
     extent = np.abs(points[:, :2]).max(0)
     return points[:, 0] * points[:, 1] / (extent[0] * extent[1])
 
@@ -72,7 +72,7 @@ def _rotations(vectors: Float[np.ndarray, "B 3"]) -> tuple[Float[np.ndarray, "B 
 def _moved(
     motions: Float[np.ndarray, "B 6"], which: Int[np.ndarray, "N"], points: Float[np.ndarray, "N 3"]
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3 6"], Float[np.ndarray, "N 3 3"]]:
-    """Points carried along, each by the motion of its number; derivatives with respect to its six numbers, and its turn."""
+    """Points moved by motion `which`, the derivatives with respect to its six numbers, and its rotation matrix."""
     turns, derivatives = _rotations(motions[:, :3])
     jacobian = np.empty((len(points), 3, 6))
     jacobian[:, :, :3] = np.einsum("nkrc,nc->nrk", derivatives[which], points)
@@ -90,7 +90,7 @@ def _turned(motion: Float[np.ndarray, "6"], pose: Float[np.ndarray, "4 4"]) -> F
 
 @dataclass(frozen=True)
 class _Seen:
-    """All points that were seen, photo by photo and mark by mark."""
+    """All points seen, photo by photo and mark by mark."""
 
     photo: Int[np.ndarray, "N"]
     tag: Int[np.ndarray, "N"]
@@ -113,8 +113,8 @@ class _Seen:
 
 
 class Problem:
-    """Residuals and their derivatives for `least_squares`: unknowns are the free lens parameters, all photos, the free tags,
-    and all tags' twists where they are free."""
+    """Residuals and their derivatives for `least_squares`. The unknowns are the free lens parameters, the poses of all photos
+    and of the free tags, and, if `free_twists`, the twists of all tags."""
 
     def __init__(self, bundle: Bundle, free_lens: Bool[np.ndarray, "9"], fixed_tags: set[int], free_twists: bool):
         self.bundle = bundle
@@ -125,6 +125,7 @@ class Problem:
         self.first_tag = self.first_pose + 6 * len(bundle.w2c)
         self.first_twist = self.first_tag + 6 * int(self.moving.sum())
         self.free_twists = free_twists
+        self._twisting = len(bundle.tags) * free_twists
         self.unknowns = self.first_twist + self._twisting
         self.seen = _Seen.of(bundle.marks)
         self._last: tuple[np.ndarray, tuple[np.ndarray, csr_matrix]] | None = None
@@ -134,7 +135,7 @@ class Problem:
         self._ends = np.concatenate([[0], np.cumsum(self._there.sum(2).reshape(-1))])
 
     def _column_of_each_entry(self) -> Int[np.ndarray, "N 2 E"]:
-        """Columns of a point's entries in the Jacobian, ascending, as `_evaluate` lines them up; -1 for those of fixed tags."""
+        """Columns of a point's entries in the Jacobian, ascending, in the order of `_evaluate`; -1 for those of fixed tags."""
         count = len(self.seen.photo)
         first = self.first_tag + 6 * (np.cumsum(self.moving) - 1)[self.seen.tag]
         tags = np.where(self.moving[self.seen.tag][:, None], first[:, None] + np.arange(6), -1)
@@ -148,13 +149,9 @@ class Problem:
 
     def start(self) -> Float[np.ndarray, "X"]:
         shifts = [*self.bundle.w2c[:, :3, 3], *self.bundle.tags[self.moving, :3, 3]]
-        # Turns are told from where they start: a rotation vector as such has a seam at half a turn.
+        # Rotations are relative to the start: rotation vectors have a seam at half a turn.
         motions = [np.concatenate([np.zeros(3), shift]) for shift in shifts]
         return np.concatenate([self.lens_start[self.free_lens], *motions, self.bundle.twists[: self._twisting]])
-
-    @property
-    def _twisting(self) -> int:
-        return len(self.bundle.tags) * self.free_twists
 
     def twists_of(self, x: Float[np.ndarray, "X"]) -> Float[np.ndarray, "T"]:
         return x[self.first_twist :] if self.free_twists else self.bundle.twists
@@ -165,14 +162,14 @@ class Problem:
         return vector
 
     def tags_of(self, x: Float[np.ndarray, "X"]) -> Float[np.ndarray, "T 6"]:
-        """Further turn and whole shift of each tag."""
+        """Rotation from the start, and translation, of each tag."""
         motions = np.zeros((len(self.bundle.tags), 6))
         motions[:, 3:] = self.bundle.tags[:, :3, 3]
         motions[self.moving] = x[self.first_tag : self.first_twist].reshape(-1, 6)
         return motions
 
     def poses_of(self, x: Float[np.ndarray, "X"]) -> Float[np.ndarray, "P 6"]:
-        """Further turn and whole shift of each photo."""
+        """Rotation from the start, and translation, of each photo."""
         return x[self.first_pose : self.first_tag].reshape(-1, 6)
 
     def unpack(self, x: Float[np.ndarray, "X"]) -> Bundle:
@@ -187,7 +184,7 @@ class Problem:
 
     def evaluate(self, x: Float[np.ndarray, "X"]) -> tuple[Float[np.ndarray, "R"], csr_matrix]:
         """Residuals, two a point, and their Jacobian."""
-        # The solver asks for both, one after the other.
+        # The solver asks for the two one after the other.
         if self._last is None or not np.array_equal(self._last[0], x):
             self._last = (x.copy(), self._evaluate(x))
         return self._last[1]

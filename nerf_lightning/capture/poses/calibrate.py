@@ -1,4 +1,4 @@
-"""The lens of a camera from photos of tags: focal length, principal point, distortion, and how sure they are."""
+"""The lens of a camera from photos of tags: focal length, principal point, distortion, and their standard deviations."""
 
 import logging
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from nerf_lightning.errors import InputError
 log = logging.getLogger(__name__)
 
 FEWEST = 3
-"""Photos below which nothing can be calibrated."""
+"""Photos that a calibration needs."""
 MODELS: tuple[tuple[int, tuple[str, ...]], ...] = (
     (3, ("focal",)),
     (4, ("focal", "k1")),
@@ -28,32 +28,32 @@ MODELS: tuple[tuple[int, tuple[str, ...]], ...] = (
     (15, ("focal", "cx", "cy", "k1", "k2", "p1", "p2", "k3")),
     (15, LENS_PARAMETERS),
 )
-"""Photos needed, and what they may set free; the criterion of Schwarz (BIC) decides among those allowed.
+"""Photos needed, and the lens parameters that these may free; the BIC decides among the models allowed.
 
-With few photos the principal point soaks up what bent paper does, and takes the focal length along: it stays in the middle.
+With few photos the principal point would absorb the effect of bent paper, and spoil the focal length: it stays in the middle.
 """
 ROUNDS = 3
-"""Solutions of the poses before the lens model is chosen."""
+"""Times that the poses are solved before the lens model is chosen."""
 FIRST_FOCAL = (0.7, 1.0, 1.5, 2.2)
 """First guesses of the focal length, in longest sides of the photo."""
 UNSURE, HOPELESS = 0.01, 0.05
-"""Standard deviation of the focal length, as a share of it, beyond which a warning, an error is due."""
+"""Relative standard deviations of the focal length above which there is a warning, and an error."""
 PLAUSIBLE = 0.35, 12.0
 """Focal lengths in longest sides of the photo: from a very wide angle to a long telephoto lens."""
 COVERED = 0.4
 """Share of the picture that corners should span."""
 FRONTAL, TILTED = np.radians(8.0), np.radians(20.0)
-"""How far tags must, and should, be tilted in some photo."""
+"""How far tags must, and should, be tilted in at least one photo."""
 TILT = "tilt the camera by 20 to 45 degrees in several photos, in different directions"
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibrated lens, and what it rests on."""
+    """A calibrated lens, and the photos and figures behind it."""
 
     lens: Lens
     deviations: dict[str, float]
-    """Standard deviations of what was set free; the other parameters kept their plain values."""
+    """Standard deviations of the free parameters; the others kept their plain values."""
     rms: float
     """Root mean square reprojection error, pixels."""
     solved: Solved
@@ -64,12 +64,12 @@ class Calibration:
     coverage: float
     """Share of the picture within the hull of all corners."""
     tilt: float
-    """How far off the frontal view a tag was seen at most, radians."""
+    """Largest angle from the frontal view of a tag, radians."""
     warnings: list[str]
 
 
 def first_lens(sightings: Sequence[Sighting]) -> Lens:
-    """A focal length to start from, each mark taken as a target of its own (Zhang 2000, as OpenCV does it)."""
+    """A lens to start from: only the focal length is fitted, with each mark as a target of its own (Zhang 2000, by OpenCV)."""
     width, height = sightings[0].width, sightings[0].height
     marks = [mark for sighting in sightings for mark in sighting.marks.values()]
     points = [mark.points.astype(np.float32) for mark in marks]
@@ -92,17 +92,15 @@ def first_lens(sightings: Sequence[Sighting]) -> Lens:
 
 
 def calibrate(folder: Path, sightings: Sequence[Sighting], layout: dict[int, Pose] | None) -> Calibration:
-    """Fits the lens.
-
-    Photos without tags are dropped by name, so are photos that the rest cannot explain.
+    """Fits the lens. Photos without tags, and photos that contradict the others, are dropped by name.
 
     Args:
         folder: where the photos are, for messages.
         sightings: all photos of one size.
-        layout: tag to world, or None where it is to be solved from these photos.
+        layout: tag to world; None solves it from these photos.
 
     Raises:
-        InputError: too few photos with tags, or photos that cannot tell the focal length.
+        InputError: too few photos with tags, or photos that do not determine the focal length.
     """
     dropped = {s.name: "no tag found" for s in sightings if not s.marks}
     used = [s for s in sightings if s.marks]
@@ -136,11 +134,12 @@ def calibrate(folder: Path, sightings: Sequence[Sighting], layout: dict[int, Pos
         dropped |= {used[i].name: "its tags could not be placed" for i in lost}
         used = left
     refined = solved.refined
-    coverage = _coverage(used)
-    share = refined.deviations.get("focal", 0.0) / solved.lens.fx
-    field = solved.lens.fx / max(solved.lens.width, solved.lens.height)
+    corners = np.concatenate([mark.pixels for s in used for mark in s.marks.values()]).astype(np.float32)
+    coverage = float(cv2.contourArea(cv2.convexHull(corners))) / (lens.width * lens.height)
+    share = refined.deviations.get("focal", 0.0) / lens.fx
+    field = lens.fx / max(lens.width, lens.height)
     if not share < HOPELESS or not PLAUSIBLE[0] < field < PLAUSIBLE[1]:
-        found = f"a focal length of {solved.lens.fx:.0f} pixels, open by {100 * share:.0f} %"
+        found = f"a focal length of {lens.fx:.0f} pixels, open by {100 * share:.0f} %"
         raise InputError(folder, "", found, "tags seen from different angles", TILT)
     warnings = []
     if share > UNSURE:
@@ -152,21 +151,12 @@ def calibrate(folder: Path, sightings: Sequence[Sighting], layout: dict[int, Pos
             f"the tags cover {100 * coverage:.0f} % of the picture: bring them near its borders in some photos, else "
             "distortion there is a guess"
         )
-    return Calibration(
-        solved.lens,
-        refined.deviations,
-        refined.total_rms,
-        solved,
-        used,
-        dropped,
-        coverage,
-        tilt,
-        warnings,
-    )
+    rms = refined.total_rms
+    return Calibration(lens, refined.deviations, rms, solved, used, dropped, coverage, tilt, warnings)
 
 
 def without(sighting: Sighting, tag: int | None) -> Sighting:
-    """A sighting less one tag that is half hidden, bent, or mistaken for another."""
+    """A sighting without a tag that is half hidden, bent, or mistaken for another."""
     if tag is None:
         return sighting
     log.warning(
@@ -176,34 +166,29 @@ def without(sighting: Sighting, tag: int | None) -> Sighting:
 
 
 def off_by(error: float, usual: float) -> str:
-    """Why a photo is left out."""
+    """The reason for leaving out a photo."""
     return f"its tag is {error:.1f} pixels off, where {usual:.2f} are usual"
 
 
 def _fit(folder: Path, lens: Lens, used: list[Sighting], layout: dict[int, Pose] | None) -> Solved:
-    """Poses and layout from the first guess, then the lens model that the photos can carry."""
+    """Poses and layout from the first guess of the lens, then the best lens model that the number of photos allows."""
     marks: list[dict[int, Mark]] = [s.marks for s in used]
     rough = MODELS[1][1] if len(used) >= MODELS[1][0] else MODELS[0][1]
-    # Without distortion a tag's flipped pose can look the better one; with the first estimate of it, solutions are told anew.
-    solved = None
+    # Without distortion the flipped pose of a tag can look better: with each estimate of it, poses are chosen again.
     for _ in range(ROUNDS):
-        solved = solve(lens if solved is None else solved.lens, marks, layout, rough)
+        solved = solve(lens, marks, layout, rough)
         if solved is None:
             raise InputError(folder, "", "tags that no camera could have seen so", "photos of flat, undamaged tags")
+        lens = solved.lens
     assert solved is not None  # ROUNDS is at least 1
     models = [free for needed, free in MODELS if len(solved.placed) >= needed]
     refined = settle(solved.refined.bundle, models, solved.fixed)
     return packed(refined, list(solved.tags), solved.placed, solved.fixed)
 
 
-def _coverage(used: Sequence[Sighting]) -> float:
-    corners = np.concatenate([mark.pixels for s in used for mark in s.marks.values()]).astype(np.float32)
-    return float(cv2.contourArea(cv2.convexHull(corners))) / (used[0].width * used[0].height)
-
-
 def _tilt(used: Sequence[Sighting]) -> float:
-    """The largest angle off the frontal view, from how much marks are foreshortened: whatever the focal length, a frontal
-    square stays one. Of each photo the mark nearest to the middle is looked at, where distortion does the same least."""
+    """The largest angle from the frontal view, by foreshortening: a frontal square stays a square at any focal length. Each
+    photo is judged by its mark nearest to the middle, where distortion is least."""
     angles = []
     for s in used:
         middle = np.array([s.width / 2, s.height / 2])

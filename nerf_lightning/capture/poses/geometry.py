@@ -1,4 +1,4 @@
-"""Rigid motions as six numbers, and the projection of points through a lens with its derivatives."""
+"""Rigid motions as six numbers, and projection through a lens."""
 
 import cv2
 import numpy as np
@@ -31,12 +31,12 @@ def inverse(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
 def angle_between(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> float:
     """Angle of the rotation from one motion to the other, radians."""
     relative = a[:3, :3].T @ b[:3, :3]
-    # The chord is exact for small angles, where the cosine is not.
+    # The chord is exact at small angles, where the cosine is not.
     return 2 * float(np.arcsin(min(1.0, np.linalg.norm(relative - np.eye(3)) / np.sqrt(8))))
 
 
 def move(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M 3"]:
-    """Points carried along by a rigid motion."""
+    """Points after a rigid motion."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
@@ -50,7 +50,7 @@ def project(lens: Lens, w2c: Float[np.ndarray, "4 4"], points: Float[np.ndarray,
 def folds(lens: Lens) -> bool:
     """Whether the radial distortion turns back before the picture's farthest corner, so that two directions share a pixel.
 
-    A polynomial that was fitted to the middle of the picture alone may do that; no lens does.
+    No lens does that, but a polynomial fitted only to the middle of the picture may.
     """
     k1, k2, _, _, k3 = lens.distortion
     x, y = max(lens.cx, lens.width - lens.cx) / lens.fx, max(lens.cy, lens.height - lens.cy) / lens.fy

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SIDE = 1600
-"""Longest side in pixels at which features are looked for."""
+"""Longest side in pixels of the copies in which COLMAP looks for features."""
 FEWEST = 3
-"""Placed photos below which nothing was found."""
+"""Placed photos that make a result."""
 OVERLAP = "take more photos, in small steps around the subject, sharp, of something with texture; or use tags"
 
 
@@ -69,7 +69,8 @@ def capture_without_tags(folder: Path, packing: Packing) -> tuple[list[Placed], 
     images = {image.name: image for image in model.images.values() if image.has_pose}
     numbers = {path.name: f"{number:06d}.png" for number, path in enumerate(paths)}
     names = [path.name for path in usable if numbers[path.name] in images]
-    raw = np.stack([inverse(_w2c(images[numbers[name]])) for name in names])
+    last = [[0.0, 0.0, 0.0, 1.0]]
+    raw = np.stack([inverse(np.concatenate([images[numbers[name]].cam_from_world().matrix(), last])) for name in names])
     poses = dict(zip(names, upright(raw), strict=True))
     photos = []
     for path in paths:
@@ -132,10 +133,6 @@ def _lens(model: "pycolmap.Reconstruction", width: int, height: int) -> Lens:
     return Lens(width, height, fx * x, fy * y, cx * x, cy * y, (k1, k2, p1, p2, 0.0))
 
 
-def _w2c(image: "pycolmap.Image") -> Float[np.ndarray, "4 4"]:
-    return np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
-
-
 def _error(image: "pycolmap.Image", model: "pycolmap.Reconstruction") -> float:
     """Root mean square reprojection distance of a copy's points, in its pixels."""
     squares = []
@@ -148,9 +145,9 @@ def _error(image: "pycolmap.Image", model: "pycolmap.Reconstruction") -> float:
 
 
 def upright(c2w: Float[np.ndarray, "V 4 4"]) -> Float[np.ndarray, "V 4 4"]:
-    """Poses in a frame whose origin is what the cameras look at, z up, at a median distance of 1.
+    """Poses in a frame with its origin where the cameras look, z up, at a median distance of 1.
 
-    Up is the direction to which the photos' rows are most nearly at right angles: people hold cameras level.
+    Up is the direction most nearly perpendicular to the photos' rows: people hold cameras level.
     """
     rows, downs = c2w[:, :3, 0], c2w[:, :3, 1]
     up = np.linalg.svd(rows)[2][2]

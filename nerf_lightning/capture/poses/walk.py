@@ -1,4 +1,4 @@
-"""The photographer's walk: neighbouring photos say which of two solutions of a flat tag is meant."""
+"""The photographer's walk: neighbouring photos show which of the two poses of a flat tag is right."""
 
 from collections.abc import Sequence
 
@@ -13,14 +13,14 @@ from nerf_lightning.capture.poses.pose import Hypothesis
 from nerf_lightning.dataset.lens import Lens
 
 STIFFNESS = np.radians([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4])
-"""Typical bends tried: by how much a step from photo to photo differs from the one before; in radians, or in shares of the
-distance to the tags. The one of largest evidence is taken."""
+"""Typical bends to try: by how much a step from photo to photo differs from the one before, in radians and in shares of the
+distance to the tags. The bend of the largest evidence is taken."""
 WALK_ERROR = np.radians(4.0)
-"""How well a smoothed walk knows a pose: about half of what separates the solutions worth separating."""
+"""Standard deviation of the poses of a smoothed walk: about half the angle between solutions that matter."""
 ROUNDS = 16
-"""Of Gauss-Newton; in the first half all bends weigh alike, so that a flipped first guess is pulled along."""
+"""Iterations of Gauss-Newton; in the first half all bends have the same weight, which pulls flipped first guesses along."""
 TAIL = 4.0
-"""Degrees of freedom of Student's t, the distribution of bends: jumps are rare but no wonder."""
+"""Degrees of freedom of Student's t, the distribution of bends: jumps are rare but possible."""
 
 
 def choose(
@@ -28,15 +28,15 @@ def choose(
     hypotheses: Sequence[Sequence[Hypothesis]],
     seen: Sequence[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 2"]]],
 ) -> list[int]:
-    """Chooses one hypothesis a photo: of small error, and near the likeliest smooth walk through all photos.
+    """Chooses a hypothesis for each photo, by its error and its distance from the likeliest smooth walk through all photos.
 
     A flat tag seen nearly from the front has two poses of about the same reprojection error, and noise decides between them.
-    But photos are taken one after the other, and the wrong poses do not make a walk. Where photos are far apart, every walk
-    bends at every step, and the reprojection error decides again.
+    But photos are taken one after the other, and the wrong poses do not make a smooth walk. If photos are far apart, every
+    walk bends at every step, and the reprojection error decides again.
 
     Args:
         lens: of all photos.
-        hypotheses: at least one for each photo, best first, in the order taken.
+        hypotheses: at least one for each photo, best first; photos in the order taken.
         seen: the points in the world and their pixels, by photo.
 
     Returns:
@@ -44,7 +44,7 @@ def choose(
     """
     if len(hypotheses) < 4 or all(len(options) == 1 for options in hypotheses):
         return [0] * len(hypotheses)
-    # Six numbers were fitted to each photo: what is left over tells the noise.
+    # Six numbers were fitted to each photo: the remaining residuals are the noise.
     spare = sum(max(2 * len(points) - 6, 1) for points, _ in seen)
     variance = max(sum(options[0].squares for options in hypotheses) / spare, 1e-4)
     start = [inverse(options[0].pose) for options in hypotheses]
@@ -68,10 +68,10 @@ def smoothed(
     variance: float,
     bend: float,
 ) -> tuple[list[Float[np.ndarray, "4 4"]], float]:
-    """The walk that weighs reprojection errors against bends, by iteratively reweighted least squares.
+    """The walk with the best balance of reprojection errors and bends, by iteratively reweighted least squares.
 
-    Unknown is a small turn and shift of each pose, both in the world's frame. Bends follow Student's t: a jump between two
-    rounds costs little.
+    The unknowns are a small rotation and translation of each pose, in the world's frame. Bends follow Student's t: a jump
+    between two rounds of photos costs little.
 
     Args:
         start: camera to world, by photo.
@@ -128,7 +128,7 @@ def _residual(
 def _pull(
     lens: Lens, pose: np.ndarray, points: np.ndarray, pixels: np.ndarray
 ) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
-    """J^T J and J^T r of one photo, for a turn and a shift of its pose in the world's frame."""
+    """J^T J and J^T r of one photo, for a rotation and a translation of its pose in the world's frame."""
     residual, by_camera = _residual(lens, pose, points, pixels)
     by_world = (by_camera @ pose[:3, :3].T).reshape(-1, 2, 3)
     # Turning the camera by w moves a point, as the camera sees it, by -w x (p - c); shifting the camera by s, by -s.
