@@ -71,10 +71,7 @@ def test_a_board_calibrates_and_places_like_tags():
     assert abs(found.lens.fx / LENS.fx - 1) < 0.003 and found.rms < 0.2
     for i, c2w in enumerate(c2ws):
         assert angle_between(inverse(found.solved.w2c[i]), c2w) < np.radians(0.5)
-
-
-def test_what_is_no_board_gives_nothing():
-    assert board_detector(FAMILY, TAG, BOARD)(np.full((480, 640), 128, np.uint8)) == {}
+    assert detect(np.full((480, 640), 128, np.uint8)) == {}  # no board
 
 
 def test_boards_that_cannot_be():

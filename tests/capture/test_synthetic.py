@@ -230,11 +230,12 @@ def test_beyond_the_table_there_is_a_plain_wall():
 
 
 def test_a_capture_is_written_with_its_truth_and_follows_its_seed(tmp_path):
+    lens = Lens(32, 24, 29.0, 29.0, 16.0, 12.0)
     truth, _, other = (
-        write_capture(tmp_path / name, SHEET, TINY, 2, 1, Flaws(), seed)
+        write_capture(tmp_path / name, SHEET, lens, 2, 1, Flaws(), seed)
         for name, seed in (("a", 4), ("b", 4), ("c", 5))
     )
-    assert (truth.lens, truth.layout) == (TINY, SHEET)
+    assert (truth.lens, truth.layout) == (lens, SHEET)
     assert list(truth.calibration) == ["000.png", "001.png"] and list(truth.photos) == ["000.png"]
     for kind, poses in (("calibration", truth.calibration), ("photos", truth.photos)):
         assert sorted(file.name for file in (tmp_path / "a" / kind).iterdir()) == list(poses)
@@ -242,5 +243,5 @@ def test_a_capture_is_written_with_its_truth_and_follows_its_seed(tmp_path):
             assert np.abs(c2w - getattr(other, kind)[name]).max() > 0.01
             first, again, changed = (tmp_path / folder / kind / name for folder in "abc")
             assert first.read_bytes() == again.read_bytes() != changed.read_bytes()
-            exact = render_photo(SHEET, TINY, c2w, kind == "photos", Flaws(noise=0), 0)
+            exact = render_photo(SHEET, lens, c2w, kind == "photos", Flaws(noise=0), 0)
             assert np.abs(imageio.imread(first).astype(float) - exact).mean() < 3

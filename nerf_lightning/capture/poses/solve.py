@@ -74,7 +74,7 @@ def _consensus(photos: list[list[Pose]]) -> tuple[Pose, int]:
 
 
 def arrange(pairs: Mapping[tuple[int, int], tuple[Pose, int]], reference: int) -> dict[int, Pose]:
-    """Places all tags that hang together with the reference, by the links that most photos agree on first.
+    """Places all tags that are linked to the reference, starting with the links that most photos agree on.
 
     Returns:
         Tag to the reference tag's frame.
