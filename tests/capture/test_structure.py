@@ -6,9 +6,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import yaml
-from capture.views import SMALL, camera
+from capture.views import SIX, SMALL, camera
 
-from benchmarks.synthetic.photos import Truth
+from benchmarks.synthetic.photos import Flaws, render_photo
+from benchmarks.synthetic.viewpoints import object_cameras
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.poses.geometry import to_matrix
 from nerf_lightning.capture.poses.structure import capture_without_tags, upright
@@ -36,8 +37,12 @@ def test_any_frame_is_turned_upright(some: slice):
     np.testing.assert_allclose(np.linalg.det(found[:, :3, :3]), 1)
 
 
-def test_photos_without_tags_give_the_same_outputs(made: tuple[Path, Truth], tmp_path: Path):
-    folder, truth = made[0] / "photos", made[1].photos
+def test_photos_without_tags_give_the_same_outputs(tmp_path: Path):
+    c2ws = object_cameras(SIX, SMALL, 24, seed=0)[:8]  # in small steps around a third of a circle
+    truth, folder = {f"{i}.png": c2w for i, c2w in enumerate(c2ws)}, tmp_path / "photos"
+    folder.mkdir()
+    for name, c2w in truth.items():
+        imageio.imwrite(folder / name, render_photo(SIX, SMALL, c2w, True, Flaws(), seed=0))
     packing = Packing(tmp_path / "scene.npz", longest=200, holdout=4)
     photos, _ = capture_without_tags(folder, packing)
     placed = [photo for photo in photos if photo.c2w is not None]
