@@ -12,7 +12,7 @@ import pytest
 from capture.views import SIZE
 from nbclient import NotebookClient
 
-from nerf_lightning.capture.synthetic import Truth
+from benchmarks.synthetic.photos import Truth
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.stability.toys import PILE, toy
 
