@@ -34,7 +34,7 @@ MODELS = {
     "siren": [*PICTURE, "model.width=32"],
 }
 ANOTHER = "siren, another seed"
-STEPS = 24
+STEPS = 14
 
 
 class Stop(Exception):

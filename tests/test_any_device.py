@@ -272,7 +272,7 @@ def test_a_search_finds_the_smallest_that_is_enough(device: torch.device, tmp_pa
     rungs = [{"density_components": 8, "colour_components": 8, "coarsest": 4, "finest": side} for side in (4, 8)]
     ladder = {"rungs": rungs, "samplers": [{"samples": 32, "resolution": 8}]}
     (tmp_path / "ladder.yaml").write_text(yaml.safe_dump(ladder))
-    given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "budget.steps=12"]
+    given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "budget.steps=6"]
     where = ["device=pretend", "+trainer.inference_mode=false", "callbacks.orbit=null", "callbacks.snapshots=null"]
     cfg = composed(
         [*given, *where, f"ladder={tmp_path}/ladder.yaml", f"output={tmp_path}/found", "target.psnr=8"],
@@ -292,7 +292,7 @@ MOST = {"tensorf": 250, "hashgrid": 250, "voxels": 250, "mlp": 220}
 def test_a_step_asks_little_of_the_device(name: str, device: torch.device, tmp_path: Path):
     """As shipped, of a field that has its size; reading a result, or its size, makes the host wait."""
     small = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1"]
-    system, data = system_of([f"recipe={name}_medium", *small, "sampler.warmup=0", "sampler.update_every=4"], tmp_path)
+    system, data = system_of([f"recipe={name}_medium", *small, "sampler.warmup=0"], tmp_path)
     assert isinstance(system, NeRF3D)
     system, period, counts = system.to(device), system.sampler.update_every, []
     optimizer = system.configure_optimizers()

@@ -30,7 +30,7 @@ def trained(folder: Path, recipe: str = "tensorf_small", *more: str) -> Path:
         "dataset=photos",
         f"dataset.path={folder}/scene.npz",
         f"recipe={recipe}",
-        "budget.steps=60",
+        "budget.steps=40",
         "threads=1",
         *more,
     ]
@@ -84,7 +84,7 @@ def test_halves_are_nearer_than_bytes(tmp_path: Path):
 
 
 def test_pictures_too(tmp_path: Path):
-    given = ["+experiment=picture", "dataset.max_side=32", "budget.steps=60", "threads=1", "~logger"]
+    given = ["+experiment=picture", "dataset.max_side=32", "budget.steps=40", "threads=1", "~logger"]
     train(composed([*given, *(f"callbacks.{one}=null" for one in ("training_gif", "charts", "baselines"))], tmp_path))
     export(tmp_path)
     assert load_compact(tmp_path / "compact.npz").orbit is None

@@ -27,7 +27,7 @@ def threads() -> Iterator[None]:
 
 
 def test_same_seed_same_weights_in_another_process_and_across_an_interruption(threads: None, tmp_path: Path):
-    line = [sys.executable, str(ROOT / "tests" / "every_model.py"), str(tmp_path / "broken"), "11"]
+    line = [sys.executable, str(ROOT / "tests" / "every_model.py"), str(tmp_path / "broken"), "6"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(line, env={**os.environ, "PYTHONPATH": str(ROOT)}, **pipes) as process:
         first = fingerprints(tmp_path / "whole", 0)

@@ -5,7 +5,10 @@ import json
 from pathlib import Path
 
 import pytest
+import yaml
 from commands import BARE, command
+
+from nerf_lightning.config.renames import RENAMED
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3"]
 
@@ -81,12 +84,19 @@ def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(
     assert not (broken / "error.txt").exists()
 
 
-def test_a_study_is_one_command(inside, tmp_path: Path):
-    code, out, err = inside("+experiment=study_rate", "dataset.max_side=16", "budget.steps=2", "model.width=8", *BARE)
-    assert code == 0, err
-    (root,) = (tmp_path / "outputs" / "study_rate").iterdir()
-    assert len(table(root)) == 7 and (root / "gallery.png").is_file()
-    assert {float(row["optimizer.lr"]) for row in table(root).values()} == {1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1}
+def test_a_sweep_of_an_earlier_version_goes_on(inside, tmp_path: Path):
+    """Its jobs are known to be done, though options had other names."""
+    command = ["-m", "+experiment=smoke_3d", "dataset.size=16", "budget.steps=2", "callbacks.orbit=null", "seed=0,1"]
+    assert inside(*command)[0] == 0
+    configs = list((tmp_path / "outputs" / "smoke_3d").glob("*/*/config.yaml"))
+    for path in configs:
+        config = yaml.safe_load(path.read_text())
+        for old, new in RENAMED.items():
+            (group, before), after = old.split("."), new.split(".")[1]
+            config[group] = {before if key == after else key: value for key, value in config[group].items()}
+        path.write_text(yaml.safe_dump(config, sort_keys=False))
+    code, out, _ = inside(*command)
+    assert len(configs) == 2 and code == 0 and out.count("done before") == 2
 
 
 @pytest.mark.filterwarnings("ignore")  # Optuna warns, and here warnings are errors
