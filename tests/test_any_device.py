@@ -308,7 +308,7 @@ def test_a_step_asks_little_of_the_device(name: str, device: torch.device, tmp_p
         if stats.counted:
             data.note_samples(stats.samples)
         counts.append(count)
-    for count in counts[-period + 2 :]:
+    for count in counts[-period + 3 :]:  # the first ones after an update make what is then kept for the device
         assert count.operations <= MOST[name], count.names.most_common()
         assert count.waits == 0, count.names.most_common()
     assert 0 < sum(count.waits for count in counts[-period:]) <= 8, "for an update"
