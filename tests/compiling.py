@@ -23,10 +23,12 @@ from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import Samples
-from nerf_lightning.system.compiled import part
+from nerf_lightning.system.compiled import BACKEND, part
 from nerf_lightning.training import train as training
 
 TRACED, DIFFERENTIATED = "eager", "aot_eager"  # as inductor has it up to its kernels, in a tenth of the time
+WHOLE = "voxels"
+"""The field that is compiled as users have it."""
 BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 FIELDS = {
     "mlp": lambda: MLPField(BOX, depth=2, width=8, skip=1, position_frequencies=2, density="exp"),
@@ -56,7 +58,7 @@ def outcome(field: Field, renderer: VolumeRenderer | None, rays: Rays, samples: 
 def check_field(name: str) -> dict[str, float]:
     """The largest difference, of the largest value in its tensor, and how many graphs were made at first, and anew."""
     field, renderer = FIELDS[name](), VolumeRenderer() if name == "mlp" else None  # the same for all
-    backend = TRACED if renderer is None else DIFFERENTIATED
+    backend = BACKEND if name == WHOLE else TRACED if renderer is None else DIFFERENTIATED
     keys, worst, before, graphs = list(field.state_dict()), 0.0, counters["stats"]["unique_graphs"], []
     for rays, count, progress in SIZES:
         field.grow(progress)
@@ -89,6 +91,7 @@ if __name__ == "__main__":
     torch.manual_seed(0)
     use_kernels("reference")
     found: dict[str, object] = {name: check_field(name) for name in FIELDS}
+    training.BACKEND = DIFFERENTIATED
     folder = Path(sys.argv[1])
     options = ("budget.steps=30", "model.depth=1", "callbacks.snapshots=null")
     found["trained"] = [trained("siren", folder / on, f"compile={on}", *options) for on in ("true", "false")]

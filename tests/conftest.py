@@ -41,7 +41,7 @@ import pytest
 from filelock import FileLock
 from numba.core.dispatcher import Dispatcher
 from once import once, shared_folder
-from pretend import device  # noqa: F401  (a fixture)
+from pretend import device, without_doubles  # noqa: F401  (fixtures)
 from torch.nn.functional import normalize
 
 from benchmarks.synthetic.photos import Flaws, Truth, write_capture
@@ -70,7 +70,8 @@ def kernels_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
     compile, folder = Dispatcher.compile, shared_folder(tmp_path_factory)
 
     def compile_once(self: Dispatcher, signature: object) -> object:
-        with FileLock(folder / f"{self.py_func.__module__}.{self.py_func.__qualname__}.lock"):
+        # One lock object a file: a kernel that needs itself in another signature does not wait for itself.
+        with FileLock(folder / f"{self.py_func.__module__}.{self.py_func.__qualname__}.lock", is_singleton=True):
             return compile(self, signature)
 
     Dispatcher.compile = compile_once

@@ -16,6 +16,8 @@ from lightning.pytorch.trainer.connectors import accelerator_connector
 from torch.utils import _pytree as pytree
 from torch.utils import backend_registration
 
+from nerf_lightning.kernels import sums
+
 NAME = "pretend"
 MOVES = ("aten::_to_copy", "aten::copy_", "aten::_copy_from")
 HALVED = ("mm", "bmm", "addmm", "baddbmm", "linear", "matmul")
@@ -213,3 +215,11 @@ def device(monkeypatch: pytest.MonkeyPatch) -> torch.device:
     monkeypatch.setattr(torch, "Generator", lambda device="cpu": generator("cpu" if NAME in str(device) else device))
     monkeypatch.setattr(accelerator_connector, "MixedPrecision", lambda flag, _: mixed(flag, NAME))
     return torch.device(NAME, 0)
+
+
+@pytest.fixture
+def without_doubles(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.device:
+    """The device as Apple's are: it knows no double precision."""
+    monkeypatch.setattr(Pretend, "doubles", False)
+    monkeypatch.setattr(sums, "WITHOUT_DOUBLE", (NAME,))
+    return device

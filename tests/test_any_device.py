@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -12,47 +11,25 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from every_model import MODELS, SCENE
+from every_model import MODELS
+from on_device import ON_IT, SCENES, options
 from once import once
-from pretend import NAME, Module, Pretend
+from pretend import NAME, Module
 
-from benchmarks.count import Count
 from nerf_lightning.config import cli
 from nerf_lightning.config.build import build_data, build_system, build_trainer, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.evaluate.__main__ import task as evaluate
 from nerf_lightning.export.__main__ import task as export
-from nerf_lightning.kernels import sums, use_kernels
 from nerf_lightning.render.__main__ import task as render
 from nerf_lightning.rightsize.__main__ import task as rightsize
 from nerf_lightning.runs.open import open_scene_run
 from nerf_lightning.stability.toys import PILE, toy
-from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.system import System
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.quiet import quiet
-from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.view.painter import Painter, Wish
-
-SCENES = ("hashgrid", "voxels", "tensorf", "mlp")
-ON_IT = ("device=pretend", "+trainer.inference_mode=false", "~logger")
-"""Its tensors know no inference mode."""
-QUICK = ("model.grown=0.5", "sampler.update_every=4", "sampler.warmup=8")
-SAMPLERS = {
-    "uniform": ["sampler=uniform", "sampler.samples=16"],
-    "stratified": ["sampler=stratified", "sampler.samples=16"],
-    "importance": ["sampler=importance", "sampler.samples=8", "sampler.fine=8"],
-}
-
-
-def options(name: str) -> list[str]:
-    """A model's, small, growing where it does; with an orbit of two frames."""
-    given = [option for option in MODELS[name] if option not in ("callbacks.orbit=null", "model.grown=1")]
-    if name not in SCENES:
-        return [f"model={name}", *given]
-    if name in ("mlp", "hashgrid"):
-        return [f"model={name}", *given, *QUICK[1:], "callbacks.orbit.frames=2"]
-    return [f"model={name}", *given, *QUICK, "callbacks.orbit.frames=2"]
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +45,7 @@ def trained(name: str, folder: Path, *more: str) -> dict:
 
 @pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
-    """A run of planes and lines made on the CPU, to be opened on the device. To be looked at."""
+    """A TensoRF run made on the CPU, to be opened on the device. To be looked at."""
 
     def make(folder: Path) -> Path:
         train(composed([*options("tensorf"), "budget.steps=60", "~logger", "callbacks.orbit=null"], folder))
@@ -84,14 +61,6 @@ def test_the_device_keeps_to_itself(device: torch.device):
     with pytest.raises(TypeError, match="no numpy"):
         there.numpy()
     assert torch.equal((there + torch.tensor(1.0)).cpu(), torch.full((3,), 2.0)), "a single number may come along"
-
-
-@pytest.fixture
-def without_doubles(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.device:
-    """The device as Apple's are: it knows no double precision."""
-    monkeypatch.setattr(Pretend, "doubles", False)
-    monkeypatch.setattr(sums, "WITHOUT_DOUBLE", (NAME,))
-    return device
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -110,69 +79,6 @@ def test_a_run_goes_on_where_it_stopped(name: str, device: torch.device, tmp_pat
     cfg = composed([*options(name), *ON_IT, "budget.steps=20"], tmp_path)
     train(cfg, tmp_path / "checkpoints" / "last.ckpt")
     assert json.loads((tmp_path / "results.json").read_text())["steps"] == 20
-
-
-def system_of(given: list[str], folder: Path) -> tuple[System, object]:
-    cfg = composed(given, folder)
-    data = build_data(cfg)
-    return build_system(cfg, frame_of(data)), data
-
-
-def stepped(system: System, data: object, steps: int, where: torch.device) -> list[float]:
-    """The losses of the first steps of a scene's training, drawn alike on every device."""
-    optimizer, losses = system.configure_optimizers(), []
-    for step in range(steps):
-        for parameter in system.field.grow(step / steps):
-            optimizer.state.pop(parameter, None)
-        batch = data.draw(step).to(where)
-        loss, stats = system.loss(batch, step_generator(0, Stream.STEP, step, where), step)
-        loss.backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        if stats.counted:
-            data.note_samples(stats.samples)
-        losses.append(float(loss.detach()))
-    return losses
-
-
-VARIANTS = {
-    **{name: options(name) for name in SCENES},
-    **{
-        name: [*(one for one in SCENE if not one.startswith("sampler.")), "model=mlp", "model.width=16", *given]
-        for name, given in SAMPLERS.items()
-    },
-    "penalty, one colour behind": [
-        *options("hashgrid"),
-        "renderer.distortion_loss_weight=0.01",
-        "renderer.background=white",
-    ],
-    "random colours behind": [*options("tensorf"), "renderer.background=random"],
-}
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("kind", ["alpha", "unbounded"])
-def test_steps_come_to_what_they_come_to_on_the_cpu(
-    variant: str, kind: str, without_doubles: torch.device, tmp_path: Path
-):
-    device = without_doubles
-    use_kernels("reference")
-    found = {}
-    for where in (torch.device("cpu"), device):
-        torch.manual_seed(0)
-        system, data = system_of([*VARIANTS[variant], "dataset.samples=null"], tmp_path)
-        assert isinstance(system, NeRF3D) and data.scene.train.images.shape[-1] == 4
-        if kind == "unbounded":
-            unbind(system)
-        found[where.type] = stepped(system.to(where), data, 7, where)
-    assert found[NAME] == pytest.approx(found["cpu"], rel=2e-3)
-    assert found[NAME][0] == pytest.approx(found["cpu"][0], rel=1e-5)
-
-
-def unbind(system: NeRF3D) -> None:
-    """As of a scene with a background."""
-    for part in (system.field, system.sampler):
-        part._bounds = replace(part._bounds, unbounded=True)
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed", "16-mixed"])
@@ -282,78 +188,3 @@ def test_a_search_finds_the_smallest_that_is_enough(device: torch.device, tmp_pa
     rightsize(cfg)
     found = json.loads((tmp_path / "found" / "rightsize.json").read_text())
     assert found["device"].startswith(NAME) and found["reached"]
-
-
-MOST = {"tensorf": 250, "hashgrid": 250, "voxels": 250, "mlp": 220}
-"""Operations a step between two updates of the sampler: forward, backward, optimiser. Each takes 5 to 10 microseconds."""
-
-
-@pytest.mark.parametrize("name", MOST)
-def test_a_step_asks_little_of_the_device(name: str, device: torch.device, tmp_path: Path):
-    """As shipped, of a field that has its size; reading a result, or its size, makes the host wait."""
-    small = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1"]
-    system, data = system_of([f"recipe={name}_medium", *small, "sampler.warmup=0"], tmp_path)
-    assert isinstance(system, NeRF3D)
-    system, period, counts = system.to(device), system.sampler.update_every, []
-    optimizer = system.configure_optimizers()
-    for step in range(2 * period):
-        for parameter in system.field.grow(0.9):
-            optimizer.state.pop(parameter, None)
-        batch = data.draw(step).to(device)
-        with Count() as count:
-            loss, stats = system.loss(batch, step_generator(0, Stream.STEP, step, device), step)
-            loss.backward()
-            optimizer.step()
-            optimizer.zero_grad()
-        if stats.counted:
-            data.note_samples(stats.samples)
-        counts.append(count)
-    for count in counts[-period + 3 :]:  # the first ones after an update make what is then kept for the device
-        assert count.operations <= MOST[name], count.names.most_common()
-        assert count.waits == 0, count.names.most_common()
-    assert 0 < sum(count.waits for count in counts[-period:]) <= 8, "for an update"
-
-
-@pytest.mark.parametrize("name", ["hashgrid2d", "picture_mlp", "fourier", "siren"])
-def test_a_step_of_a_picture_waits_for_nothing(name: str, device: torch.device, tmp_path: Path):
-    system, data = system_of(options(name), tmp_path)
-    optimizer, batch = system.to(device).configure_optimizers(), data.draw(0).to(device)
-    for _ in range(2):
-        with Count() as count:
-            system.training_step(batch, 0).backward()
-            optimizer.step()
-            optimizer.zero_grad()
-    assert count.waits == 0 and count.operations <= 100, count.names.most_common()
-
-
-def test_rays_that_room_was_too_small_for_teach_nothing(device: torch.device, tmp_path: Path):
-    system, data = system_of(options("hashgrid"), tmp_path)
-    assert isinstance(system, NeRF3D)
-    stepped(system.to(device), data, 2, device)
-    batch, sampler = data.draw(2).to(device), system.sampler
-    sampler.update(2, system.field.density, step_generator(0, Stream.STEP, 2, device))
-    before = sampler.per_ray
-    assert before is not None, "there is room for as many as were counted"
-
-    def drawn(per_ray: tuple[float, float] | None) -> Any:
-        sampler.per_ray = per_ray
-        return sampler(batch.rays, system.field.density, step_generator(0, Stream.STEP, 2, device))
-
-    with torch.no_grad():
-        counted, roomy, tight = drawn(None), drawn(before), drawn((before[0], 0.4 * before[1]))
-    assert counted.whole is None and roomy.whole.all() and len(roomy) > len(counted)
-    ends = [int(end) for end in counted.offsets.cpu()]
-    torch.testing.assert_close(roomy.t[: ends[-1]].cpu(), counted.t.cpu())
-    assert torch.equal(roomy.offsets.cpu(), counted.offsets.cpu()) and not roomy.dt[ends[-1] :].any()
-    whole = tight.whole.cpu()
-    assert whole.tolist() == [end <= len(tight) for end in ends[1:]] and 0 < int(whole.sum()) < len(whole)
-    assert torch.equal(tight.t[: ends[int(whole.sum())]].cpu(), counted.t[: ends[int(whole.sum())]].cpu())
-
-    def loss(pixels: torch.Tensor) -> float:
-        sampler.per_ray = (before[0], 0.4 * before[1])
-        changed = replace(batch, pixels=pixels)
-        return float(system.loss(changed, step_generator(0, Stream.STEP, 2, device), 2)[0].detach())
-
-    others = batch.pixels.clone()
-    others[~tight.whole] = 255 - others[~tight.whole]
-    assert loss(batch.pixels) == loss(others) > 0

@@ -2,12 +2,14 @@
 
 import io
 import json
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from once import once
 
 from nerf_lightning.config import cli
 from nerf_lightning.config.compose import composed
@@ -43,6 +45,12 @@ def trained(folder: Path, recipe: str = "tensorf_small", *more: str) -> Path:
     return folder
 
 
+@pytest.fixture
+def run_folder(tmp_path_factory: pytest.TempPathFactory, own_cache: None, tmp_path: Path) -> Path:
+    """A run trained once, in a folder of the test's own."""
+    return Path(shutil.copytree(once(tmp_path_factory, "compact", trained), tmp_path / "run"))
+
+
 @pytest.mark.parametrize(
     ("recipe", "more"),
     [
@@ -69,8 +77,8 @@ def test_it_shows_what_the_run_shows_in_far_fewer_bytes(
     assert abs(run.evaluate(view).psnr - small.evaluate(view).psnr) < 0.1
 
 
-def test_halves_are_nearer_than_bytes(tmp_path: Path):
-    folder = trained(tmp_path)
+def test_halves_are_nearer_than_bytes(run_folder: Path):
+    folder = run_folder
     errors, sizes, used = {}, {}, torch.empty(0)
     planes = load_run(folder).system.field.density_volume.planes.detach()
     for precision in ("half", "byte"):
@@ -90,10 +98,10 @@ def test_pictures_too(tmp_path: Path):
     assert load_compact(tmp_path / "compact.npz").orbit is None
 
 
-def test_too_much_lost_is_refused_and_nothing_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_too_much_lost_is_refused_and_nothing_written(run_folder: Path, monkeypatch: pytest.MonkeyPatch):
     from nerf_lightning.export import smallest
 
-    folder = trained(tmp_path)
+    folder = run_folder
     scores = iter([30.0, 29.5, 29.6, 29.7, 29.4])
     monkeypatch.setattr(smallest, "held_out_psnr", lambda *_: next(scores))
     with pytest.raises(
@@ -145,15 +153,15 @@ def with_header(content: bytes, **values: object) -> bytes:
     return changed(content, header=np.frombuffer(json.dumps(header).encode(), np.uint8))
 
 
-def test_what_is_broken_or_not_trusted_is_refused(tmp_path: Path):
-    export(trained(tmp_path))
-    content = (tmp_path / "compact.npz").read_bytes()
+def test_what_is_broken_or_not_trusted_is_refused(run_folder: Path):
+    export(run_folder)
+    content = (run_folder / "compact.npz").read_bytes()
     for broken in (b"", b"no zip at all", content[: len(content) // 2]):
         with pytest.raises(InputError, match="expected a compact file"):
             decode(broken, "given.npz")
     with pytest.raises(InputError, match="version 99, expected .* version 1; export the run again"):
         decode(with_header(content, version=99), "given.npz")
-    config = load_run(tmp_path).cfg
+    config = load_run(run_folder).cfg
     config.model._target_ = "os.system"
     from omegaconf import OmegaConf
 
@@ -165,5 +173,5 @@ def test_what_is_broken_or_not_trusted_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="expected a compact file"):
         decode(changed(content, header=pickled), "given.npz")
     with pytest.raises(InputError, match="no such file|No such file"):
-        load_compact(tmp_path / "missing.npz")
+        load_compact(run_folder / "missing.npz")
     assert torch.is_tensor(decode(content, "given.npz").system.field.aabb)

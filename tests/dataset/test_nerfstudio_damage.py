@@ -1,0 +1,80 @@
+"""nerfstudio captures that are damaged: one line for each."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from nerf_lightning.dataset import load_nerfstudio
+from nerf_lightning.errors import InputError
+from tests.dataset.test_nerfstudio import INTRINSICS, change, opengl_pose, write
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    return write(tmp_path / "Garden", INTRINSICS)
+
+
+def _remove_most(capture: Path) -> None:
+    for i in range(2, 10):
+        (capture / f"images/{i:04d}.png").unlink()
+
+
+def _first(**entry: object) -> Callable[[Path], None]:
+    return lambda capture: change(capture, lambda c: c["frames"][0].update(entry))
+
+
+def _top(**entry: object) -> Callable[[Path], None]:
+    return lambda capture: change(capture, lambda c: c.update(entry))
+
+
+def _pop(key: str) -> Callable[[Path], None]:
+    return lambda capture: change(capture, lambda c: c.pop(key))
+
+
+ALL = [f"images/{i:04d}.png" for i in range(12)]
+DAMAGE = {
+    "no json": (lambda c: (c / "transforms.json").unlink(), "transforms.json: found nothing there"),
+    "most photos missing": (_remove_most, "found 'images/0002.png', which is not there (nor are 7 more)"),
+    "focal missing": (_pop("fl_x"), "fl_x: found no focal length among [cx, cy"),
+    "focal null": (_top(fl_x=None), "fl_x: found no focal length"),
+    "focal negative": (_top(fl_y=-3), "fl_y: found -3, expected a positive"),
+    "focal of a frame": (_first(fl_x=0), "frames[0].fl_x: found 0"),
+    "angle": (lambda c: (_pop("fl_x")(c), _top(camera_angle_x=4.0)(c)), "camera_angle_x: found 4"),
+    "centre text": (_top(cx="middle"), "cx: found 'middle'"),
+    "distortion text": (_first(k1=[1]), "frames[0].k1: found [1]"),
+    "distortion k4": (_top(k4=0.1), "k4: found 0.1"),
+    "fisheye": (_top(camera_model="OPENCV_FISHEYE"), "camera_model: found 'OPENCV_FISHEYE', expected a perspective"),
+    "fisheye frame": (_first(camera_model="EQUIRECTANGULAR"), "frames[0].camera_model: found 'EQUIRECTANGULAR'"),
+    "fisheye flag": (_top(is_fisheye=True), "camera_model: found is_fisheye"),
+    "width": (_top(w=161), "w: found 161, expected 160, the size of 0000.png"),
+    "height of a frame": (_first(h=1), "frames[0].h: found 1, expected 120"),
+    "image channels": (
+        lambda c: cv2.imwrite(str(c / "images/0004.png"), np.zeros((H, W, 4), np.uint8)),
+        "0004.png: found 160x120 with 4 channels",
+    ),
+    "scaled pose": (
+        _first(transform_matrix=(opengl_pose(0) * [2, 2, 2, 1]).tolist()),
+        "frames[0].transform_matrix: found R^T R that is 3 away from the identity",
+    ),
+    "unknown name": (_top(val_filenames=["images/x.png"]), "val_filenames: found 'images/x.png', which is no frame"),
+    "names no list": (_top(val_filenames="images/0000.png"), "val_filenames: found 'images/0000.png'"),
+    "leaking split": (
+        _top(train_filenames=ALL, val_filenames=ALL[:1]),
+        "val_filenames: found 'images/0000.png', which is in train_filenames too",
+    ),
+    "nothing held out": (_top(val_filenames=[]), "val split: found 0 views"),
+    "nothing to train on": (_top(val_filenames=ALL), "train split: found 0 views"),
+    "one photo": (lambda c: change(c, lambda j: j.update(frames=j["frames"][:1])), "train split: found 0 views"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damage(damage: str, capture: Path, says: Callable):
+    spoil, words = DAMAGE[damage]
+    spoil(capture)
+    with pytest.raises(InputError) as caught:
+        load_nerfstudio(capture)
+    says(caught.value, capture, words, ", expected ")
