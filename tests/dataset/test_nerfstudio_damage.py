@@ -9,7 +9,7 @@ import pytest
 
 from nerf_lightning.dataset import load_nerfstudio
 from nerf_lightning.errors import InputError
-from tests.dataset.test_nerfstudio import INTRINSICS, change, opengl_pose, write
+from tests.dataset.test_nerfstudio import INTRINSICS, H, W, change, opengl_pose, write
 
 
 @pytest.fixture
