@@ -28,7 +28,7 @@ test: lint                  ## install, check style and types, run the tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
 
 QUICK := tests/test_rooms.py $(addprefix tests/, cameras dataset sampler model renderer system) \
-	$(addprefix tests/runs/test_, before.py folder.py) $(addprefix tests/config/test_, rates.py resolvers.py)
+	$(addprefix tests/runs/test_, before.py folder.py) $(addprefix tests/config/test_, defaults.py rates.py renames.py resolvers.py)
 
 quick: $(VENV)/.test        ## what a change most likely breaks, in half a minute
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal $(QUICK)
