@@ -21,6 +21,10 @@ import scipy.signal  # noqa: F401
 import torch.utils.tensorboard
 from jaxtyping import install_import_hook
 
+# As training sets it, and before any thread starts: threads inherit it. A test that trains would otherwise leave it set for its
+# own thread alone, and what several threads compute after it would depend on which of them computed what.
+torch.set_flush_denormal(True)
+
 ROOT = Path(__file__).resolve().parents[1]
 UNCHECKED = "nerf_lightning.kernels.cpu"
 

@@ -1,6 +1,7 @@
 """import nerf_lightning as nl: what the command line does, from Python."""
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -49,10 +50,16 @@ def test_it_trains_as_the_command_line_does(path: Path, inside, tmp_path: Path):
     assert math.isnan(compact.psnr) and float((compact.render(camera).rgb - view.rgb).abs().max()) < 0.2
 
 
-def test_the_process_stays_as_it_was(path: Path, tmp_path: Path):
+@pytest.fixture
+def denormals() -> Iterator[None]:
+    torch.set_flush_denormal(False)
+    yield
+    torch.set_flush_denormal(True)
+
+
+def test_the_process_stays_as_it_was(path: Path, tmp_path: Path, denormals: None):
     threads, numbers, more = torch.get_num_threads(), torch.get_rng_state(), np.random.get_state()[1].copy()
     hydra = HydraConfig.instance().cfg
-    torch.set_flush_denormal(False)  # whatever ran before here
     nl.train(path, steps=1, device="cpu", folder=tmp_path / "run", options=[*FEW, "threads=1", "kernels=reference"])
     assert torch.get_num_threads() == threads and torch.equal(torch.get_rng_state(), numbers)
     assert (np.random.get_state()[1] == more).all() and HydraConfig.instance().cfg is hydra

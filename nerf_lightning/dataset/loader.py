@@ -70,18 +70,21 @@ class StepDataModule(L.LightningDataModule, Generic[Photos]):
     """Base of the two data modules.
 
     Args:
-        photos: what batches are drawn from.
         seed: of the draw.
     """
 
     held_out_views: int
 
-    def __init__(self, photos: Photos, seed: int):
+    def __init__(self, seed: int):
         super().__init__()
-        self.photos: Photos = photos
         self.seed = seed
         self._near: Photos | None = None
         """The photos, on the device where batches are drawn."""
+
+    @property
+    def photos(self) -> Photos:
+        """What batches are drawn from."""
+        raise TypeError(f"{type(self).__name__} must define photos")
 
     def draw(self, step: int) -> Any:
         """The batch of a step: this process's share of it."""

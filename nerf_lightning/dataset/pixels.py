@@ -103,11 +103,15 @@ class PixelDataModule(StepDataModule[Tensor]):
     held_out_views = 1
 
     def __init__(self, scene: Picture, pixels: int = 10_000, seed: int = 0):
-        super().__init__(scene.image, seed)
+        super().__init__(seed)
         if pixels < 1:
             raise InputError("dataset.pixels", "", str(pixels), "at least 1")
         self.scene = scene
         self.pixels = pixels
+
+    @property
+    def photos(self) -> UInt8[Tensor, "H W 3"]:
+        return self.scene.image
 
     def enlarge(self, batch: int) -> None:
         """Takes that many times the pixels a step, for a device that takes more at once. Before training."""

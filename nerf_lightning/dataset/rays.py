@@ -70,7 +70,7 @@ class RayDataModule(StepDataModule[Views]):
     MOST_RAYS = 32  # times the rays of the first step
 
     def __init__(self, scene: Scene, rays: int = RAYS, samples: int | None = SAMPLES, seed: int = 0):
-        super().__init__(scene.train, seed)
+        super().__init__(seed)
         if rays < 1:
             raise InputError("dataset.rays", "", str(rays), "at least 1")
         if samples is not None and samples < 1:
@@ -79,6 +79,10 @@ class RayDataModule(StepDataModule[Views]):
         self.rays = self.first_rays = rays
         self.samples = samples
         self.batch = 1
+
+    @property
+    def photos(self) -> Views:
+        return self.scene.train
 
     def enlarge(self, batch: int) -> None:
         """Takes that many times the rays and samples a step, for a device that takes more at once. Before training."""
