@@ -25,7 +25,7 @@ DISTINCT = 10
 
 def repeated(train: Views, count: int) -> Views:
     chosen = torch.arange(count) % DISTINCT
-    return Views(train.images[chosen], train.cameras[chosen])
+    return train[torch.as_tensor(chosen)]
 
 
 def points(data: RayDataModule, seed: int) -> list[tuple[str, int, RayDataModule]]:

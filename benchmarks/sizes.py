@@ -12,7 +12,7 @@ from torch import Tensor
 from nerf_lightning.config import conf_dir
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
-from nerf_lightning.dataset import RayDataModule, Views, save_npz
+from nerf_lightning.dataset import RayDataModule, save_npz
 from nerf_lightning.drawing.ink import pixels_of
 from nerf_lightning.drawing.panels import write_png
 from nerf_lightning.rightsize.choose import Target
@@ -106,7 +106,7 @@ def few(whole: DictConfig, found: Found, overrides: list[str], seconds: float, o
     kept = torch.tensor(evenly(len(data.scene.train), FEW))
     views = data.scene.train
     path = output / "scenes" / f"{data.scene.name}_{FEW}.npz"
-    save_npz(replace(data.scene, train=Views(views.images[kept], views.cameras[kept])), path)
+    save_npz(replace(data.scene, train=views[torch.as_tensor(kept)]), path)
     cfg = configured(["dataset=photos", f"dataset.path={path}"], seconds, overrides, folder)
     sparse = looked_for(cfg, folder)
     rows: Rows = []

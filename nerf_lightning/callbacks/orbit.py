@@ -69,12 +69,12 @@ class Orbit(L.Callback):
             one = time.perf_counter() - start
             fitting, shrink = affordable(count, one, Budget.of(trainer).drawing_seconds(trainer.global_step))
             if fitting < count or shrink < 1:
-                width, height = (max(1, round(side * shrink)) for side in (cameras.width, cameras.height))
+                smaller = cameras.scaled(shrink)
                 print(
-                    f"{self.path}: {fitting} frames of {width}x{height}, as one of {cameras.width}x{cameras.height} takes "
-                    f"{one:.1f} s; callbacks.orbit.frames={count} draws all"
+                    f"{self.path}: {fitting} frames of {smaller.width}x{smaller.height}, as one of "
+                    f"{cameras.width}x{cameras.height} takes {one:.1f} s; callbacks.orbit.frames={count} draws all"
                 )
-                count, cameras, pictures = fitting, cameras.resized(width, height), []
+                count, cameras, pictures = fitting, smaller, []
         for view in evenly(len(cameras), count)[len(pictures) :]:
             pictures.append(picture(view))
             if progress is not None:

@@ -2,15 +2,20 @@
 
 from nerf_lightning.cameras.bounds import Bounds, InBounds
 from nerf_lightning.cameras.cameras import Cameras, Rays
-from nerf_lightning.cameras.orbit import focus_point, look_at, orbit_around, orbit_like, spiral_like
+from nerf_lightning.cameras.lenses import Distortion, Lenses
+from nerf_lightning.cameras.orbit import focus_point, look_at, orbit_around, orbit_like, spiral_like, typical_view
 from nerf_lightning.cameras.transforms import pixel_to_camera, pixel_to_ray, transform, transform_directions
+from nerf_lightning.cameras.upright import held, turn_upright
 
 __all__ = [
     "Bounds",
     "Cameras",
+    "Distortion",
     "InBounds",
+    "Lenses",
     "Rays",
     "focus_point",
+    "held",
     "look_at",
     "orbit_around",
     "orbit_like",
@@ -19,4 +24,6 @@ __all__ = [
     "spiral_like",
     "transform",
     "transform_directions",
+    "turn_upright",
+    "typical_view",
 ]

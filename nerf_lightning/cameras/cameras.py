@@ -4,8 +4,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from nerf_lightning.cameras.lenses import Lenses, distort, per_view, to_directions, to_flat, undistort
+
+LATTICE = 33
+"""Places along each side of a photo where its lens is undone beforehand: between them one step of Newton's method suffices."""
 
 
 @dataclass(frozen=True)
@@ -28,15 +33,22 @@ class Rays:
 
 @dataclass(frozen=True)
 class Cameras:
-    """V pinhole views of one size, OpenCV frame, distortion already undone.
+    """V views, OpenCV frame, each of its own size.
 
     `K` holds pixels, `c2w` maps camera to world.
     """
 
     K: Float[Tensor, "V 3 3"]
     c2w: Float[Tensor, "V 4 4"]
-    width: int
-    height: int
+    sizes: Int[Tensor, "V 2"]
+    """Width and height in pixels; always on the CPU."""
+    lenses: Lenses | None = None
+    """None for pinhole cameras."""
+
+    @classmethod
+    def of_size(cls, K: Float[Tensor, "V 3 3"], c2w: Float[Tensor, "V 4 4"], width: int, height: int) -> "Cameras":
+        """Pinhole cameras of one size."""
+        return cls(K, c2w, torch.tensor([[width, height]]).repeat(len(c2w), 1))
 
     def __len__(self) -> int:
         return self.c2w.shape[0]
@@ -45,19 +57,61 @@ class Cameras:
         """Some of the views; an integer gives Cameras with that one view."""
         if isinstance(index, int):
             index = torch.tensor([index])
-        return replace(self, K=self.K[index], c2w=self.c2w[index])
+        sizes = self.sizes[index.cpu() if isinstance(index, Tensor) else index]
+        return Cameras(self.K[index], self.c2w[index], sizes, None if self.lenses is None else self.lenses[index])
 
     def to(self, device: torch.device | str) -> "Cameras":
-        return replace(self, K=self.K.to(device), c2w=self.c2w.to(device))
+        lenses = None if self.lenses is None else self.lenses.to(device)
+        return replace(self, K=self.K.to(device), c2w=self.c2w.to(device), lenses=lenses)
 
     @property
     def centres(self) -> Float[Tensor, "V 3"]:
         return self.c2w[:, :3, 3]
 
-    def resized(self, width: int, height: int) -> "Cameras":
-        """The same views on another pixel grid; K scales with it (pixel edges, not centres, stay in place)."""
-        scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=self.K.dtype)
-        return replace(self, K=self.K * scale[:, None].to(self.K.device), width=width, height=height)
+    @cached_property
+    def one_size(self) -> bool:
+        """Whether all views have the same width and height."""
+        return bool((self.sizes == self.sizes[:1]).all())
+
+    def size(self, view: int) -> tuple[int, int]:
+        """Width and height of a view."""
+        width, height = self.sizes[view].tolist()
+        return width, height
+
+    @property
+    def width(self) -> int:
+        """Of all views.
+
+        Raises:
+            ValueError: they have several sizes.
+        """
+        return self._side(0)
+
+    @property
+    def height(self) -> int:
+        """Of all views, likewise."""
+        return self._side(1)
+
+    def _side(self, axis: int) -> int:
+        if not self.one_size:
+            raise ValueError("these views have several sizes: ask for that of each, size(view)")
+        return int(self.sizes[0, axis]) if len(self) else 0
+
+    @property
+    def longest(self) -> int:
+        """The longest side of any view in pixels."""
+        return int(self.sizes.max())
+
+    def resized(self, sizes: Int[Tensor, "V 2"] | tuple[int, int]) -> "Cameras":
+        """The same views on other pixel grids; K scales with them (pixel edges, not centres, stay in place)."""
+        if isinstance(sizes, tuple):
+            sizes = torch.tensor([sizes]).repeat(len(self), 1)
+        scale = torch.cat([sizes.double() / self.sizes, torch.ones(len(self), 1, dtype=torch.float64)], dim=1)
+        return replace(self, K=self.K * scale[:, :, None].to(self.K), sizes=sizes)
+
+    def scaled(self, factor: float) -> "Cameras":
+        """The same views, that many times as large; never smaller than a pixel."""
+        return self.resized((self.sizes * factor).round().long().clamp_min(1))
 
     def pixel_width(self, place: Float[Tensor, "3"]) -> float:
         """Width of what one pixel shows at a place, world units: the median over the views."""
@@ -66,19 +120,94 @@ class Cameras:
     def rays(self, view: Int[Tensor, "R"], row: Int[Tensor, "R"], col: Int[Tensor, "R"]) -> Rays:
         """Rays through the centres of the given pixels."""
         u, v = col.to(self.K.dtype) + 0.5, row.to(self.K.dtype) + 0.5
-        across, down, ahead = self.pixel_axes[view].unbind(1)
-        directions = torch.nn.functional.normalize(across * u[:, None] + down * v[:, None] + ahead, dim=1)
-        return Rays(self.centres[view], directions)
+        if self.lenses is None:
+            across, down, ahead = self.pixel_axes[view].unbind(1)
+            directions = across * u[:, None] + down * v[:, None] + ahead
+        else:
+            coefficients = self.lenses.coefficients[view]
+            places = torch.stack([u, v], dim=1)
+            flat = undistort(_on_sensor(self.K[view], places), coefficients, self._guess(view, places), steps=1)
+            local = to_directions(flat, self.lenses.fisheye[view])
+            directions = (self.c2w[view, :3, :3] * local[:, None]).sum(2)
+        return Rays(self.centres[view], torch.nn.functional.normalize(directions, dim=1))
 
     @cached_property
     def pixel_axes(self) -> Float[Tensor, "V 3 3"]:
-        """World vectors a, b, c of each view: pixel (u, v) looks along u a + v b + c, as in `pixel_to_ray`."""
+        """World vectors a, b, c of each pinhole view: pixel (u, v) looks along u a + v b + c, as in `pixel_to_ray`."""
         K, rotation = self.K.cpu().double(), self.c2w[:, :3, :3].cpu().double()  # not every device has doubles
         identity = torch.eye(3, dtype=torch.float64).expand_as(K)
         inverse = torch.linalg.solve_triangular(K, identity, upper=True)
         return (rotation @ inverse).mT.to(self.K).contiguous()
 
+    def _guess(self, view: Int[Tensor, "R"], places: Float[Tensor, "R 2"]) -> Float[Tensor, "R 2"]:
+        """Undistorted flat coordinates of places in pixels, good enough for one step of Newton's method to end."""
+        which, tables, scale = self._lattices
+        lens = which[view]
+        at = places * scale[view]
+        low = at.long().clamp(max=LATTICE - 2)
+        across, down = (at - low).unbind(1)
+        first = (lens * LATTICE + low[:, 1]) * LATTICE + low[:, 0]
+        corners = [tables[first + step] for step in (0, 1, LATTICE, LATTICE + 1)]
+        above, below = (torch.lerp(a, b, across[:, None]) for a, b in (corners[:2], corners[2:]))
+        return torch.lerp(above, below, down[:, None])
+
+    @cached_property
+    def _lattices(self) -> tuple[Int[Tensor, "V"], Float[Tensor, "entries 2"], Float[Tensor, "V 2"]]:
+        """For each view the number of its lens; for all lenses, one after the other, undistorted flat coordinates on a lattice
+        over the photo; and the factor from pixels to the lattice."""
+        assert self.lenses is not None  # pinhole cameras need none
+        sizes = self.sizes.to(self.K)
+        every = torch.cat([self.K.flatten(1), sizes, self.lenses.coefficients], dim=1)
+        _, which = torch.unique(every, dim=0, return_inverse=True)
+        t = torch.linspace(0, 1, LATTICE, dtype=self.K.dtype, device=self.K.device)
+        lattice = torch.stack(torch.meshgrid(t, t, indexing="xy"), dim=2).view(-1, 2)
+        tables = []
+        for lens in range(int(which.max()) + 1):
+            view = int((which == lens).int().argmax())
+            seen = _on_sensor(self.K[view : view + 1], lattice * sizes[view])
+            tables.append(undistort(seen, self.lenses.coefficients[view : view + 1]))
+        return which, torch.cat(tables), (LATTICE - 1) / sizes
+
     def view_rays(self, view: int) -> Rays:
         """All H*W rays of one view, row by row."""
-        pixel = torch.arange(self.height * self.width, device=self.K.device)
-        return self.rays(torch.full_like(pixel, view), pixel // self.width, pixel % self.width)
+        width, height = self.size(view)
+        pixel = torch.arange(height * width, device=self.K.device)
+        return self.rays(torch.full_like(pixel, view), pixel // width, pixel % width)
+
+    def project(
+        self, points: Float[Tensor, "N 3"], view: int
+    ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N"], Bool[Tensor, "N"]]:
+        """Where world points appear in a view.
+
+        Returns:
+            Pixels (column, row; the first pixel's centre is at 0.5), of no use for points that the view does not see;
+            depths along the optical axis, world units; and which points are in the picture.
+        """
+        local = (points - self.centres[view]) @ self.c2w[view, :3, :3]
+        depth = local[:, 2]
+        if self.lenses is None:
+            ahead, flat = depth > 0, local[:, :2] / torch.where(depth > 0, depth, 1.0)[:, None]
+        else:
+            fisheye = per_view(self.lenses.fisheye, view)
+            flat = to_flat(local, fisheye)
+            # Beyond the rim a polynomial may lead back into the picture.
+            ahead = ((depth > 0) | fisheye) & (flat.norm(dim=1) <= self.rims[view])
+            flat = distort(flat, per_view(self.lenses.coefficients, view))[0]
+        K = self.K[view]
+        pixels = flat @ K[:2, :2].T + K[:2, 2]
+        inside = ahead & (pixels >= 0).all(1) & (pixels < self.sizes[view].to(pixels)).all(1)
+        return pixels, depth, inside
+
+    @cached_property
+    def rims(self) -> Float[Tensor, "V"]:
+        """The largest flat radius (see `Lenses`) that each view shows."""
+        assert self.lenses is not None  # pinhole cameras need none
+        which, tables, _ = self._lattices
+        return (tables.norm(dim=1).view(-1, LATTICE**2).amax(1) * 1.001)[which]
+
+
+def _on_sensor(K: Float[Tensor, "#N 3 3"], places: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:
+    """Flat coordinates, distorted, of places in pixels."""
+    y = (places[:, 1] - K[:, 1, 2]) / K[:, 1, 1]
+    x = (places[:, 0] - K[:, 0, 2] - K[:, 0, 1] * y) / K[:, 0, 0]
+    return torch.stack([x, y], dim=1)

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras.cameras import Cameras
+from nerf_lightning.cameras.upright import held
 
 ONE_SIDED = 0.35
 """Length of the mean viewing direction's horizontal part above which the cameras are all on one side of the subject."""
@@ -90,13 +91,13 @@ def loop_before(
 
 
 def orbit_like(cameras: Cameras, frames: int = 60) -> Cameras:
-    """A closed path around what `cameras` look at, on the sides they saw, with their size and first intrinsics.
+    """A closed path around what `cameras` look at, on the sides they saw, upright, with the lens of a typical one.
 
     Cameras all around give a full turn at their mean distance and height; cameras on one side give a loop there, as wide as
     their spread.
     """
     centre = focus_point(cameras.c2w)
-    up = torch.nn.functional.normalize(-cameras.c2w[:, :3, 1].mean(0), dim=-1)
+    up, sides = held(cameras.c2w)
     offset = cameras.centres - centre
     radius = float(offset.norm(dim=-1).mean())
     direction = torch.nn.functional.normalize(offset, dim=-1)
@@ -109,7 +110,24 @@ def orbit_like(cameras: Cameras, frames: int = 60) -> Cameras:
     else:
         elevation = math.asin(max(-0.95, min(0.95, float((offset @ up).mean()) / max(radius, 1e-9))))
         c2w = orbit_around(centre, up, radius, elevation, frames)
-    return Cameras(cameras.K[:1].repeat(frames, 1, 1), c2w, cameras.width, cameras.height)
+    typical = typical_view(cameras)
+    K, (width, height) = cameras.K[typical], cameras.size(typical)
+    if int(sides[typical]) % 2 == 1:  # it lies on its side
+        K, width, height = on_its_side(K, width, height), height, width
+    return Cameras.of_size(K.repeat(frames, 1, 1), c2w, width, height)
+
+
+def typical_view(cameras: Cameras) -> int:
+    """The first view of the commonest size."""
+    _, which, counts = torch.unique(cameras.sizes, dim=0, return_inverse=True, return_counts=True)
+    return int((which == counts.argmax()).int().argmax())
+
+
+def on_its_side(K: Float[Tensor, "3 3"], width: int, height: int) -> Float[Tensor, "3 3"]:
+    """Intrinsics of a photo turned by a quarter, with its principal point in the middle."""
+    turned = torch.eye(3, dtype=K.dtype, device=K.device)
+    turned[0, 0], turned[1, 1], turned[0, 2], turned[1, 2] = K[1, 1], K[0, 0], height / 2, width / 2
+    return turned
 
 
 SPIRAL_TURNS, SPIRAL_CLIMB = 2, 0.75
@@ -139,4 +157,4 @@ def spiral_like(orbit: Cameras, frames: int = 60) -> Cameras:
     slope = angle * (1 - SPIRAL_CLIMB * (1 - torch.cos(turn)) / 2)
     around = torch.cos(SPIRAL_TURNS * turn) * first + torch.sin(SPIRAL_TURNS * turn) * second
     eye = centre + radius * (torch.sin(slope) * around + torch.cos(slope) * axis)
-    return Cameras(orbit.K[:1].repeat(frames, 1, 1), look_at(eye, centre, up), orbit.width, orbit.height)
+    return Cameras.of_size(orbit.K[:1].repeat(frames, 1, 1), look_at(eye, centre, up), orbit.width, orbit.height)

@@ -13,7 +13,8 @@ from nerf_lightning.dataset.extent import viewing_distance, visible_cube
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.dataset.lens import Lens, Rectification, rectify
 from nerf_lightning.dataset.resize import fit_size
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
 NEAR = 0.25
@@ -67,12 +68,12 @@ def pack(
     images = torch.from_numpy(np.stack([pinhole_photo(path, rectification, width, height) for path in paths]))
     poses = torch.from_numpy(c2w).float()
     K = torch.from_numpy(rectification.K).float().repeat(len(paths), 1, 1)
-    cameras = Cameras(K, poses, lens.width, lens.height).resized(width, height)
+    cameras = Cameras.of_size(K, poses, lens.width, lens.height).resized((width, height))
     held = torch.zeros(len(paths), dtype=torch.bool)
     held[holdout // 2 :: holdout] = True
     if not held.any():
         held[len(paths) // 2] = True
-    train = Views(images[~held], cameras[~held])
+    train = Views.of(images[~held], cameras[~held])
     centre = focus_point(train.cameras.c2w)
     distances = (train.cameras.centres - centre).norm(dim=1)
     if orbit is not None:
@@ -92,7 +93,7 @@ def pack(
         name=name,
         source=source,
         train=train,
-        val=Views(images[held], cameras[held]),
-        orbit=Cameras(train.cameras.K[:1].repeat(FRAMES, 1, 1), circle, width, height),
+        val=Views.of(images[held], cameras[held]),
+        orbit=Cameras.of_size(train.cameras.K[:1].repeat(FRAMES, 1, 1), circle, width, height),
         bounds=Bounds(aabb, unbounded=True, near=near),
     )

@@ -157,7 +157,7 @@ def frame_of(data: RayDataModule | PixelDataModule) -> Frame:
 
 def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, system: System) -> None:
     """Photos without alpha show one background colour; with another, the field would learn that colour as a wall."""
-    if isinstance(data, PixelDataModule) or data.scene.train.images.shape[-1] == 4:
+    if isinstance(data, PixelDataModule) or data.scene.train.channels == 4:
         return
     assert isinstance(system, NeRF3D)  # what build_system makes for rays
     wanted = "random" if system.renderer.random else system.background

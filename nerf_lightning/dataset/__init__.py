@@ -8,8 +8,9 @@ from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PictureBatch, PixelBatch, PixelDataModule, pixel_grid
 from nerf_lightning.dataset.rays import RayBatch, RayDataModule, ViewBatch, draw_rays
-from nerf_lightning.dataset.scene import BUILT_IN, Scene, Views
+from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.sources import from_bricks, from_download, from_photos, from_picture
+from nerf_lightning.dataset.views import Views
 
 __all__ = [
     "BUILT_IN",

@@ -1,6 +1,6 @@
 """The box to sample in, estimated from cameras and silhouettes."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, focus_point
-from nerf_lightning.dataset.scene import Views
+from nerf_lightning.dataset.views import Views
 
 GRID = 48
 """Voxels along each axis of the carving grid."""
@@ -49,23 +49,39 @@ def estimate_bounds(
     return Bounds(torch.from_numpy(aabb).float(), unbounded=False, near=near, far=far)
 
 
-def silhouettes(views: Views, background: tuple[float, float, float]) -> Bool[np.ndarray, "V H W"] | None:
-    """Which pixels show content; None where neither alpha nor a flat background at the borders tells."""
-    images = views.images.numpy()
-    if images.shape[3] == 4:
-        return images[..., 3] > ALPHA_FLOOR * 255
-    colour = np.rint(np.array(background) * 255).astype(np.int16)
-    masks = np.stack([(np.abs(image - colour) > COLOUR_FLOOR).any(-1) for image in images])
-    border = np.concatenate([masks[:, 0], masks[:, -1], masks[:, :, 0], masks[:, :, -1]], axis=1)
-    flat = border.mean(1) < 0.2
-    return masks if flat.mean() > 0.5 else None
+def silhouettes(views: Views, background: tuple[float, float, float]) -> list[Bool[np.ndarray, "H W"]] | None:
+    """Which pixels of each photo show content; None where neither alpha nor a flat background at the borders tells.
+
+    Masked pixels may show content.
+    """
+    images = [views.image(view).numpy() for view in range(len(views))]
+    if views.channels == 4:
+        masks = [image[..., 3] > ALPHA_FLOOR * 255 for image in images]
+    else:
+        colour = np.rint(np.array(background) * 255).astype(np.int16)
+        masks = [(np.abs(image - colour) > COLOUR_FLOOR).any(-1) for image in images]
+    if views.known is not None:
+        masks = [mask | ~views.mask_of(view).numpy() for view, mask in enumerate(masks)]
+    flat = [around(mask).mean() < 0.2 for mask in masks]
+    return masks if views.channels == 4 or np.mean(flat) > 0.5 else None
 
 
-def border_colour(images: UInt8[Tensor, "V H W C"]) -> tuple[float, float, float] | None:
+def around(image: Shaped[np.ndarray, "H W *C"]) -> Shaped[np.ndarray, "B *C"]:
+    """The pixels along the border of a picture."""
+    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+
+
+def border_colour(views: Views) -> tuple[float, float, float] | None:
     """The one colour along the borders of photos without alpha, sRGB in [0, 1]; None where they have several, or alpha."""
-    if images.shape[3] == 4:
+    if views.channels == 4:
         return None
-    edges = torch.cat([images[:, 0], images[:, -1], images[:, :, 0], images[:, :, -1]], dim=1).flatten(0, 1).int()
+    borders = []
+    for view in range(len(views)):
+        border = around(views.image(view).numpy())
+        borders.append(border if views.known is None else border[around(views.mask_of(view).numpy())])
+    edges = torch.from_numpy(np.concatenate(borders)).int()
+    if not len(edges):
+        return None
     middle = edges.median(0).values
     alike = ((edges - middle).abs() <= COLOUR_FLOOR).all(1).float().mean()
     if float(alike) < FLAT:
@@ -84,7 +100,7 @@ def visible_cube(cameras: Cameras) -> Float[np.ndarray, "2 3"]:
     """A cube around the point the cameras look at, as wide as they see there, in world units."""
     centre = focus_point(cameras.c2w)
     distance = viewing_distance(cameras.c2w, centre)
-    tangent = max(cameras.width / float(cameras.K[:, 0, 0].min()), cameras.height / float(cameras.K[:, 1, 1].min())) / 2
+    tangent = float((cameras.sizes / cameras.K[:, [0, 1], [0, 1]].cpu()).max()) / 2
     half = distance * tangent
     return np.stack([centre.numpy() - half, centre.numpy() + half]).astype(np.float64)
 
@@ -118,22 +134,21 @@ def voxel_centres(aabb: Float[np.ndarray, "2 3"], count: int) -> Float[np.ndarra
 
 def sightings(aabb: Float[np.ndarray, "2 3"], count: int, cameras: Cameras) -> Iterator[Sighting]:
     """A box of count^3 voxels, in the order of their indices, as each camera sees it."""
-    x, y, z = voxel_centres(aabb, count)
+    places = np.stack(np.meshgrid(*voxel_centres(aabb, count), indexing="ij"), axis=-1).reshape(-1, 3)
+    points = torch.from_numpy(places).float()
     diagonal = np.linalg.norm((aabb[1] - aabb[0]) / count)
-    for K, c2w in zip(cameras.K.double().numpy(), cameras.c2w.double().numpy(), strict=True):
-        # P = K [R t; 0 1]^-1 maps world to pixels. On a grid it is a sum of one term an axis, cheaper than products.
-        P = K @ np.linalg.inv(c2w)[:3]
-        u, v, depth = ((p[0] * x[:, None, None] + p[1] * y[:, None] + (p[2] * z + p[3])).reshape(-1) for p in P)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = u / depth, v / depth
-        inside = (depth > 0) & (u >= 0) & (v >= 0) & (u < cameras.width) & (v < cameras.height)
-        column, row = (np.where(inside, pixel, 0).astype(np.int32) for pixel in (u, v))
-        nearness = float(np.median(depth[inside])) if inside.any() else np.inf
-        reach = int(min(np.ceil(0.5 * diagonal * K[0, 0] / nearness), max(cameras.width, cameras.height)))
-        yield Sighting(inside, column, row, reach)
+    for view in range(len(cameras)):
+        pixels, depth, seen = cameras.project(points, view)
+        inside = seen.numpy()
+        column, row = np.where(inside, pixels.T.numpy(), 0).astype(np.int32)
+        nearness = float(depth[seen].median()) if inside.any() else np.inf
+        focal = float(cameras.K[view, 0, 0])
+        yield Sighting(inside, column, row, int(min(np.ceil(0.5 * diagonal * focal / nearness), cameras.longest)))
 
 
-def visual_hull(masks: Bool[np.ndarray, "V H W"], sightings: Iterable[Sighting], least: float) -> Bool[np.ndarray, "N"]:
+def visual_hull(
+    masks: Sequence[Bool[np.ndarray, "H W"]], sightings: Iterable[Sighting], least: float
+) -> Bool[np.ndarray, "N"]:
     """Which voxels at least `least` views see, and nearly all of these find in their silhouettes."""
     seen: Any = 0
     found: Any = 0
@@ -144,7 +159,7 @@ def visual_hull(masks: Bool[np.ndarray, "V H W"], sightings: Iterable[Sighting],
 
 
 def _carve(
-    aabb: Float[np.ndarray, "2 3"], masks: Bool[np.ndarray, "V H W"], cameras: Cameras
+    aabb: Float[np.ndarray, "2 3"], masks: Sequence[Bool[np.ndarray, "H W"]], cameras: Cameras
 ) -> Float[np.ndarray, "2 3"] | None:
     """The box of the voxels inside (nearly) all silhouettes, one voxel wider; None when there are none."""
     voxel = (aabb[1] - aabb[0]) / GRID

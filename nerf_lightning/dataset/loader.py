@@ -7,7 +7,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from nerf_lightning.dataset.scene import Views
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.utils.device import CPU, fits
 
 Batch = TypeVar("Batch")

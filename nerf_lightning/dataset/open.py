@@ -5,45 +5,51 @@ from pathlib import Path
 
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.blender import load_blender
+from nerf_lightning.dataset.formats.colmap import find_models, load_colmap
+from nerf_lightning.dataset.formats.llff import POSES, load_llff
 from nerf_lightning.dataset.formats.nerfstudio import load_nerfstudio
 from nerf_lightning.dataset.formats.npz import load_npz
 from nerf_lightning.dataset.resize import resize_scene
 from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.shots import Masked, Reading
 from nerf_lightning.errors import InputError
 
-SUPPORTED = "an .npz file, a folder with transforms_train.json, or transforms.json or its folder"
+SUPPORTED = (
+    "an .npz file, a COLMAP folder (sparse/0), poses_bounds.npy beside images, a Blender folder (transforms_train.json),"
+    " or transforms.json or its folder"
+)
 
 
 def open_scene(
     path: str,
     name: str | None = None,
     resize: int | None = None,
-    holdout: int = 10,
+    holdout: int = 8,
     near: float | None = None,
     far: float | None = None,
+    masked: Masked = "auto",
+    invert_masks: bool = False,
+    undistort: bool = False,
 ) -> Scene:
-    """Reads a scene of any supported format.
+    """Reads a scene of any supported format, told apart by what is inside.
 
     Args:
-        path: an .npz file, a Blender folder (transforms_train.json), or a nerfstudio / instant-ngp capture
-            (transforms.json or its folder).
+        path: an .npz file; a folder of a Blender scene (transforms_train.json), of a nerfstudio or instant-ngp capture
+            (transforms.json, or that file), of LLFF (poses_bounds.npy), or of COLMAP (or its model's folder).
         name: what to call it; defaults to the file's or folder's name.
-        resize: longest side in pixels after averaging, if smaller than the photos.
-        holdout: N to hold out every N-th photo, where the format has no split of its own.
         near, far: distances along the rays, in the scene's unit, that override the bounds'.
+        resize, holdout, masked, invert_masks, undistort: see `Reading`; of an .npz file and a Blender folder only `resize`
+            counts.
 
     Raises:
         InputError: nothing readable at `path`, or what is there is damaged.
     """
     place = Path(path).expanduser()
-    if place.suffix.lower() == ".npz" and not place.is_dir():
-        scene = resize_scene(load_npz(place, name), resize)
-    elif (place / "transforms_train.json").is_file():
-        scene = load_blender(place, name, resize)
-    elif (place / "transforms.json").is_file() or (place.suffix.lower() == ".json" and place.is_file()):
-        scene = load_nerfstudio(place, name, resize, holdout)
-    else:
-        raise InputError(place, "", _description(place), SUPPORTED)
+    reading = Reading(resize, holdout, masked, invert_masks, undistort)
+    try:
+        scene = _open(place, name, reading)
+    except OSError as error:  # a loop of links, a folder that may not be read
+        raise InputError(place, "", f"something unreadable ({error})", SUPPORTED) from error
     if near is None and far is None:
         return scene
     bounds = scene.bounds
@@ -51,6 +57,20 @@ def open_scene(
     far = bounds.far if far is None else checks.number(place, "far", far)
     checks.near_far(place, near, far)
     return replace(scene, bounds=replace(bounds, near=near, far=far))
+
+
+def _open(place: Path, name: str | None, reading: Reading) -> Scene:
+    if place.suffix.lower() == ".npz" and not place.is_dir():
+        return resize_scene(load_npz(place, name), reading.resize)
+    if (place / "transforms_train.json").is_file():
+        return load_blender(place, name, reading.resize)
+    if (place / "transforms.json").is_file() or (place.suffix.lower() == ".json" and place.is_file()):
+        return load_nerfstudio(place, name, reading)
+    if find_models(place):
+        return load_colmap(place, name, reading)
+    if (place / POSES).is_file():
+        return load_llff(place, name, reading)
+    raise InputError(place, "", _description(place), SUPPORTED)
 
 
 def _description(place: Path) -> str:

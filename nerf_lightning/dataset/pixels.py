@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -67,6 +68,8 @@ class PictureBatch(PixelBatch):
 
     height: int
     width: int
+    known: ClassVar[None] = None
+    """All pixels count."""
 
     def to(self, device: torch.device | str) -> "PictureBatch":
         return PictureBatch(self.uv.to(device), self.rgb.to(device), self.height, self.width)

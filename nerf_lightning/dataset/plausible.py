@@ -1,6 +1,6 @@
 """Data that can be read but cannot be learned from: wrong poses, wrong background, a box that is too small."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,7 +80,7 @@ def looking_away(scene: Scene) -> Iterator[Doubt]:
 
 def border(scene: Scene) -> Iterator[Doubt]:
     """Photos whose borders have one colour, while the background is said to have another."""
-    if scene.bounds.unbounded or (found := border_colour(scene.train.images)) is None:
+    if scene.bounds.unbounded or (found := border_colour(scene.train)) is None:
         return
     if max(abs(is_ - said) for is_, said in zip(found, scene.background, strict=True)) > OTHER_COLOUR:
         seen, said = ([round(part, 2) for part in colour] for colour in (found, scene.background))
@@ -91,7 +91,13 @@ def misfits(scene: Scene) -> Iterator[Doubt]:
     """Silhouettes that no single object can have: shuffled or rotated poses. (Those of a ball fit any pose.)"""
     views = scene.train.spread(MAX_VIEWS)
     masks = silhouettes(views, scene.background)
-    if masks is None or len(views) < 3 or scene.bounds.unbounded or not masks.any() or masks.mean() > 0.9:
+    if (
+        masks is None
+        or len(views) < 3
+        or scene.bounds.unbounded
+        or not any(map(np.any, masks))
+        or np.mean([mask.mean() for mask in masks]) > 0.9
+    ):
         return
     explained = hull_coverage(masks, views.cameras, scene.bounds)
     if explained >= FITS_WELL:
@@ -108,7 +114,7 @@ def misfits(scene: Scene) -> Iterator[Doubt]:
         yield Doubt(text, hopeless=explained < FITS)
 
 
-def hull_coverage(masks: Bool[np.ndarray, "V H W"], cameras: Cameras, bounds: Bounds) -> float:
+def hull_coverage(masks: Sequence[Bool[np.ndarray, "H W"]], cameras: Cameras, bounds: Bounds) -> float:
     """Share of the silhouettes that their visual hull within the bounds covers, in [0, 1]."""
     seen = list(sightings(bounds.aabb.double().numpy(), HULL, cameras))
     hull = visual_hull(masks, seen, least=1)
@@ -135,7 +141,7 @@ def overlap(scene: Scene) -> Iterator[Doubt]:
     """Held-out views that are trained on as well: their PSNR says nothing about unseen views."""
     first = _first_alike(scene.val.cameras.c2w, scene.train.cameras.c2w, scene)
     found = (first >= 0).nonzero()[:, 0].tolist()
-    same = [view for view in found if torch.equal(scene.val.images[view], scene.train.images[int(first[view])])]
+    same = [view for view in found if torch.equal(scene.val.image(view), scene.train.image(int(first[view])))]
     if same:
         yield Doubt(
             f"{len(same)} of {len(scene.val)} held-out photos are trained on as well: their PSNR says nothing of unseen views"

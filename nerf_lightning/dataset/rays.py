@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset.loader import StepDataModule
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.seeding import Stream, step_generator
 
@@ -36,22 +37,26 @@ class ViewBatch(RayBatch):
 
     height: int
     width: int
+    known: Bool[Tensor, "R"] | None = None
+    """Which pixels count; None for all."""
 
     def to(self, device: torch.device | str) -> "ViewBatch":
-        return ViewBatch(self.rays.to(device), self.pixels.to(device), self.height, self.width)
+        known = None if self.known is None else self.known.to(device)
+        return ViewBatch(self.rays.to(device), self.pixels.to(device), self.height, self.width, known)
 
 
 def draw_rays(views: Views, count: int, generator: torch.Generator, part: slice = slice(None)) -> RayBatch:  # noqa: B008
-    """Draws `count` pixels uniformly from all views, with replacement; returns a part of them.
+    """Draws `count` pixels uniformly from all views, masked ones excepted, with replacement; returns a part of them.
 
     Photos stay bytes, and rays are made only for the drawn pixels: the cost does not depend on the number of photos.
     """
-    height, width = views.cameras.height, views.cameras.width
-    whole = len(views) * height * width
-    flat = torch.randint(whole, (count,), generator=generator, device=views.images.device)[part]
-    view, pixel = flat // (height * width), flat % (height * width)
-    row, col = pixel // width, pixel % width
-    return RayBatch(views.cameras.rays(view, row, col), views.images[view, row, col])
+    whole = len(views.pixels) if views.known is None else len(views.known)
+    flat = torch.randint(whole, (count,), generator=generator, device=views.pixels.device)[part]
+    if views.known is not None:
+        flat = views.known.find(flat)
+    view = torch.searchsorted(views.starts, flat, right=True) - 1
+    pixel, width = flat - views.starts[view], views.widths[view]
+    return RayBatch(views.cameras.rays(view, pixel // width, pixel % width), views.pixels[flat])
 
 
 class RayDataModule(StepDataModule[Views]):
@@ -104,7 +109,7 @@ class RayDataModule(StepDataModule[Views]):
         self.rays = self.first_rays
 
     def draw_from(self, photos: Views, step: int, part: slice) -> RayBatch:
-        generator = step_generator(self.seed, Stream.BATCH, step, photos.images.device)
+        generator = step_generator(self.seed, Stream.BATCH, step, photos.pixels.device)
         return draw_rays(photos, self.rays, generator, part)
 
     def some_pixels(self) -> RayBatch:
@@ -117,8 +122,9 @@ class RayDataModule(StepDataModule[Views]):
 
     def held_out(self, view: int) -> ViewBatch:
         views = self.scene.val
-        height, width = views.cameras.height, views.cameras.width
-        return ViewBatch(views.cameras.view_rays(view), views.images[view].flatten(0, 1), height, width)
+        width, height = views.cameras.size(view)
+        known = None if views.known is None else views.mask_of(view).flatten()
+        return ViewBatch(views.cameras.view_rays(view), views.image(view).flatten(0, 1), height, width, known)
 
     def state_dict(self) -> dict[str, int]:
         return {"rays": self.rays, "batch": self.batch}

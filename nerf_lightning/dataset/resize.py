@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
 
@@ -45,16 +46,18 @@ def area_resize(image: UInt8[np.ndarray, "H W C"], width: int, height: int) -> U
 
 
 def resize_views(views: Views, longest: int | None) -> Views:
+    """Views without masks on smaller pixel grids."""
     cameras = views.cameras
-    width, height = fit_size(cameras.width, cameras.height, longest)
-    if (width, height) == (cameras.width, cameras.height):
+    sizes = torch.tensor([fit_size(width, height, longest) for width, height in cameras.sizes.tolist()])
+    if torch.equal(sizes, cameras.sizes):
         return views
-    images = np.stack([area_resize(image, width, height) for image in views.images.numpy()])
-    return Views(torch.from_numpy(images), cameras.resized(width, height))
+    images = [area_resize(views.image(i).numpy(), *size) for i, size in enumerate(sizes.tolist())]
+    pixels = np.concatenate([image.reshape(-1, views.channels) for image in images])
+    return Views(torch.from_numpy(pixels), cameras.resized(sizes))
 
 
 def resize_scene(scene: Scene, longest: int | None) -> Scene:
     """The scene on a smaller pixel grid; world, bounds and poses stay."""
     train, val = resize_views(scene.train, longest), resize_views(scene.val, longest)
-    orbit = scene.orbit.resized(*fit_size(scene.orbit.width, scene.orbit.height, longest))
+    orbit = scene.orbit.resized(fit_size(scene.orbit.width, scene.orbit.height, longest))
     return replace(scene, train=train, val=val, orbit=orbit)

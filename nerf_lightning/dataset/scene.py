@@ -4,41 +4,14 @@ import hashlib
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras
+from nerf_lightning.cameras import Bounds, Cameras, typical_view
+from nerf_lightning.dataset.views import Views
 
 BUILT_IN = "built-in"
 """The source of what this package makes itself."""
-
-
-@dataclass(frozen=True)
-class Views:
-    """Photos and the cameras that took them, all of one size."""
-
-    images: UInt8[Tensor, "V H W C"]
-    """sRGB; C is 3, or 4 with straight (not premultiplied) alpha."""
-    cameras: Cameras
-
-    def __len__(self) -> int:
-        return self.images.shape[0]
-
-    @property
-    def nbytes(self) -> int:
-        """Of the pictures."""
-        return self.images.nbytes
-
-    def __getitem__(self, index: Tensor) -> "Views":
-        """Some of the views."""
-        return Views(self.images[index], self.cameras[index])
-
-    def spread(self, count: int) -> "Views":
-        """At most `count` views, evenly spaced from the first to the last."""
-        return self[torch.linspace(0, len(self) - 1, min(len(self), count)).round().long()]
-
-    def to(self, device: torch.device) -> "Views":
-        return Views(self.images.to(device), self.cameras.to(device))
 
 
 @dataclass(frozen=True)
@@ -62,16 +35,23 @@ class Scene:
 
     @property
     def resolution(self) -> tuple[int, int]:
-        """Width and height of a view in pixels."""
-        return self.train.cameras.width, self.train.cameras.height
+        """Width and height in pixels of the commonest training photo."""
+        return self.train.cameras.size(typical_view(self.train.cameras))
 
     def sha256(self) -> str:
         """A fingerprint of the pictures and their split, the same for every file format that holds them."""
         digest = hashlib.sha256()
         for views in (self.train, self.val):
-            digest.update(repr(tuple(views.images.shape)).encode())
-            for image in views.images:  # one by one: bytes are a copy
-                digest.update(image.numpy().tobytes())
+            sizes, channels = views.cameras.sizes.tolist(), views.channels
+            if views.cameras.one_size:  # as earlier versions did
+                width, height = sizes[0] if sizes else (0, 0)
+                digest.update(repr((len(views), height, width, channels)).encode())
+            else:
+                digest.update(repr((sizes, channels)).encode())
+            for view in range(len(views)):  # one by one: bytes are a copy
+                digest.update(views.image(view).numpy().tobytes())
+            if views.known is not None:
+                digest.update(views.known.starts.numpy().tobytes() + views.known.ends.numpy().tobytes())
         return digest.hexdigest()
 
     def describe(self) -> dict[str, object]:

@@ -6,6 +6,7 @@ import shutil
 import urllib.request
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import UInt8
@@ -18,8 +19,9 @@ from nerf_lightning.dataset.pixels import Picture, PixelDataModule
 from nerf_lightning.dataset.rays import RAYS, SAMPLES, RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
+from nerf_lightning.dataset.shots import Masked
 from nerf_lightning.utils.files import atomic
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import AtLeast, Count
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +33,10 @@ def from_photos(
     path: str,
     name: str | None = None,
     resize: Count | None = None,
-    holdout: Count = 10,
+    holdout: Annotated[int, AtLeast(2)] = 8,
+    masked: Masked = "auto",
+    invert_masks: bool = False,
+    undistort: bool = False,
     near: float | None = None,
     far: float | None = None,
     rays: Count = RAYS,
@@ -39,7 +44,8 @@ def from_photos(
     seed: int = 0,
 ) -> RayDataModule:
     """Posed photos in any supported format, see `open_scene` and `RayDataModule`."""
-    return RayDataModule(open_scene(path, name, resize, holdout, near, far), rays, samples, seed)
+    scene = open_scene(path, name, resize, holdout, near, far, masked, invert_masks, undistort)
+    return RayDataModule(scene, rays, samples, seed)
 
 
 def from_bricks(

@@ -36,8 +36,7 @@ class Style:
 
 def depth_range(system: NeRF3D, cameras: Cameras) -> tuple[float, float]:
     """The 2nd and the 98th percentile of the depths that a few of the views show, in the scene's unit."""
-    shrink = min(1.0, LOOK_SIDE / max(cameras.width, cameras.height))
-    small = cameras.resized(max(1, round(cameras.width * shrink)), max(1, round(cameras.height * shrink)))
+    small = cameras.scaled(min(1.0, LOOK_SIDE / cameras.longest))
     seen = []
     for view in evenly(len(small), LOOKS):
         rendered = system.render(small.view_rays(view).to(system.device))
@@ -53,7 +52,8 @@ def draw(system: NeRF3D, cameras: Cameras, view: int, style: Style) -> dict[str,
     """A view's channels; C is 4, with straight alpha, where the background is left transparent."""
     rays = cameras.view_rays(view).to(system.device)
     rendered = system.render(rays, background=style.background or BLACK)
-    shape = (cameras.height, cameras.width, -1)
+    width, height = cameras.size(view)
+    shape = (height, width, -1)
     return {name: to_bytes(colours(rendered, name, style).view(shape)) for name in style.channels}
 
 

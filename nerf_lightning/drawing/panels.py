@@ -51,13 +51,19 @@ def panel(images: list[UInt8[ndarray, "H W 3"]], caption: str) -> UInt8[ndarray,
     return np.concatenate([row, strip])
 
 
+def stacked(panels: list[UInt8[ndarray, "H W 3"]]) -> UInt8[ndarray, "H2 W2 3"]:
+    """One below the other; narrow ones with a dark margin."""
+    widest = max(one.shape[1] for one in panels)
+    return np.concatenate([np.pad(one, ((0, 0), (0, widest - one.shape[1]), (0, 0))) for one in panels])
+
+
 def result_panel(result: ViewResult, caption: str) -> UInt8[ndarray, "H2 W2 3"]:
     """Truth, render, and depth (3D) or error times four (2D)."""
     if result.depth is not None and result.opacity is not None:
         third = depth_colours(result.depth, result.opacity)
         names = "truth | render | depth"
     else:
-        third = to_bytes((result.rgb - result.truth).abs() * 4)
+        third = to_bytes(result.errors * 4)
         names = "truth | render | 4 x error"
     return panel([to_bytes(result.truth), to_bytes(result.rgb), third], f"{names}    {caption}")
 

@@ -13,17 +13,17 @@ WEIGHTS = "alexnet-owt-7be5be79.pth"
 SMALLEST = 64
 """Pixels along a side that AlexNet needs."""
 
-Distance = Callable[[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]], float]
+TOO_SMALL = f"photos of less than {SMALLEST} pixels"
+
+Distance = Callable[[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]], float | None]
 
 
-def perceptual_distance(width: int, height: int) -> tuple[Distance | None, str]:
-    """LPIPS with AlexNet of two pictures in [0, 1]: 0 for the same, smaller is better.
+def perceptual_distance() -> tuple[Distance | None, str]:
+    """LPIPS with AlexNet of two pictures in [0, 1]: 0 for the same, smaller is better; None for pictures that are too small.
 
     Returns:
         It, or None and the reason why it cannot be computed.
     """
-    if min(width, height) < SMALLEST:
-        return None, f"photos of less than {SMALLEST} pixels"
     if importlib.util.find_spec("torchvision") is None:
         return None, "torchvision is not installed"
     weights = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS
@@ -32,7 +32,9 @@ def perceptual_distance(width: int, height: int) -> tuple[Distance | None, str]:
 
     from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
 
-    def distance(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
+    def distance(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float | None:
+        if min(image.shape[:2]) < SMALLEST:
+            return None
         first, second = (one.permute(2, 0, 1)[None] for one in (image, truth))
         return float(learned_perceptual_image_patch_similarity(first, second, net_type="alex", normalize=True))
 

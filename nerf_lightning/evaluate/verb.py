@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 
-from nerf_lightning.drawing.panels import result_panel, write_png
-from nerf_lightning.evaluate.perceptual import perceptual_distance
+from nerf_lightning.drawing.panels import result_panel, stacked, write_png
+from nerf_lightning.evaluate.perceptual import SMALLEST, TOO_SMALL, perceptual_distance
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.open import beside, open_run
 from nerf_lightning.system import ViewResult
@@ -52,13 +51,13 @@ def evaluate(run: str, output: str | None, worst: int, device: str, photos: str 
     found = open_run(source, where)
     data = data_again(found.cfg, found.scene, photos)
     folder = beside(source) / "evaluation" if output is None else Path(output).expanduser()
-    first = data.held_out(0)
-    distance, why = perceptual_distance(first.width, first.height)
+    distance, why = perceptual_distance()
     metrics: list[ViewMetrics] = []
     kept: dict[int, ViewResult] = {}
     views = tracked(range(data.held_out_views), data.held_out_views, "held-out views")
     for view, result in enumerate(found.system.evaluate_held_out(data, views)):
-        lpips = None if distance is None else distance(result.rgb, result.truth)
+        why = TOO_SMALL if min(result.rgb.shape[:2]) < SMALLEST else why
+        lpips = None if distance is None else distance(result.rgb, result.comparable)
         metrics.append(ViewMetrics(view, result.psnr, result.ssim, lpips, result.seconds))
         kept[view] = result
         if len(kept) > worst:
@@ -68,7 +67,7 @@ def evaluate(run: str, output: str | None, worst: int, device: str, photos: str 
     for view in sorted(kept, key=lambda one: kept[one].psnr):
         caption = f"view {view}, {metrics[view].psnr:.2f} dB, SSIM {metrics[view].ssim:.3f}"
         panels.append(result_panel(kept[view], caption))
-    write_png(folder / "worst.png", np.concatenate(panels))
+    write_png(folder / "worst.png", stacked(panels))
     Console(highlight=False, soft_wrap=True).print(table(metrics))
     mean = fmean(one.psnr for one in metrics)
     over = f"{len(metrics)} held-out views on {device_in_words(where)}"

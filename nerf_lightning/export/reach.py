@@ -41,7 +41,7 @@ def seen_cells(system: System, cameras: Cameras) -> Cells | None:
     bounds, n = system.sampler.bounds, len(occupied)
     cell = 2 * float(bounds.half_size.max()) / n
     times = min(FINEST, math.ceil(cameras.pixel_width(bounds.centre.cpu()) / cell))
-    fine = cameras.resized(times * cameras.width, times * cameras.height)
+    fine = cameras.scaled(times)
     seen = torch.zeros(n**3, dtype=torch.bool, device=system.device)
     for view in range(len(fine)):
         rays = fine.view_rays(view)

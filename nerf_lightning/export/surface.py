@@ -71,22 +71,19 @@ def lit_cells(system: NeRF3D, volume: Volume, cameras: Cameras) -> Bool[ndarray,
     """
     places = volume.centres.view(-1, 3)
     dark = torch.arange(len(places))
-    share = min(1.0, LOOKED / max(cameras.width, cameras.height))
-    cameras = cameras.resized(max(1, round(share * cameras.width)), max(1, round(share * cameras.height)))
+    cameras = cameras.scaled(min(1.0, LOOKED / cameras.longest))
     # Within a pixel a slanted surface has many depths: where cells are finer, the pixel's width says how far to go on.
     beyond = max(volume.cell, PIXELS * cameras.pixel_width(system.field.bounds.centre.cpu()))
     for view in tracked(range(len(cameras)), len(cameras), "views"):
         rendered = system.render(cameras.view_rays(view).to(system.device))
         ends = torch.where(rendered.opacity > 0.5, rendered.depth, FAR).cpu() + beyond
         # At an outline a pixel's depth is a mean of near and far: the nearest of its neighbours' counts.
-        ends = -torch.nn.functional.max_pool2d(-ends.view(1, cameras.height, cameras.width), 3, 1, 1).flatten()
-        offset = places[dark] - cameras.centres[view]
-        local = offset @ cameras.c2w[view, :3, :3]
-        pixels = local @ cameras.K[view].T
-        col, row = (pixels[:, :2] / pixels[:, 2:]).nan_to_num(-1).clamp(-1, 1e6).floor().long().unbind(1)
-        seen = (local[:, 2] > 0) & (col >= 0) & (col < cameras.width) & (row >= 0) & (row < cameras.height)
-        reach = torch.where(seen, ends[row * seen * cameras.width + col * seen], 0.0)
-        dark = dark[offset.norm(dim=1) > reach]
+        width, height = cameras.size(view)
+        ends = -torch.nn.functional.max_pool2d(-ends.view(1, height, width), 3, 1, 1).flatten()
+        pixels, _, seen = cameras.project(places[dark], view)
+        col, row = torch.where(seen[:, None], pixels, 0.0).long().unbind(1)
+        reach = torch.where(seen, ends[row * width + col], 0.0)
+        dark = dark[(places[dark] - cameras.centres[view]).norm(dim=1) > reach]
     lit = torch.ones(len(places), dtype=torch.bool)
     lit[dark] = False
     return lit.view(volume.density.shape).numpy()

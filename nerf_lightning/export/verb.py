@@ -1,6 +1,5 @@
 """The export verb's options -> a file."""
 
-from dataclasses import replace
 from operator import lt
 from pathlib import Path
 
@@ -96,6 +95,7 @@ def views_of(run: SceneRun, photos: str | None) -> Cameras:
         print(f"without the photos' cameras, from the orbit: {error}")
         spiral, count = spiral_like(run.orbit, MOST_VIEWS // 2), MOST_VIEWS // 2
         orbit = run.orbit[torch.tensor(evenly(len(run.orbit), count))]
-        return replace(spiral, K=torch.cat([orbit.K, spiral.K]), c2w=torch.cat([orbit.c2w, spiral.c2w]))
+        K, c2w, sizes = (torch.cat([getattr(x, name) for x in (orbit, spiral)]) for name in ("K", "c2w", "sizes"))
+        return Cameras(K, c2w, sizes)
     assert isinstance(data, RayDataModule)  # of a scene's run
     return some_cameras(data)

@@ -49,7 +49,7 @@ def find_route(path: str, frames: int | None, orbit: Cameras, scene: Scene | Non
         photos: Views = getattr(scene, WITH_PHOTOS[path])
         chosen = evenly(len(photos), frames)
         index = torch.tensor(chosen)
-        return Route(photos.cameras[index], chosen, Views(photos.images[index], photos.cameras[index]))
+        return Route(photos.cameras[index], chosen, photos[index])
     if path == "orbit":
         cameras = along(orbit, len(orbit) if frames is None else frames, closed=True)
     elif path == "spiral":
@@ -85,7 +85,7 @@ def along(cameras: Cameras, frames: int, closed: bool) -> Cameras:
     part = torch.from_numpy(at - at.astype(int)).float()[:, None, None]
     K = cameras.K[loop]
     after = (below + 1).clamp_max(len(loop) - 1)
-    return Cameras(K[below] * (1 - part) + K[after] * part, poses, cameras.width, cameras.height)
+    return Cameras.of_size(K[below] * (1 - part) + K[after] * part, poses, cameras.width, cameras.height)
 
 
 def read_path(file: Path) -> Cameras:
@@ -120,7 +120,7 @@ def read_path(file: Path) -> Cameras:
 def _own(plain: dict[str, Any]) -> Cameras:
     c2w = torch.tensor(plain["c2w"], dtype=torch.float32).view(-1, 4, 4)
     K = torch.tensor(plain["K"], dtype=torch.float32).view(-1, 3, 3).expand(len(c2w), 3, 3)
-    return Cameras(K.contiguous(), c2w, int(plain["width"]), int(plain["height"]))
+    return Cameras.of_size(K.contiguous(), c2w, int(plain["width"]), int(plain["height"]))
 
 
 def _nerfstudio(plain: dict[str, Any]) -> Cameras:
@@ -130,4 +130,4 @@ def _nerfstudio(plain: dict[str, Any]) -> Cameras:
         poses.append(torch.tensor(view["camera_to_world"], dtype=torch.float32).view(4, 4) @ OPENGL_TO_OPENCV)
         focal = height / (2 * math.tan(math.radians(float(view["fov"])) / 2))
         K.append(torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]))
-    return Cameras(torch.stack(K), torch.stack(poses), width, height)
+    return Cameras.of_size(torch.stack(K), torch.stack(poses), width, height)

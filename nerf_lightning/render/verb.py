@@ -82,8 +82,7 @@ def the_route(options: RenderOptions, found: SceneRun) -> Route:
     route = find_route(options.path, options.frames, found.orbit, scene)
     if options.scale == 1:
         return route
-    width, height = (max(1, round(side * options.scale)) for side in (route.cameras.width, route.cameras.height))
-    return Route(route.cameras.resized(width, height), route.views)
+    return Route(route.cameras.scaled(options.scale), route.views)
 
 
 def the_background(options: RenderOptions, system: NeRF3D, route: Route) -> tuple[float, float, float] | None:
@@ -108,7 +107,7 @@ def the_background(options: RenderOptions, system: NeRF3D, route: Route) -> tupl
     if len(colour) != 3 or not all(0 <= part <= 1 for part in colour):
         expected = "scene, black, white, transparent, or R,G,B in 0..1"
         raise InputError("config", "background", repr(given), expected)
-    if route.photos is not None and route.photos.images.shape[-1] == 3 and not np.allclose(colour, own, atol=1e-3):
+    if route.photos is not None and route.photos.channels == 3 and not np.allclose(colour, own, atol=1e-3):
         expected = f"scene: these photos have no alpha, and stand on {[round(part, 3) for part in own]}"
         raise InputError("config", "background", repr(given), expected)
     red, green, blue = colour
@@ -124,7 +123,7 @@ def the_plan(options: RenderOptions, system: NeRF3D, route: Route, style: Style)
         "what": digest.hexdigest(),
         "path": options.path,
         "views": route.views,
-        "size": [route.cameras.width, route.cameras.height],
+        "size": route.cameras.sizes.tolist(),
         "channels": list(style.channels),
         "background": None if style.background is None else list(style.background),
     }
@@ -138,7 +137,7 @@ def side_by_side(system: NeRF3D, route: Route, index: int, style: Style) -> Pict
 def beside_truth(system: NeRF3D, route: Route, index: int, style: Style) -> Picture:
     """The photo, the render, their difference, and the other channels, with a caption."""
     assert route.photos is not None and style.background is not None  # the verb sees to it
-    photo = route.photos.images[index].numpy()
+    photo = route.photos.image(index).numpy()
     if photo.shape[-1] == 4:
         alpha = photo[..., 3:] / 255.0
         photo = np.rint(photo[..., :3] * alpha + 255 * (1 - alpha) * np.array(style.background)).astype(np.uint8)

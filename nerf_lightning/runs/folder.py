@@ -126,7 +126,7 @@ def frame_from(scene: dict[str, Any]) -> tuple[Frame, Cameras | None, Tensor | N
     bounds = Bounds(torch.tensor(scene["aabb"]), scene["unbounded"], near, far, pixel)
     red, green, blue = map(float, scene["background"])
     view = scene["orbit"]
-    orbit = Cameras(torch.tensor(view["K"]), torch.tensor(view["c2w"]), view["width"], view["height"])
+    orbit = Cameras.of_size(torch.tensor(view["K"]), torch.tensor(view["c2w"]), view["width"], view["height"])
     to_source = torch.tensor(scene["to_source"], dtype=torch.float32).view(4, 4)
     return SceneFrame(bounds, (red, green, blue)), orbit, to_source
 

@@ -23,12 +23,7 @@ ROOM = 1.25
 
 def in_view(camera: Cameras, points: Float[Tensor, "N 3"], near: float) -> Bool[Tensor, "N"]:
     """Which world points one camera sees, farther from it than `near`."""
-    rotation, eye = camera.c2w[0, :3, :3], camera.c2w[0, :3, 3]
-    local = (points - eye) @ rotation
-    pixels = local @ camera.K[0].T
-    size = torch.tensor([camera.width, camera.height])
-    inside = ((pixels[:, :2] > 0) & (pixels[:, :2] < size * pixels[:, 2:])).all(1)
-    return inside & (local[:, 2] > 0) & (local.norm(dim=1) > near)
+    return camera.project(points, 0)[2] & ((points - camera.centres).norm(dim=1) > near)
 
 
 class OccupancySampler(Sampler):

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from nerf_lightning.dataset.pixels import Picture
-from nerf_lightning.dataset.scene import BUILT_IN, Scene, Views
+from nerf_lightning.dataset.scene import BUILT_IN, Scene
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.stability import damage
 from nerf_lightning.stability.toys import MARBLE, PILE, ROD, around, photograph, toy
 
@@ -81,7 +82,7 @@ def _waves(seed: int) -> Picture:
 def _seen_from_nearer(seed: int) -> Scene:
     scene = _pile()
     cameras = around(len(scene.val), scene.val.cameras.width, phase=0.7, distance=2.4)
-    return replace(scene, val=Views(photograph(PILE, cameras, BLACK), cameras))
+    return replace(scene, val=Views.of(photograph(PILE, cameras, BLACK), cameras))
 
 
 SURVIVES, TOLD = "no collapse", "refused, or an alarm"

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 Poses = Callable[[Float[Tensor, "V 4 4"]], Float[Tensor, "V 4 4"]]
@@ -23,7 +24,7 @@ def posed(views: Views, change: Poses) -> Views:
 def exposed(views: Views, change: Photos) -> Views:
     """Views with other colours: `change` takes and gives the photos in [0, 1]."""
     colours = change(views.images.float() / 255)
-    return replace(views, images=(colours.clamp(0, 1) * 255).round().to(torch.uint8))
+    return Views.of((colours.clamp(0, 1) * 255).round().to(torch.uint8), views.cameras)
 
 
 def turned_to_opengl(scene: Scene, seed: int) -> Scene:

@@ -12,7 +12,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at
-from nerf_lightning.dataset.scene import BUILT_IN, Scene, Views
+from nerf_lightning.dataset.scene import BUILT_IN, Scene
+from nerf_lightning.dataset.views import Views
 
 DISTANCE, FIELD_OF_VIEW = 4.0, 0.7
 """Distance of the cameras from the origin; horizontal field of view, radians."""
@@ -108,7 +109,7 @@ def photograph(
     bodies: list[Body], cameras: Cameras, background: tuple[float, float, float] | None, grain: float = 1.0
 ) -> UInt8[Tensor, "V H W C"]:
     """Pictures on a background, or with alpha if it is None."""
-    fine = cameras.resized(FINER * cameras.width, FINER * cameras.height)
+    fine = cameras.scaled(FINER)
     pixels = torch.arange(fine.height * fine.width).view(fine.height, fine.width)
     tiles = [tile.flatten() for row in pixels.split(TILE) for tile in row.split(TILE, dim=1)]
     pictures = []
@@ -144,7 +145,7 @@ def around(count: int, size: int, phase: float = 0.0, distance: float = DISTANCE
     c2w = look_at(eye, torch.zeros(3).double(), torch.tensor([0.0, 0.0, 1.0]).double()).float()
     focal = 0.5 * size / math.tan(0.5 * FIELD_OF_VIEW)
     K = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-    return Cameras(K.repeat(count, 1, 1), c2w, size, size)
+    return Cameras.of_size(K.repeat(count, 1, 1), c2w, size, size)
 
 
 def enclosing(bodies: list[Body]) -> Bounds:
@@ -176,8 +177,8 @@ def toy(
     return Scene(
         name="toy",
         source=BUILT_IN,
-        train=Views(photograph(bodies, train, background, grain), train),
-        val=Views(photograph(bodies, val, background, grain), val),
+        train=Views.of(photograph(bodies, train, background, grain), train),
+        val=Views.of(photograph(bodies, val, background, grain), val),
         orbit=around(8, size, phase=0.3),
         bounds=enclosing(bodies),
         background=background or (0.0, 0.0, 0.0),

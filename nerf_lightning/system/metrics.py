@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
@@ -13,10 +13,15 @@ def mse_to_psnr(mse: float) -> float:
     return -10 * math.log10(max(mse, 1e-12))
 
 
-def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> float:
-    """Peak signal-to-noise ratio in dB, 10 log10(1 / MSE), of pictures in [0, 1]."""
+def psnr(
+    image: Float[Tensor, "*shape C"], truth: Float[Tensor, "*shape C"], known: Bool[Tensor, "*shape"] | None = None
+) -> float:
+    """Peak signal-to-noise ratio in dB, 10 log10(1 / MSE), of pictures in [0, 1], over all pixels or the known ones; nan where
+    none is known."""
     first, second = (x.cpu().double() for x in (image, truth))  # not every device has doubles
-    return mse_to_psnr(float(torch.mean((first - second) ** 2)))
+    squares = (first - second) ** 2
+    mse = float(torch.mean(squares if known is None else squares[known.cpu()]))
+    return mse if math.isnan(mse) else mse_to_psnr(mse)
 
 
 SSIM_WINDOW = 11
@@ -25,18 +30,25 @@ SSIM_ROWS = 32
 """Rows compared at once: the library needs a kilobyte for each pixel."""
 
 
-def ssim(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
-    """Structural similarity (Wang et al. 2004) of pictures in [0, 1]; nan if they are smaller than its window."""
+def ssim(
+    image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], known: Bool[Tensor, "H W"] | None = None
+) -> float:
+    """Structural similarity (Wang et al. 2004) of pictures in [0, 1]; nan if they are smaller than its window.
+
+    Where only some pixels are known, it is the mean over windows around these; what is not known counts as equal in them.
+    """
     height, width, _ = image.shape
     if min(height, width) < SSIM_WINDOW:
         return math.nan
     first, second = (x.permute(2, 0, 1)[None] for x in (image, truth))
     margin, total = SSIM_WINDOW // 2, 0.0
+    counted = torch.ones(height, width, dtype=torch.bool) if known is None else known
+    second = torch.where(counted, second, first)
     for start in range(0, height, SSIM_ROWS):
         end = min(start + SSIM_ROWS, height)
         top, bottom = max(0, start - margin), min(height, end + margin)
         _, scores = structural_similarity_index_measure(
             first[:, :, top:bottom], second[:, :, top:bottom], data_range=1.0, return_full_image=True
         )
-        total += scores[:, :, start - top : end - top].double().sum().item()
-    return total / image.numel()
+        total += scores[0, :, start - top : end - top][:, counted[start:end]].double().sum().item()
+    return total / (3 * int(counted.sum())) if counted.any() else math.nan

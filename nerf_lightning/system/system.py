@@ -9,7 +9,7 @@ from typing import Any
 
 import lightning as L
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.dataset.loader import StepDataModule
@@ -51,6 +51,18 @@ class ViewResult:
     """Rendering time."""
     depth: Float[Tensor, "H W"] | None = None
     opacity: Float[Tensor, "H W"] | None = None
+    known: Bool[Tensor, "H W"] | None = None
+    """Pixels that are scored; None for all."""
+
+    @property
+    def comparable(self) -> Float[Tensor, "H W 3"]:
+        """The truth; the render itself where the truth is not known."""
+        return self.truth if self.known is None else torch.where(self.known[..., None], self.truth, self.rgb)
+
+    @property
+    def errors(self) -> Float[Tensor, "H W 3"]:
+        """Absolute differences; 0 where the truth is not known."""
+        return (self.rgb - self.comparable).abs()
 
 
 class System(L.LightningModule):
@@ -137,8 +149,9 @@ class System(L.LightningModule):
             return x.view(view.height, view.width, *x.shape[1:]).cpu()
 
         rgb, truth = image(rgb.clamp(0, 1)), image(self.truth(view))
-        depth, opacity = (None if x is None else image(x) for x in (depth, opacity))
-        return ViewResult(rgb, truth, psnr(rgb, truth), ssim(rgb, truth), seconds, depth, opacity)
+        depth, opacity, known = (None if x is None else image(x) for x in (depth, opacity, view.known))
+        figures = psnr(rgb, truth, known), ssim(rgb, truth, known)
+        return ViewResult(rgb, truth, *figures, seconds, depth, opacity, known)
 
     def evaluate_held_out(self, data: StepDataModule, views: Iterable[int]) -> Iterator[ViewResult]:
         """Evaluates some of the held-out views, one after the other."""
@@ -146,6 +159,7 @@ class System(L.LightningModule):
 
     def test_step(self, batch: Any, batch_idx: int) -> dict[str, float]:
         result = self.evaluate(batch)
-        plain = result.truth.mean((0, 1)).expand_as(result.truth)
+        truth = result.truth if result.known is None else result.truth[result.known][None]
+        plain = truth.mean((0, 1)).expand_as(truth)
         figures = {"psnr": result.psnr, "ssim": result.ssim, "seconds": result.seconds}
-        return {**figures, "plain_psnr": psnr(plain, result.truth)}
+        return {**figures, "plain_psnr": psnr(plain, truth)}

@@ -12,7 +12,8 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Bounds, Cameras, Rays, focus_point
 from nerf_lightning.dataset.extent import viewing_distance
 from nerf_lightning.dataset.resize import area_resize, fit_size
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.sampler import UniformSampler
 
 OVERVIEW_FOV = math.radians(50)
@@ -64,9 +65,9 @@ def frusta(views: Views, word: str, photo_side: int) -> Iterator[Frustum]:
         word: names are this word and the view's number.
         photo_side: longest side of the photos in pixels.
     """
-    images, cameras = views.images.numpy(), views.cameras
-    for i, (image, K, c2w) in enumerate(zip(images, cameras.K.double().numpy(), cameras.c2w.numpy(), strict=True)):
-        fov, aspect, photo = _centred(image, K, photo_side)
+    cameras = views.cameras
+    for i, (K, c2w) in enumerate(zip(cameras.K.double().numpy(), cameras.c2w.numpy(), strict=True)):
+        fov, aspect, photo = _centred(views.image(i).numpy(), K, photo_side)
         yield Frustum(f"{word} {i}", c2w, fov, aspect, photo)
 
 
@@ -91,7 +92,8 @@ def _centred(
 
 def random_rays(cameras: Cameras, view: Int[Tensor, "R"], generator: Generator) -> Rays:
     """The ray of a random pixel of each of some views, which may repeat."""
-    row, col = (torch.randint(size, view.shape, generator=generator) for size in (cameras.height, cameras.width))
+    place = torch.rand(len(view), 2, generator=generator) * cameras.sizes[view]
+    col, row = place.long().minimum(cameras.sizes[view] - 1).unbind(1)
     return cameras.rays(view, row, col)
 
 

@@ -48,7 +48,7 @@ class Wish:
         height = max(1, round(side / max(1.0, self.aspect)))
         focal = height / (2 * math.tan(self.fov / 2))
         K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-        return Cameras(K[None], torch.from_numpy(self.c2w).float()[None], width, height)
+        return Cameras.of_size(K[None], torch.from_numpy(self.c2w).float()[None], width, height)
 
 
 class Painter:

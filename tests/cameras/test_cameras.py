@@ -8,12 +8,12 @@ from nerf_lightning.cameras import Cameras, pixel_to_ray
 
 @pytest.fixture
 def cameras(random_K, random_poses) -> Cameras:
-    return Cameras(random_K(3), random_poses(3), width=7, height=5)
+    return Cameras.of_size(random_K(3), random_poses(3), width=7, height=5)
 
 
 def test_the_centre_pixel_of_an_odd_picture_looks_along_z():
     K = torch.tensor([[[10.0, 0, 2.5], [0, 10.0, 1.5], [0, 0, 1]]])
-    cameras = Cameras(K, torch.eye(4)[None], width=5, height=3)
+    cameras = Cameras.of_size(K, torch.eye(4)[None], width=5, height=3)
     rays = cameras.rays(torch.tensor([0]), torch.tensor([1]), torch.tensor([2]))
     assert rays.directions.tolist() == [[0, 0, 1]]
     right, below = cameras.view_rays(0).directions[[1 * 5 + 3, 2 * 5 + 2]]
@@ -44,7 +44,7 @@ def test_view_rays_go_row_by_row(cameras):
 
 @pytest.mark.parametrize(("width", "height"), [(14, 10), (3, 5), (70, 1), (7, 5)])
 def test_resizing_keeps_the_ray_of_every_place_in_the_picture(cameras, width, height):
-    small = cameras.resized(width, height)
+    small = cameras.resized((width, height))
     share = torch.rand(3, 2, dtype=torch.float64)
     before = pixel_to_ray(cameras.K, cameras.c2w, share * torch.tensor([7, 5]))
     after = pixel_to_ray(small.K, small.c2w, share * torch.tensor([width, height]))
@@ -54,8 +54,8 @@ def test_resizing_keeps_the_ray_of_every_place_in_the_picture(cameras, width, he
 
 
 def test_a_third_of_the_size_sees_what_the_middle_of_three_by_three_pixels_saw(cameras):
-    fine = replace(cameras, width=9, height=6)
-    coarse = fine.resized(3, 2).view_rays(0).directions.view(2, 3, 3)
+    fine = replace(cameras, sizes=torch.tensor([[9, 6]]).repeat(len(cameras), 1))
+    coarse = fine.resized((3, 2)).view_rays(0).directions.view(2, 3, 3)
     torch.testing.assert_close(coarse, fine.view_rays(0).directions.view(6, 9, 3)[1::3, 1::3])
 
 

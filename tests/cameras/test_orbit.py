@@ -91,7 +91,7 @@ def test_the_focus_does_not_depend_on_the_last_digits_of_the_axes():
 def test_an_orbit_like_cameras_all_around_is_theirs(elevation):
     centre, up = torch.tensor([1.0, 2.0, -0.5]), unit(0.6, 0.0, 0.8).float()
     K = torch.eye(3).repeat(12, 1, 1) * torch.arange(1.0, 13)[:, None, None]
-    cameras = Cameras(K, orbit_around(centre, up, 3.0, elevation, 12), 40, 30)
+    cameras = Cameras.of_size(K, orbit_around(centre, up, 3.0, elevation, 12), 40, 30)
     orbit = orbit_like(cameras, frames=5)
     offset = orbit.centres - centre
     assert len(orbit) == 5 and (orbit.width, orbit.height) == (40, 30)
@@ -105,7 +105,7 @@ def test_an_orbit_like_cameras_all_around_is_theirs(elevation):
 def test_an_orbit_like_cameras_on_one_side_stays_there(spread):
     centre = torch.tensor([1.0, 2.0, -0.5])
     c2w = inward(30, centre, spread)
-    orbit = orbit_like(Cameras(torch.eye(3).repeat(30, 1, 1), c2w, 4, 4), frames=8)
+    orbit = orbit_like(Cameras.of_size(torch.eye(3).repeat(30, 1, 1), c2w, 4, 4), frames=8)
     seen, shown = normalize(c2w[:, :3, 3] - centre, dim=-1), normalize(orbit.centres - centre, dim=-1)
     middle = normalize(seen.mean(0), dim=-1)
     assert (shown @ middle).min() > (seen @ middle).min()
@@ -116,7 +116,7 @@ def test_an_orbit_like_cameras_on_one_side_stays_there(spread):
 
 @pytest.mark.parametrize("frames", [1, 4])
 def test_an_orbit_like_a_single_camera_is_finite(frames):
-    one = Cameras(torch.eye(3)[None], inward(1, torch.zeros(3)), 4, 4)
+    one = Cameras.of_size(torch.eye(3)[None], inward(1, torch.zeros(3)), 4, 4)
     assert orbit_like(one, frames).c2w.isfinite().all()
 
 

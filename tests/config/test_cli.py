@@ -73,7 +73,7 @@ def test_photos_without_alpha_refuse_another_background(inside, tmp_path: Path):
     from nerf_lightning.dataset.scene import Scene, Views
 
     scene = bricks(size=16, train_views=4, val_views=1, cache="")
-    flat = [Views(v.images[..., :3].contiguous(), v.cameras) for v in (scene.train, scene.val)]
+    flat = [Views.of(v.images[..., :3].contiguous(), v.cameras) for v in (scene.train, scene.val)]
     save_npz(Scene("flat", "made", *flat, scene.orbit, scene.bounds), tmp_path / "flat.npz")
     code, _, err = inside("dataset=photos", "dataset.path=flat.npz", "renderer.background=white")
     assert code == 2

@@ -23,7 +23,7 @@ def ball_views(per_ring: int, elevations: tuple[float, ...] = (-0.6, 0.2, 0.9), 
     spin = torch.tensor([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     c2w = torch.cat([spin @ orbit_around(torch.zeros(3), up, 4.0, e, per_ring) for e in elevations])
     K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    cameras = Cameras(K.repeat(len(c2w), 1, 1), c2w, WIDTH, HEIGHT)
+    cameras = Cameras.of_size(K.repeat(len(c2w), 1, 1), c2w, WIDTH, HEIGHT)
     images = []
     for view in range(len(c2w)):
         rays = cameras.view_rays(view)
@@ -34,7 +34,7 @@ def ball_views(per_ring: int, elevations: tuple[float, ...] = (-0.6, 0.2, 0.9), 
         rgb = ((hit - CENTRE) / RADIUS * 0.5 + 0.5).clamp(0, 1) * 0.8 + 0.2
         rgba = torch.cat([rgb, torch.ones_like(along)[:, None]], dim=-1) * (under > 0)[:, None]
         images.append((rgba * 255).round().to(torch.uint8).view(HEIGHT, WIDTH, 4))
-    return Views(torch.stack(images), cameras)
+    return Views.of(torch.stack(images), cameras)
 
 
 @pytest.fixture(scope="session")

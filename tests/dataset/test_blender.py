@@ -111,10 +111,6 @@ def _write(name: str, content: bytes) -> Callable[[Path], None]:
     return lambda folder: (folder / name).write_bytes(content)
 
 
-def _resize(name: str, height: int, width: int) -> Callable[[Path], None]:
-    return lambda folder: imageio.imwrite(folder / name, np.zeros((height, width, 4), np.uint8))
-
-
 def _angle(value: object) -> Callable[[Path], None]:
     return _edit("val", lambda c: c.update(camera_angle_x=value))
 
@@ -152,12 +148,7 @@ DAMAGE = {
     "matrix scaled": (_matrix(np.diag([1.5, 1.5, 1.5, 1]).tolist()), [f"{MATRIX} R^T R", "scale"]),
     "matrix mirrored": (_matrix(np.diag([1.0, 1, -1, 1]).tolist()), [f"{MATRIX} a mirror", "handedness"]),
     "image missing": (_frame("file_path", "r_9"), ["frames[1].file_path: found 'r_9', which is not there"]),
-    "image size": (
-        _resize("train/r_1.png", 6, 7),
-        ["r_1.png: found 7x6 with 4 channels, expected 8x6 with 4 channels"],
-    ),
     "image text": (_write("train/r_0.png", b"no"), ["r_0.png: found 2 bytes that are no image"]),
-    "split sizes": (_resize("val/r_0.png", 5, 8), ["transforms_val.json: frames: found 8x5"]),
 }
 
 

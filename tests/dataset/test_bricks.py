@@ -147,7 +147,7 @@ def test_retracing_gives_the_remaining_distance(scene):
 
 
 def test_culling_changes_nothing(scene):
-    cameras = scene.val.cameras.resized(24, 24)
+    cameras = scene.val.cameras.resized((24, 24))
     for view in range(2):
         for fast, slow in zip(
             visible(bulldozer(), cameras, view), visible(bulldozer(), cameras, view, cull=False), strict=True
@@ -170,7 +170,7 @@ def test_pictures_agree_with_trace(scene):
     hit = same & (expected >= 0)
     np.testing.assert_allclose(depth.reshape(-1)[hit], along[hit], atol=1e-4)
     # The picture is the mean of nine rays a pixel, over those that hit.
-    rgb, hit, _ = trace(cameras.resized(120, 120).view_rays(2))
+    rgb, hit, _ = trace(cameras.resized((120, 120)).view_rays(2))
     rgb, hit = (x.reshape(40, 3, 40, 3, -1).float().transpose(1, 2).flatten(2, 3).sum(2) for x in (rgb, hit))
     expected = torch.cat([rgb / hit.clamp_min(1), hit / 9], dim=-1)
     error = (scene.train.images[2] / 255 - expected).abs().amax(-1)

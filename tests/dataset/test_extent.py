@@ -20,7 +20,7 @@ def views(ball_views_of: Callable[..., Views]) -> Views:
 def over(views: Views, background: int) -> Views:
     alpha = views.images[..., 3:].float() / 255
     rgb = views.images[..., :3] * alpha + background * (1 - alpha)
-    return replace(views, images=rgb.round().to(torch.uint8))
+    return Views.of(rgb.round().to(torch.uint8), views.cameras)
 
 
 def assert_snug(box: torch.Tensor, truth: torch.Tensor, slack: float) -> None:
@@ -57,7 +57,7 @@ def cube(half: float) -> torch.Tensor:
 
 def test_without_silhouettes_the_box_is_what_the_cameras_see(views: Views):
     noise = torch.randint(0, 256, (*views.images.shape[:3], 3), generator=torch.manual_seed(0)).to(torch.uint8)
-    bounds = estimate_bounds(replace(views, images=noise), BLACK)
+    bounds = estimate_bounds(Views.of(noise, views.cameras), BLACK)
     # Cameras 4 away from the origin, half of 48 pixels wide at a focal length of 60.
     torch.testing.assert_close(bounds.aabb, cube(4 * 24 / 60), atol=1e-4, rtol=0)
 
@@ -67,7 +67,7 @@ def test_another_flat_background_is_no_silhouette(views: Views):
 
 
 def test_nothing_kept_falls_back_to_the_cube(views: Views):
-    empty = replace(views, images=torch.zeros_like(views.images))
+    empty = replace(views, pixels=torch.zeros_like(views.pixels))
     torch.testing.assert_close(estimate_bounds(empty, BLACK).aabb, cube(1.6), atol=1e-4, rtol=0)
 
 
@@ -76,7 +76,7 @@ def test_one_spot_to_look_from_still_gives_a_box():
     c2w[:, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
     K = torch.tensor([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]).repeat(2, 1, 1)
     noise = torch.randint(0, 256, (2, 8, 8, 3), generator=torch.manual_seed(0)).to(torch.uint8)
-    box = estimate_bounds(Views(noise, Cameras(K, c2w, 8, 8)), BLACK).aabb
+    box = estimate_bounds(Views.of(noise, Cameras.of_size(K, c2w, 8, 8)), BLACK).aabb
     torch.testing.assert_close(box, torch.tensor([1.0, 2.0, 3.0]) + cube(0.5))
 
 

@@ -46,14 +46,14 @@ DAMAGE = {
     "centre text": (_top(cx="middle"), "cx: found 'middle'"),
     "distortion text": (_first(k1=[1]), "frames[0].k1: found [1]"),
     "distortion k4": (_top(k4=0.1), "k4: found 0.1"),
-    "fisheye": (_top(camera_model="OPENCV_FISHEYE"), "camera_model: found 'OPENCV_FISHEYE', expected a perspective"),
-    "fisheye frame": (_first(camera_model="EQUIRECTANGULAR"), "frames[0].camera_model: found 'EQUIRECTANGULAR'"),
-    "fisheye flag": (_top(is_fisheye=True), "camera_model: found is_fisheye"),
+    "lens of a frame": (_first(camera_model="EQUIRECTANGULAR"), "frames[0].camera_model: found 'EQUIRECTANGULAR'"),
+    "folded over": (_top(k1=-3.0), "k1, k2, k3, p1, p2: found a distortion that folds the photo over"),
+    "mask missing": (_first(mask_path="no.png"), "frames[0].mask_path: found 'no.png', which is not there"),
     "width": (_top(w=161), "w: found 161, expected 160, the size of 0000.png"),
     "height of a frame": (_first(h=1), "frames[0].h: found 1, expected 120"),
-    "image channels": (
-        lambda c: cv2.imwrite(str(c / "images/0004.png"), np.zeros((H, W, 4), np.uint8)),
-        "0004.png: found 160x120 with 4 channels",
+    "image size": (
+        lambda c: cv2.imwrite(str(c / "images/0004.png"), np.zeros((H, W + 9, 3), np.uint8)),
+        "w: found 160, expected 169, the size of 0004.png",
     ),
     "scaled pose": (
         _first(transform_matrix=(opengl_pose(0) * [2, 2, 2, 1]).tolist()),

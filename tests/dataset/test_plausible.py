@@ -87,7 +87,7 @@ def test_doubtful_scenes_are_warned_of(pile: Scene):
 
     images, poses = pile.val.images.clone(), pile.val.cameras.c2w.clone()
     images[1], poses[1] = pile.train.images[7], pile.train.cameras.c2w[7]
-    leaked = replace(pile, val=Views(images, replace(pile.val.cameras, c2w=poses)))
+    leaked = replace(pile, val=Views.of(images, replace(pile.val.cameras, c2w=poses)))
     (doubt,) = check_scene(leaked)
     assert "1 of 4 held-out photos are trained on as well" in doubt
 
@@ -113,10 +113,13 @@ def test_a_panorama_is_no_mistake(pile: Scene):
 
 
 def test_the_border_tells_the_background(pile: Scene, tmp_path: Path):
-    assert border_colour(pile.train.images) == (0.0, 0.0, 0.0)
-    assert border_colour(toy(PILE, WHITE, size=32).train.images) == WHITE
-    assert border_colour(toy(PILE, None, size=32).train.images) is None
-    assert border_colour(torch.randint(0, 255, (4, 16, 16, 3), dtype=torch.uint8)) is None
+    assert border_colour(pile.train) == (0.0, 0.0, 0.0)
+    assert border_colour(toy(PILE, WHITE, size=32).train) == WHITE
+    assert border_colour(toy(PILE, None, size=32).train) is None
+    assert (
+        border_colour(replace(pile.train, pixels=torch.randint(0, 255, pile.train.pixels.shape, dtype=torch.uint8)))
+        is None
+    )
 
     path = tmp_path / "white.npz"
     save_npz(toy(MARBLE, WHITE, size=32), path)

@@ -21,7 +21,7 @@ def labelled(count: int) -> Views:
     c2w = orbit_around(torch.zeros(3), torch.tensor([0.0, 0, 1]), 4.0, 0.3, count)
     K = torch.tensor([[7.0, 0, 3.2], [0, 8, 1.7], [0, 0, 1]]) * (1 + 0.1 * torch.arange(count)[:, None, None])
     K[:, 2, 2] = 1
-    return Views(images, Cameras(K, c2w, WIDTH, HEIGHT))
+    return Views.of(images, Cameras.of_size(K, c2w, WIDTH, HEIGHT))
 
 
 @pytest.fixture
@@ -145,6 +145,6 @@ def test_the_loader_asks_for_the_step_at_each_batch(scene: Scene):
 def test_photos_may_lie_in_memory_in_any_order(scene: Scene):
     """numpy files in Fortran order are read without a copy."""
     images = scene.train.images
-    turned = Views(images.permute(3, 2, 1, 0).contiguous().permute(3, 2, 1, 0), scene.train.cameras)
+    turned = Views.of(images.permute(3, 2, 1, 0).contiguous().permute(3, 2, 1, 0), scene.train.cameras)
     expected = draw_rays(scene.train, 50, torch.Generator().manual_seed(0))
     assert torch.equal(draw_rays(turned, 50, torch.Generator().manual_seed(0)).pixels, expected.pixels)

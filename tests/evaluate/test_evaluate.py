@@ -68,9 +68,9 @@ def test_means_are_of_what_could_be_told():
 def test_lpips_is_told_where_its_weights_are_and_nothing_is_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: None)
-    assert perceptual_distance(100, 100) == (None, "torchvision is not installed")
+    assert perceptual_distance() == (None, "torchvision is not installed")
     monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: name)
-    assert perceptual_distance(100, 100) == (None, f"{tmp_path}/checkpoints/alexnet-owt-7be5be79.pth is not there")
+    assert perceptual_distance() == (None, f"{tmp_path}/checkpoints/alexnet-owt-7be5be79.pth is not there")
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").write_bytes(b"")
     asked = {}
@@ -82,7 +82,7 @@ def test_lpips_is_told_where_its_weights_are_and_nothing_is_fetched(tmp_path: Pa
     monkeypatch.setattr(
         "torchmetrics.functional.image.learned_perceptual_image_patch_similarity", metric, raising=False
     )
-    distance, why = perceptual_distance(100, 80)
+    distance, why = perceptual_distance()
     assert distance is not None and why == ""
     assert distance(torch.ones(80, 100, 3), torch.zeros(80, 100, 3)) == 1.0
     assert asked == {"shape": (1, 3, 80, 100), "net": "alex", "normalize": True}, "pictures in [0, 1], channels first"

@@ -43,5 +43,5 @@ def ball_run(to_source: torch.Tensor) -> SceneRun:
     K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
     up = torch.tensor([0.0, 0.0, 1.0])
     poses = torch.cat([orbit_around(CENTRE, up, 3.0, elevation, 8) for elevation in (-0.6, 0.6)])
-    orbit = Cameras(K.repeat(16, 1, 1), poses, 32, 24)
+    orbit = Cameras.of_size(K.repeat(16, 1, 1), poses, 32, 24)
     return SceneRun(OmegaConf.create(), ball_system(), orbit, to_source, {})

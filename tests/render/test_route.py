@@ -18,7 +18,7 @@ K = torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]])
 
 
 def circle(frames: int = 12, elevation: float = 0.5) -> Cameras:
-    return Cameras(K.repeat(frames, 1, 1), orbit_around(CENTRE, UP, 3.0, elevation, frames), 16, 12)
+    return Cameras.of_size(K.repeat(frames, 1, 1), orbit_around(CENTRE, UP, 3.0, elevation, frames), 16, 12)
 
 
 def test_more_frames_stand_between_those_of_the_path():

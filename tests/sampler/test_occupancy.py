@@ -181,7 +181,7 @@ def test_what_too_few_cameras_have_in_view_stays_empty():
     c2w = look_at(eyes, targets, torch.tensor([0.0, 0, 1]))
     K = torch.tensor([[80.0, 0, 8], [0, 80, 8], [0, 0, 1]]).repeat(4, 1, 1)  # a beam of 0.4 at a distance of 4
     sampler = OccupancySampler(CUBE, samples=100, resolution=16, seen_by=3)
-    sampler.look_through(Cameras(K, c2w, 16, 16))
+    sampler.look_through(Cameras.of_size(K, c2w, 16, 16))
     sampler.update(0, lambda x: torch.full((len(x),), 10.0), seeded())
     grid = sampler.occupied.view(16, 16, 16)
     assert grid[:, 8, 8].all() and grid[2, 8, 8] and not grid[8, 0, 8] and not grid[8, 8, 0]
@@ -191,7 +191,7 @@ def test_what_too_few_cameras_have_in_view_stays_empty():
     found = sampler(along_y, lambda x: torch.full((len(x),), 1e-3)).positions(along_y)
     assert len(found) and found[:, 1].abs().max() < 0.7
     near = OccupancySampler(replace(CUBE, near=4.0), samples=100, resolution=16, seen_by=3)
-    near.look_through(Cameras(K, c2w, 16, 16))
+    near.look_through(Cameras.of_size(K, c2w, 16, 16))
     assert not near.allowed.view(16, 16, 16)[2, 8, 8], "nearer than rays begin"
 
 
@@ -199,8 +199,8 @@ def test_few_cameras_allow_what_all_of_them_see():
     K = torch.tensor([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])[None]
     c2w = look_at(torch.tensor([[-4.0, 0, 0]]), torch.zeros(1, 3), torch.tensor([0.0, 0, 1]))
     sampler = OccupancySampler(CUBE, resolution=8, seen_by=3)
-    sampler.look_through(Cameras(K, c2w, 16, 16))
+    sampler.look_through(Cameras.of_size(K, c2w, 16, 16))
     assert sampler.allowed.all()
     away = look_at(torch.tensor([[-4.0, 0, 0]]), torch.tensor([[-9.0, 0, 0]]), torch.tensor([0.0, 0, 1]))
-    sampler.look_through(Cameras(K, away, 16, 16))
+    sampler.look_through(Cameras.of_size(K, away, 16, 16))
     assert sampler.allowed.all(), "a view of nothing must not leave nothing to train"

@@ -72,7 +72,7 @@ def slab_view(alpha: int) -> ViewBatch:
     K = torch.tensor([[[40.0, 0, 8], [0, 40, 6], [0, 0, 1]]])
     c2w = torch.eye(4)[None].clone()
     c2w[0, 2, 3] = -3
-    cameras = Cameras(K, c2w, 16, 12)
+    cameras = Cameras.of_size(K, c2w, 16, 12)
     image = torch.tensor([0, 0, 255, alpha]).repeat(12, 16, 1)
     image[:, 8:] = torch.tensor([255, 0, 0, 255])
     return ViewBatch(cameras.view_rays(0), image.to(torch.uint8).flatten(0, 1), 12, 16)

@@ -43,7 +43,7 @@ def test_frusta_stand_where_the_cameras_are(scene: Scene):
 @pytest.mark.parametrize("channels", [3, 4])
 def test_a_photo_stays_in_place_when_the_optical_axis_is_not_its_middle(scene: Scene, channels: int):
     """Every pixel of the photo lies in the pyramid's base where the camera's own K puts it."""
-    views = off_centre(Views(scene.train.images[..., :channels].contiguous(), scene.train.cameras))
+    views = off_centre(Views.of(scene.train.images[..., :channels].contiguous(), scene.train.cameras))
     frustum = next(frusta(views, "training", 16))
     h, w, _ = frustum.photo.shape
     assert (h, w) == (16 + 8, 16 + 4)

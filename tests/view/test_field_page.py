@@ -28,7 +28,7 @@ BLUE = (0.0, 0.0, 1.0)
 
 def orbit() -> Cameras:
     K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
-    return Cameras(K.repeat(4, 1, 1), orbit_around(CENTRE, UP, 3.0, 0.3, 4), 32, 24)
+    return Cameras.of_size(K.repeat(4, 1, 1), orbit_around(CENTRE, UP, 3.0, 0.3, 4), 32, 24)
 
 
 def wish(**changes: Any) -> Wish:

@@ -17,7 +17,8 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras, look_at, orbit_around
 from nerf_lightning.dataset.bricks.model import bulldozer
 from nerf_lightning.dataset.bricks.trace import picture, shadow
-from nerf_lightning.dataset.scene import BUILT_IN, Scene, Views
+from nerf_lightning.dataset.scene import BUILT_IN, Scene
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic
 
@@ -64,8 +65,8 @@ def bricks(
     return Scene(
         name="bricks",
         source=BUILT_IN,
-        train=Views(torch.from_numpy(images[0]), train),
-        val=Views(torch.from_numpy(images[1]), val),
+        train=Views.of(torch.from_numpy(images[0]), train),
+        val=Views.of(torch.from_numpy(images[1]), val),
         orbit=orbit,
         bounds=Bounds(centre + 1.02 * (aabb - centre)),
         background=(0.0, 0.0, 0.0),
@@ -75,7 +76,7 @@ def bricks(
 def _cameras(c2w: Float[Tensor, "V 4 4"], size: int) -> Cameras:
     focal = 0.5 * size / math.tan(0.5 * FIELD_OF_VIEW)
     K = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-    return Cameras(K.repeat(len(c2w), 1, 1), c2w, size, size)
+    return Cameras.of_size(K.repeat(len(c2w), 1, 1), c2w, size, size)
 
 
 def _hemisphere(index: Tensor) -> Float[Tensor, "V 4 4"]:

@@ -169,7 +169,7 @@ def shadow() -> Lit:
     focal = SHADOW_SIZE / 2 * float(np.sqrt(LIGHT @ LIGHT - reach**2)) / reach
     centre = SHADOW_SIZE / 2
     K = torch.tensor([[focal, 0, centre], [0, focal, centre], [0, 0, 1]])
-    first, depth = visible(solids, Cameras(K[None], c2w[None], SHADOW_SIZE, SHADOW_SIZE), 0)
+    first, depth = visible(solids, Cameras.of_size(K[None], c2w[None], SHADOW_SIZE, SHADOW_SIZE), 0)
     rotation = c2w[:3, :3].numpy()
 
     def lit(solid: Int[np.ndarray, "N"], points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
@@ -187,7 +187,7 @@ def picture(cameras: Cameras, view: int) -> UInt8[np.ndarray, "H W 4"]:
     """One view of the bulldozer: sRGB and straight alpha, each pixel the mean of a grid of samples."""
     solids, n = bulldozer(), SUPERSAMPLING
     width, height = cameras.width, cameras.height
-    fine = cameras.resized(width * n, height * n)
+    fine = cameras.scaled(n)
     solid, depth = (x.reshape(-1) for x in visible(solids, fine, view))
     hit = np.flatnonzero(solid >= 0)
     K, c2w = fine.K[view].numpy(), fine.c2w[view].numpy()

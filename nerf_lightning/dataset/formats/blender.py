@@ -3,16 +3,15 @@
 import math
 from pathlib import Path
 
-import numpy as np
-import torch
-
-from nerf_lightning.cameras import Cameras, orbit_like
+from nerf_lightning.cameras import orbit_like
 from nerf_lightning.dataset.extent import estimate_bounds
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.conventions import opengl_to_opencv
-from nerf_lightning.dataset.formats.decode import find_image, read_images
-from nerf_lightning.dataset.resize import area_resize, fit_size
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.formats.decode import find_image, image_header
+from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.shots import Reading, Shot, read_shots
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
 WHITE = (1.0, 1.0, 1.0)
@@ -30,14 +29,13 @@ def load_blender(folder: Path, name: str | None = None, resize: int | None = Non
         resize: longest side in pixels after averaging, if smaller than the renders.
 
     Raises:
-        InputError: anything missing, malformed or of unequal size.
+        InputError: anything missing or malformed.
     """
     files = [folder / f"transforms_{split}.json" for split in ("train", "val", "test")]
     held_out = next((file for file in files[1:] if file.is_file()), None)
     if held_out is None:
         raise InputError(folder, "", "no transforms_val.json or transforms_test.json", "held-out views in one of them")
     train, val = _load_split(files[0], resize), _load_split(held_out, resize)
-    checks.image_size(held_out, "frames", val.images.numpy(), tuple(train.images.shape[1:]))
     return Scene(
         name=name or folder.resolve().name.lower(),
         source=str(folder),
@@ -56,18 +54,11 @@ def _load_split(path: Path, resize: int | None) -> Views:
     if angle >= math.pi:
         raise InputError(path, "camera_angle_x", f"{angle:g}", "radians below pi")
     names, poses = checks.json_frames(path, content)
-    files = []
-    for i, file_path in enumerate(names):
+    shots = []
+    for i, (file_path, c2w) in enumerate(zip(names, opengl_to_opencv(poses), strict=True)):
         if (file := find_image(path.parent, file_path)) is None:
             raise InputError(path, f"frames[{i}].file_path", f"{file_path!r}, which is not there", "an image file")
-        files.append(file)
-
-    def shrink(index: int, image: np.ndarray) -> np.ndarray:
-        return area_resize(image, *fit_size(image.shape[1], image.shape[0], resize))
-
-    images = read_images(files, shrink)
-    height, width = images.shape[1:3]
-    focal = 0.5 * width / math.tan(0.5 * angle)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
-    c2w = torch.from_numpy(opengl_to_opencv(poses)).float()
-    return Views(torch.from_numpy(images), Cameras(K.repeat(len(c2w), 1, 1), c2w, width, height))
+        width, height, _ = image_header(file)
+        focal = 0.5 * width / math.tan(0.5 * angle)
+        shots.append(Shot(file_path, file, c2w, Optics(width, height, focal, focal, width / 2, height / 2)))
+    return read_shots(path, shots, Reading(resize))

@@ -3,19 +3,21 @@
 OpenCV rather than Pillow, which cuts 16-bit colour to its high byte and cannot open TIFFs of floats to say so.
 """
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt8
+from PIL import Image, UnidentifiedImageError
 
-from nerf_lightning.dataset.formats.checks import existing_file, image_size
+from nerf_lightning.dataset.formats.checks import existing_file
 from nerf_lightning.errors import InputError
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 THREADS = 4
+ORIENTATION, QUARTER_TURNS = 0x0112, (5, 6, 7, 8)
+"""EXIF's tag for how the camera was held, and its values for photos that lie on their side."""
 
 
 def find_image(folder: Path, file_path: str) -> Path | None:
@@ -53,22 +55,26 @@ def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]
     return _rgb8(path, raw)
 
 
-def read_images(
-    paths: Sequence[Path], process: Callable[[int, UInt8[np.ndarray, "H W C"]], UInt8[np.ndarray, "h w C"]]
-) -> UInt8[np.ndarray, "V h w C"]:
-    """Decodes posed photos of one size and stacks what `process(index, image)` makes of each.
+def image_header(path: Path, upright: bool = False) -> tuple[int, int, bool]:
+    """Width, height, and whether there is alpha, from the file's header alone where Pillow knows it.
 
-    In threads: OpenCV releases the interpreter lock, and few full-size photos are in memory at a time.
+    Args:
+        path, upright: see `read_pixels`.
+
+    Raises:
+        InputError: see `read_pixels`.
     """
-    size = read_pixels(paths[0]).shape
-
-    def read(index: int) -> UInt8[np.ndarray, "h w C"]:
-        image = read_pixels(paths[index])
-        image_size(paths[index], "", image, size)
-        return process(index, image)
-
-    with ThreadPoolExecutor(THREADS) as pool:
-        return np.stack(list(pool.map(read, range(len(paths)))))
+    existing_file(path)
+    try:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore")  # of sizes: nothing is decoded here
+            alpha = "A" in image.getbands() or "transparency" in image.info
+            turned = upright and not alpha and image.getexif().get(ORIENTATION, 1) in QUARTER_TURNS
+            width, height = image.size
+            return (height, width, alpha) if turned else (width, height, alpha)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, UnidentifiedImageError):
+        shape = read_pixels(path, upright).shape  # says what is wrong
+        return shape[1], shape[0], shape[2] == 4
 
 
 def _rgb8(path: Path, raw: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "H W C"]:

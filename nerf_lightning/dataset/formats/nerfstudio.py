@@ -2,27 +2,27 @@
 
 import logging
 import math
-from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from jaxtyping import Float, UInt8
-from torch import Tensor
+from jaxtyping import Float
 
-from nerf_lightning.cameras import Bounds, Cameras, focus_point, orbit_like
-from nerf_lightning.dataset.extent import estimate_bounds, viewing_distance
+from nerf_lightning.cameras import Distortion
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.conventions import opengl_to_opencv
-from nerf_lightning.dataset.formats.decode import find_image, read_images, read_pixels
-from nerf_lightning.dataset.lens import Lens, rectify
-from nerf_lightning.dataset.resize import area_resize, fit_size
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.formats.decode import find_image, image_header
+from nerf_lightning.dataset.masks import find_masks
+from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.dataset.posed import scene_of
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
 from nerf_lightning.errors import InputError
 
-BLACK = (0.0, 0.0, 0.0)
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
+LEFT_OUT = ("depth_file_path", "normal_file_path", "semantics_path")
+"""Keys of frames that other programs read."""
 
 log = logging.getLogger(__name__)
 
@@ -37,61 +37,49 @@ class Frame(NamedTuple):
     """OpenCV, the file's world frame and unit."""
 
 
-def load_nerfstudio(path: Path, name: str | None = None, resize: int | None = None, holdout: int = 10) -> Scene:
-    """Reads a posed capture: OpenGL camera-to-world poses, converted to OpenCV here; lens distortion undone.
-
-    The world is moved to what the training cameras look at and scaled so that their median distance to it is 1; its
-    axes keep the file's directions (up is whatever it was). `to_source` leads back. Photos with alpha give a bounded
-    scene; those without an unbounded one around the cube [-1, 1]^3.
+def load_nerfstudio(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -> Scene:
+    """Reads a posed capture: OpenGL camera-to-world poses, converted to OpenCV here.
 
     Frames whose photo is not there are left out with a warning, as instant-ngp does (its own fox is shipped so), unless
-    they are the majority: then the path is wrong.
+    they are the majority: then the path is wrong. A frame's `mask_path` is its mask; without any, see `find_masks`.
 
     Args:
         path: transforms.json or the folder that holds it.
         name: defaults to the folder's name, or the file's if that is not transforms.json.
-        resize: longest side in pixels after averaging, if smaller than the photos.
-        holdout: N to hold out every N-th frame, sorted by file_path, unless the file names its own split.
+        reading: see there; frames are sorted by file_path, and the file may name its own split.
 
     Raises:
-        InputError: anything missing, malformed, of unequal size, or a lens that is not a perspective one.
+        InputError: anything missing or malformed, or a lens that is not known here.
     """
     file = path / "transforms.json" if path.is_dir() else path
     content = checks.read_json(file)
     frames = _frames(file, content)
-    train, val = _split(file, content, frames, holdout)
-
-    height, width = read_pixels(frames[0].image).shape[:2]
-    lenses = [_lens(file, content, frame, width, height) for frame in frames]
-    # A capture has one lens, or one for each photo: keep the maps of a few, not of hundreds.
-    undistort = lru_cache(maxsize=4)(rectify)
-    new_width, new_height = fit_size(width, height, resize)
-
-    def process(index: int, image: UInt8[np.ndarray, "H W C"]) -> UInt8[np.ndarray, "h w C"]:
-        return area_resize(undistort(lenses[index]).apply(image), new_width, new_height)
-
-    K = torch.from_numpy(np.stack([undistort(lens).K for lens in lenses])).float()
-    if not (torch.isfinite(K).all() and (K[:, [0, 1], [0, 1]] > 0).all()):
-        raise InputError(file, "k1, k2, k3, p1, p2", "a distortion that folds the photo over", "that of a real lens")
-    c2w = torch.from_numpy(np.stack([frame.c2w for frame in frames])).float()
-    c2w, to_source = _normalised(c2w, c2w[train])
-    cameras = Cameras(K, c2w, width, height).resized(new_width, new_height)
-    views = Views(torch.from_numpy(read_images([frame.image for frame in frames], process)), cameras)
-    train_views, val_views = views[torch.tensor(train)], views[torch.tensor(val)]
-    bounds = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), unbounded=True)
-    if views.images.shape[3] == 4:
-        bounds = estimate_bounds(train_views, BLACK)
+    optics = [_optics(file, content, frame, *image_header(frame.image)[:2]) for frame in frames]
+    for key in LEFT_OUT:
+        if any(key in frame.entry for frame in frames):
+            log.warning("%s: %s is not used", file, key)
     folder = file.resolve().parent
-    return Scene(
-        name=name or (folder.name if file.stem == "transforms" else file.stem).lower(),
-        source=str(path),
-        train=train_views,
-        val=val_views,
-        orbit=orbit_like(train_views.cameras),
-        bounds=bounds,
-        background=BLACK,
-        to_source=to_source,
-    )
+    named = [_mask(file, frame) for frame in frames]
+    masks = named if any(named) else find_masks([frame.image for frame in frames], folder)
+    shots = [
+        Shot(frame.name, frame.image, frame.c2w, one, mask)
+        for frame, one, mask in zip(frames, optics, masks, strict=True)
+    ]
+    split = _split(file, content, frames, reading.holdout)
+    return scene_of(path, name or (folder.name if file.stem == "transforms" else file.stem), shots, reading, split)
+
+
+def _mask(file: Path, frame: Frame) -> Path | None:
+    """The mask that a frame names."""
+    name = frame.entry.get("mask_path")
+    if name is None:
+        return None
+    key = f"{frame.key}.mask_path"
+    if not isinstance(name, str):
+        raise InputError(file, key, repr(name)[:60], "a string")
+    if (mask := find_image(file.parent, name)) is None:
+        raise InputError(file, key, f"{name!r}, which is not there", "a picture, white where the photo is kept")
+    return mask
 
 
 def _frames(file: Path, content: dict) -> list[Frame]:
@@ -115,8 +103,6 @@ def _frames(file: Path, content: dict) -> list[Frame]:
 
 def _split(file: Path, content: dict, frames: list[Frame], holdout: int) -> tuple[list[int], list[int]]:
     """Indices of training and held-out frames: as the file says, or every `holdout`-th held out."""
-    if holdout < 2:
-        raise InputError("holdout", "", str(holdout), "2 or more: every N-th photo is held out")
     held_key = "val_filenames" if "val_filenames" in content else "test_filenames"
     named = {}
     everything = {entry.get("file_path") for entry in content["frames"]}
@@ -146,7 +132,7 @@ def _split(file: Path, content: dict, frames: list[Frame], holdout: int) -> tupl
     return train, val
 
 
-def _lens(file: Path, content: dict, frame: Frame, width: int, height: int) -> Lens:
+def _optics(file: Path, content: dict, frame: Frame, width: int, height: int) -> Optics:
     """Intrinsics of one frame: its own entries first, then the file's."""
 
     def key_of(key: str) -> str:
@@ -157,13 +143,14 @@ def _lens(file: Path, content: dict, frame: Frame, width: int, height: int) -> L
         return default if value is None else checks.number(file, key_of(key), value)
 
     model = frame.entry.get("camera_model", content.get("camera_model", "OPENCV"))
-    if model not in PERSPECTIVE or content.get("is_fisheye"):
-        found = repr(model) if model not in PERSPECTIVE else "is_fisheye"
-        raise InputError(file, key_of("camera_model"), found, f"a perspective lens: {', '.join(PERSPECTIVE)}")
-    for key in ("k4", "k5", "k6"):
+    if model not in (*PERSPECTIVE, *FISHEYE):
+        expected = f"one of {', '.join((*PERSPECTIVE, *FISHEYE))}"
+        raise InputError(file, key_of("camera_model"), repr(model), expected)
+    fisheye = model in FISHEYE or bool(frame.entry.get("is_fisheye", content.get("is_fisheye", False)))
+    for key in ("k5", "k6") if fisheye else ("k4", "k5", "k6"):
         if number(key, 0.0):
-            found = f"{number(key):g}"
-            raise InputError(file, key_of(key), found, "at most k1, k2, k3, p1, p2", "calibrate with these")
+            expected = "at most k1, k2, k3, k4" if fisheye else "at most k1, k2, k3, p1, p2"
+            raise InputError(file, key_of(key), f"{number(key):g}", expected, "calibrate with these")
     for key, size in (("w", width), ("h", height)):
         if number(key, float(size)) != size:
             raise InputError(file, key_of(key), f"{number(key):g}", f"{size}, the size of {frame.image.name}")
@@ -175,7 +162,7 @@ def _lens(file: Path, content: dict, frame: Frame, width: int, height: int) -> L
             return None
         if not 0 < angle < math.pi:
             raise InputError(file, key_of(angle_key), f"{angle:g}", "radians between 0 and pi")
-        return 0.5 * size / math.tan(0.5 * angle)
+        return 0.5 * size / (0.5 * angle if fisheye else math.tan(0.5 * angle))
 
     fx = focal("fl_x", "camera_angle_x", width)
     if fx is None:
@@ -183,20 +170,11 @@ def _lens(file: Path, content: dict, frame: Frame, width: int, height: int) -> L
         raise InputError(file, key_of("fl_x"), found, "fl_x in pixels or camera_angle_x in radians")
     fy = focal("fl_y", "camera_angle_y", height) or fx
     # `number` gives None only where the default is None.
-    distortion = tuple(number(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2")
+    distortion = Distortion(**{key: number(key, 0.0) for key in names})  # type: ignore[arg-type]
     centre = number("cx", width / 2), number("cy", height / 2)
-    return Lens(width, height, fx, fy, *centre, distortion)  # type: ignore[arg-type]
-
-
-def _normalised(
-    c2w: Float[Tensor, "V 4 4"], train: Float[Tensor, "T 4 4"]
-) -> tuple[Float[Tensor, "V 4 4"], Float[Tensor, "4 4"]]:
-    """Poses in a frame centred on what `train` looks at, median distance 1, and the similarity back."""
-    centre = focus_point(train)
-    scale = viewing_distance(train, centre)
-    moved = c2w.clone()
-    moved[:, :3, 3] = (c2w[:, :3, 3] - centre) / scale
-    to_source = torch.eye(4)
-    to_source[:3, :3] *= scale
-    to_source[:3, 3] = centre
-    return moved, to_source
+    optics = Optics(width, height, fx, fy, *centre, distortion, fisheye)  # type: ignore[arg-type]
+    if not optics.sees_every_pixel():
+        expected = "that of a real lens"
+        raise InputError(file, ", ".join(map(key_of, names)), "a distortion that folds the photo over", expected)
+    return optics

@@ -11,7 +11,8 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras, orbit_like
 from nerf_lightning.dataset.extent import border_colour, estimate_bounds
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.scene import Scene, Views
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic
 
@@ -48,13 +49,13 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
 
     def cameras(key: str) -> Cameras:
         c2w = torch.from_numpy(checks.rigid_poses(path, key + "[{}]", data[key])).float()
-        return Cameras(torch.from_numpy(K).float().repeat(len(c2w), 1, 1), c2w, width, height)
+        return Cameras.of_size(torch.from_numpy(K).float().repeat(len(c2w), 1, 1), c2w, width, height)
 
     def views(split: str) -> Views:
         key, poses = f"images_{split}", f"c2ws_{split}"
         checks.split_size(path, key, len(images[key]), len(np.atleast_1d(data[poses])))
         checks.image_size(path, key, images[key], size)
-        return Views(torch.from_numpy(images[key]), cameras(poses))
+        return Views.of(torch.from_numpy(images[key]), cameras(poses))
 
     train, val = views("train"), views("val")
     orbit = orbit_like(train.cameras)
@@ -62,7 +63,7 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
         orbit = cameras("c2ws_test")
         checks.split_size(path, "c2ws_test", len(orbit))
 
-    background = border_colour(train.images) or (0.0, 0.0, 0.0)
+    background = border_colour(train) or (0.0, 0.0, 0.0)
     if "background" in data:
         red, green, blue = checks.numeric(path, "background", data["background"], "3").tolist()
         background = (red, green, blue)

@@ -1,0 +1,134 @@
+"""Lens models: from directions to places in a photo, and back."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
+
+NEWTON = 8
+"""Steps of Newton's method that undo a distortion; real lenses need three or four for single precision."""
+NEVER = 1e-7
+
+
+class Distortion(NamedTuple):
+    """The names of the columns of `Lenses.coefficients`."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    """Radial: 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, divided by 1 + d1 r^2 + d2 r^4 + d3 r^6."""
+    d1: float = 0.0
+    d2: float = 0.0
+    d3: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    """Tangential."""
+    s1: float = 0.0
+    s2: float = 0.0
+    """Thin prism: s1 r^2 to the right, s2 r^2 down."""
+
+
+@dataclass(frozen=True)
+class Lenses:
+    """The distortion of V views, in OpenCV's and COLMAP's terms.
+
+    A direction (x, y, z) in the camera frame has the flat coordinates (x/z, y/z); with a fisheye lens those times
+    theta / tan(theta), where theta is the angle to the optical axis. The distortion moves them; K makes pixels of them.
+    """
+
+    coefficients: Float[Tensor, "V 11"]
+    """See `Distortion`."""
+    fisheye: Bool[Tensor, "V"]
+
+    def __getitem__(self, index: slice | Tensor) -> "Lenses":
+        return Lenses(self.coefficients[index], self.fisheye[index])
+
+    def to(self, device: torch.device | str) -> "Lenses":
+        return Lenses(self.coefficients.to(device), self.fisheye.to(device))
+
+
+def distort(
+    flat: Float[Tensor, "N 2"], coefficients: Float[Tensor, "#N 11"]
+) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2 2"]]:
+    """Moves flat coordinates as a lens does.
+
+    OpenCV's model of a camera (calib3d, "Detailed Description") without k4 to k6 of the same name, which are d1 to d3 here;
+    a fisheye lens is the same polynomial in theta.
+
+    Returns:
+        Where they come to lie, and the Jacobian of that.
+    """
+    k1, k2, k3, k4, d1, d2, d3, p1, p2, s1, s2 = coefficients.unbind(1)
+    x, y = flat.unbind(1)
+    r2 = x * x + y * y
+    above = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    below = 1 + r2 * (d1 + r2 * (d2 + r2 * d3))
+    radial = above / below
+    slope = (k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4)) - radial * (d1 + r2 * (2 * d2 + r2 * 3 * d3))) / below
+    xy = 2 * x * y
+    moved = torch.stack(
+        [
+            x * radial + p1 * xy + p2 * (r2 + 2 * x * x) + s1 * r2,
+            y * radial + p1 * (r2 + 2 * y * y) + p2 * xy + s2 * r2,
+        ],
+        dim=1,
+    )
+    cross = xy * slope + 2 * (p1 * x + p2 * y)
+    jacobian = torch.stack(
+        [
+            torch.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x + 2 * s1 * x, cross + 2 * s1 * y], dim=1),
+            torch.stack([cross + 2 * s2 * x, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x + 2 * s2 * y], dim=1),
+        ],
+        dim=1,
+    )
+    return moved, jacobian
+
+
+def undistort(
+    seen: Float[Tensor, "N 2"],
+    coefficients: Float[Tensor, "#N 11"],
+    start: Float[Tensor, "N 2"] | None = None,
+    steps: int = NEWTON,
+) -> Float[Tensor, "N 2"]:
+    """The inverse of `distort`, by Newton's method.
+
+    Args:
+        seen: where the flat coordinates came to lie.
+        coefficients: see `Lenses`.
+        start: guesses; None starts from `seen`.
+        steps: of Newton's method.
+    """
+    flat = seen if start is None else start
+    for _ in range(steps):
+        moved, jacobian = distort(flat, coefficients)
+        (a, b), (c, d) = (row.unbind(1) for row in jacobian.unbind(1))
+        determinant = a * d - b * c
+        determinant = torch.where(determinant.abs() < NEVER, NEVER, determinant)
+        u, v = (seen - moved).unbind(1)
+        flat = flat + torch.stack([d * u - b * v, a * v - c * u], dim=1) / determinant[:, None]
+    return flat
+
+
+def to_directions(flat: Float[Tensor, "N 2"], fisheye: Bool[Tensor, "#N"]) -> Float[Tensor, "N 3"]:
+    """Directions of any length, camera frame, with some flat coordinates."""
+    theta = flat.norm(dim=1)
+    bent = torch.sinc(theta / torch.pi)  # sin(theta) / theta
+    across = torch.where(fisheye, bent, 1.0)[:, None] * flat
+    return torch.cat([across, torch.where(fisheye, theta.cos(), 1.0)[:, None]], dim=1)
+
+
+def to_flat(directions: Float[Tensor, "N 3"], fisheye: Bool[Tensor, "#N"]) -> Float[Tensor, "N 2"]:
+    """The inverse of `to_directions`; of no use for directions that a lens without fisheye does not see (z <= 0)."""
+    across, ahead = directions[:, :2], directions[:, 2]
+    beside = across.norm(dim=1)
+    bent = torch.atan2(beside, ahead) / beside.clamp_min(NEVER)
+    straight = 1 / torch.where(ahead.abs() < NEVER, NEVER, ahead)
+    return across * torch.where(fisheye, bent, straight)[:, None]
+
+
+def per_view(values: Shaped[Tensor, "V *rest"], view: Shaped[Tensor, "N"] | int) -> Shaped[Tensor, "N *rest"]:
+    """The values of each ray's view, or of one."""
+    return values[view : view + 1] if isinstance(view, int) else values[view]

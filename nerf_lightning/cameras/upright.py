@@ -1,0 +1,62 @@
+"""Which way is up, from how the cameras were held."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+LEVEL = 0.005
+"""Weight of the photos' mean up direction against their level axes: decides only where all cameras look the same way."""
+
+
+def image_axes(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 3"]:
+    """The four directions that may be up in each photo: its top, right, bottom and left, world frame."""
+    right, down = c2w[:, :3, 0], c2w[:, :3, 1]
+    return torch.stack([-down, right, down, -right], dim=1)
+
+
+def held(c2w: Float[Tensor, "V 4 4"]) -> tuple[Float[Tensor, "3"], Int[Tensor, "V"]]:
+    """Up, and which side of each photo is its top.
+
+    Photos are taken level, upright or on their side. All around a subject, the mean of the sides that are up is long, that of
+    the others short. Up is then the direction most nearly perpendicular to the photos' level axes.
+
+    Returns:
+        Unit vector, world frame; 0 to 3 for a photo whose top, right, bottom or left side is up.
+    """
+    axes = image_axes(c2w.double())
+    means = axes.mean(0)
+    sideways = bool(means[1].norm() > means[0].norm() + 0.1)
+    up = torch.nn.functional.normalize(means[1 if sideways else 0], dim=0)
+    slope = float((c2w[:, :3, 2].double() @ up).mean())
+    # Which side of a photo that lies on its side is up it does not tell; people look down at what they photograph.
+    if sideways and slope > 0:
+        up = -up
+    for _ in range(3):
+        side = (axes @ up).argmax(1)
+        pick = torch.arange(len(axes), device=axes.device)
+        mean = torch.nn.functional.normalize(axes[pick, side].mean(0), dim=0)
+        level = axes[pick, (side + 1) % 4]
+        eye = torch.eye(3, dtype=axes.dtype, device=axes.device)
+        spread = level.mT @ level / len(level) + LEVEL * (eye - mean[:, None] * mean)
+        found = torch.linalg.eigh(spread).eigenvectors[:, 0]
+        up = found if float(found @ mean) >= 0 else -found
+    return up.to(c2w.dtype), side
+
+
+def turn_upright(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The smallest rotation that takes `up`, a unit vector, to (0, 0, 1) (Rodrigues' formula)."""
+    dtype, up = up.dtype, up.double()
+    axis = torch.stack([up[1], -up[0], torch.zeros_like(up[0])])  # up x z
+    cosine = up[2]
+    if float(cosine) < -1 + 1e-9:
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=dtype, device=up.device))
+    zero = torch.zeros_like(cosine)
+    cross = torch.stack(
+        [
+            torch.stack([zero, -axis[2], axis[1]]),
+            torch.stack([axis[2], zero, -axis[0]]),
+            torch.stack([-axis[1], axis[0], zero]),
+        ]
+    )
+    eye = torch.eye(3, dtype=torch.float64, device=up.device)
+    return (eye + cross + cross @ cross / (1 + cosine)).to(dtype)

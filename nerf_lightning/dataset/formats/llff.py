@@ -1,0 +1,85 @@
+"""The LLFF format (Mildenhall et al. 2019): poses_bounds.npy beside a folder of photos."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from nerf_lightning.dataset.formats import checks
+from nerf_lightning.dataset.formats.decode import EXTENSIONS, image_header
+from nerf_lightning.dataset.masks import find_masks
+from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.dataset.posed import scene_of
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
+from nerf_lightning.errors import InputError
+
+POSES = "poses_bounds.npy"
+
+
+def load_llff(folder: Path, name: str | None = None, reading: Reading = AS_IT_IS) -> Scene:
+    """Reads poses_bounds.npy and the photos beside it, in the order of their names.
+
+    A row holds a pose of 3 x 5 numbers (rotation with columns down, right, backward; centre; height, width and focal length in
+    pixels), then the nearest and farthest depth.
+
+    Args:
+        folder: holds poses_bounds.npy and `images`, or photos of another size in `images_2`, `images_4` or `images_8`.
+        name: defaults to the folder's name.
+        reading: see there.
+
+    Raises:
+        InputError: a damaged file, or as many photos as poses are not there.
+    """
+    path = folder / POSES
+    c2w, sizes = _rows(path)
+    photos = _photos(folder, len(c2w))
+    masks = find_masks(photos, folder)
+    shots = []
+    for photo, mask, pose, (height, width, focal) in zip(photos, masks, c2w, sizes.tolist(), strict=True):
+        wide, high, _ = image_header(photo)
+        focal *= wide / width
+        if abs(high * width / wide - height) > 1.5 * max(1, width / wide):
+            found = f"{wide}x{high} pixels"
+            raise InputError(photo, "", found, f"{width:g}x{height:g} as in {POSES}, or the same reduced")
+        optics = Optics(wide, high, focal, focal, wide / 2, high / 2)
+        shots.append(Shot(photo.name, photo, pose, optics, mask))
+    return scene_of(folder, name or folder.resolve().name, shots, reading)
+
+
+def _rows(path: Path) -> tuple[Float[np.ndarray, "V 4 4"], Float[np.ndarray, "V 3"]]:
+    """Poses, OpenCV camera to world, and height, width and focal length."""
+    checks.existing_file(path)
+    try:
+        with path.open("rb") as file:
+            rows = np.load(file, allow_pickle=False)
+    except checks.UNREADABLE as error:
+        found = f"something unreadable ({type(error).__name__}: {error})"
+        raise InputError(path, "", found, "an .npy array of numbers", "copy it again") from error
+    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "iuf":
+        found = f"shape {rows.shape}, {rows.dtype}" if isinstance(rows, np.ndarray) else "an archive"
+        raise InputError(path, "", found, "numbers of shape (photos, 17)")
+    poses = rows[:, :15].astype(np.float64).reshape(-1, 3, 5)
+    c2w = np.zeros((len(poses), 4, 4))
+    c2w[:, :3, 0], c2w[:, :3, 1] = poses[:, :, 1], poses[:, :, 0]
+    c2w[:, :3, 2], c2w[:, :3, 3] = -poses[:, :, 2], poses[:, :, 3]
+    c2w[:, 3, 3] = 1
+    sizes = poses[:, :, 4]
+    if not len(poses) or not (np.isfinite(sizes).all() and (sizes > 0).all()):
+        raise InputError(path, "", "no photo, or a height, width or focal length that is none", "positive numbers")
+    return checks.rigid_poses(path, "row {}", c2w), sizes
+
+
+def _photos(folder: Path, count: int) -> list[Path]:
+    """As many photos as there are poses, in the order of their names."""
+    names = ("images", "images_2", "images_4", "images_8", "")
+    found = {}
+    for name in names:
+        below = folder / name
+        files = sorted(file for file in below.iterdir() if file.suffix in EXTENSIONS) if below.is_dir() else []
+        if len(files) == count:
+            return files
+        if files:
+            found[name or "."] = len(files)
+    shown = ", ".join(f"{number} in {name}" for name, number in found.items()) or "no photos"
+    raise InputError(folder / POSES, "", f"{count} poses, but {shown}", "a pose for each photo of the folder images")

@@ -1,0 +1,92 @@
+"""The optics of one photo: its intrinsics and its lens, as calibration programs state them."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from nerf_lightning.cameras import Distortion
+from nerf_lightning.cameras.lenses import distort, undistort
+from nerf_lightning.dataset.lens import Lens
+
+FOLDED = 1e-3
+"""How far, in flat coordinates, an undistorted place may come to lie from where it was seen."""
+FITTED = 1e-5
+"""Likewise for a lens of another kind that is replaced by a polynomial."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Intrinsics in pixels, pixel centres at +0.5, and the distortion (see `cameras.Lenses`)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Distortion = Distortion()
+    fisheye: bool = False
+
+    @property
+    def K(self) -> Float[np.ndarray, "3 3"]:
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
+    @property
+    def bent(self) -> bool:
+        """Whether it is not a pinhole camera's."""
+        return self.fisheye or any(self.distortion)
+
+    def perspective(self) -> Lens | None:
+        """The same as OpenCV's five coefficients; None where they do not suffice."""
+        d = self.distortion
+        if self.fisheye or any((d.k4, d.d1, d.d2, d.d3, d.s1, d.s2)):
+            return None
+        return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy, (d.k1, d.k2, d.p1, d.p2, d.k3))
+
+    def sees_every_pixel(self) -> bool:
+        """Whether each place along the border of the photo has a direction of its own, as a real lens's has."""
+        if not (
+            all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy, *self.distortion))) and self.fx * self.fy > 0
+        ):
+            return False
+        if not self.bent:
+            return True
+        seen = torch.from_numpy(self._border())
+        coefficients = torch.tensor([self.distortion], dtype=torch.float64)
+        flat = undistort(seen, coefficients)
+        back, jacobian = distort(flat, coefficients)
+        upright = torch.linalg.det(jacobian) > 0
+        return bool(torch.isfinite(flat).all() and ((back - seen).abs().amax() < FOLDED) and upright.all())
+
+    def _border(self, steps: int = 16) -> Float[np.ndarray, "B 2"]:
+        """Flat coordinates, distorted, along the border of the photo."""
+        t = np.linspace(0, 1, steps + 1)
+        edges = np.concatenate([[(a, 0.0), (a, 1.0), (0.0, a), (1.0, a)] for a in t])
+        return (edges * (self.width, self.height) - (self.cx, self.cy)) / (self.fx, self.fy)
+
+
+def field_of_view_lens(
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, omega: float
+) -> Optics | None:
+    """The lens of Devernay and Faugeras (2001), eq. 13, as a fisheye with a polynomial; None where none is near enough.
+
+    Args:
+        omega: the lens's field of view, radians: r = atan(2 tan(theta) tan(omega / 2)) / omega.
+    """
+    if not 1e-3 < omega < math.pi - 1e-3:
+        return None
+    slope = 2 * math.tan(omega / 2) / omega
+    rim = float(np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy))
+    if rim * omega >= math.pi / 2:
+        return None
+    theta = np.linspace(1e-3, math.atan(math.tan(rim * omega) / (2 * math.tan(omega / 2))), 256)
+    wanted = np.arctan(2 * np.tan(theta) * math.tan(omega / 2)) / (omega * slope)
+    powers = theta[:, None] ** np.array([3, 5, 7, 9])
+    k, *_ = np.linalg.lstsq(powers, wanted - theta, rcond=None)
+    if np.abs(theta + powers @ k - wanted).max() > FITTED:
+        return None
+    k1, k2, k3, k4 = map(float, k)
+    return Optics(width, height, fx * slope, fy * slope, cx, cy, Distortion(k1, k2, k3, k4), fisheye=True)

@@ -1,0 +1,205 @@
+"""Posed photos on disk become a Scene, whatever format named them."""
+
+import logging
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import psutil
+import torch
+from jaxtyping import Bool, Float, UInt8
+
+from nerf_lightning.cameras import Cameras, Lenses
+from nerf_lightning.dataset.formats.decode import THREADS, image_header, read_pixels
+from nerf_lightning.dataset.lens import Lens, rectify
+from nerf_lightning.dataset.masks import SURE, cut_out, empty_middle, read_mask
+from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.dataset.resize import area_resize, fit_size
+from nerf_lightning.dataset.views import Runs, Views
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.progress import tracked
+
+log = logging.getLogger(__name__)
+
+Masked = Literal["auto", "unknown", "empty"]
+ROOM = 0.8
+"""Share of the free memory that photos may take."""
+LOOKED = 8
+"""Photos, evenly chosen, that tell what their masks mean."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How posed photos are read.
+
+    Args:
+        resize: longest side in pixels after averaging, for photos that are larger.
+        holdout: every N-th photo is held out, in the order of their names, where the format has no split of its own.
+        masked: what masks and alpha leave out is "unknown" (a passer-by: not drawn, not scored) or "empty" (the subject is
+            cut out); "auto" takes alpha as empty, and masks as empty where what they leave out is of one colour.
+        invert_masks: masks are black where the photo is kept.
+        undistort: resample photos to those of a pinhole camera, cropped; otherwise rays follow the lens.
+    """
+
+    resize: int | None = None
+    holdout: int = 8
+    masked: Masked = "auto"
+    invert_masks: bool = False
+    undistort: bool = False
+
+    def __post_init__(self) -> None:
+        if self.holdout < 2:
+            raise InputError("holdout", "", str(self.holdout), "2 or more: every N-th photo is held out")
+        if self.masked not in ("auto", "unknown", "empty"):
+            raise InputError("dataset.masked", "", repr(self.masked), "auto, unknown or empty")
+
+
+AS_IT_IS = Reading()
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One posed photo."""
+
+    name: str
+    """As its format names it."""
+    photo: Path
+    c2w: Float[np.ndarray, "4 4"]
+    """Camera to world, OpenCV, the file's world frame and unit."""
+    optics: Optics
+    """Of the photo's size, or of the same photo at another one."""
+    mask: Path | None = None
+    upright: bool = False
+    """Whether the pose and optics are those of the photo as its EXIF data turn it."""
+
+
+def read_shots(source: Path, shots: Sequence[Shot], reading: Reading) -> Views:
+    """Decodes photos, undistorted and resized where that is asked for. Poses stay in the file's frame.
+
+    Raises:
+        InputError: a photo that cannot be read or has another shape than its camera, or more photos than fit into memory.
+    """
+    sizes, alpha = [], False
+    for shot in shots:
+        width, height, has_alpha = image_header(shot.photo, shot.upright)
+        _check_shape(source, shot, width, height)
+        sizes.append((width, height))
+        alpha |= has_alpha
+    masked = what_masks_mean(shots, reading)
+    channels = 4 if masked == "empty" or (alpha and reading.masked != "unknown") else 3
+    undistort = lru_cache(maxsize=4)(rectify)  # one lens, or one a photo: keep the maps of a few
+    lenses = [
+        _pinhole(source, shot, size) if reading.undistort else None for shot, size in zip(shots, sizes, strict=True)
+    ]
+    small = [fit_size(*size, reading.resize) for size in sizes]
+    starts = np.cumsum([0] + [width * height for width, height in small])
+    _check_memory(source, shots, int(starts[-1]) * channels, small)
+    pixels = np.empty((starts[-1], channels), np.uint8)
+    known = np.ones(starts[-1], bool) if masked == "unknown" or (alpha and channels == 3) else None
+    K = np.stack([shot.optics.K for shot in shots])
+
+    def read(i: int) -> None:
+        shot, size, lens = shots[i], small[i], lenses[i]
+        image = read_pixels(shot.photo, shot.upright)
+        if image.shape[1::-1] != sizes[i]:
+            found = f"{image.shape[1]}x{image.shape[0]} pixels"
+            raise InputError(shot.photo, "", found, f"{sizes[i][0]}x{sizes[i][1]}, as its header says", "save it again")
+        mask = None if shot.mask is None else read_mask(shot.mask, *sizes[i], reading.invert_masks)
+        if image.shape[2] == 4 and channels == 3:
+            mask = image[..., 3] if mask is None else np.minimum(mask, image[..., 3])
+            image = np.ascontiguousarray(image[..., :3])
+        if channels == 4:
+            cover = image[..., 3] if image.shape[2] == 4 else np.full(image.shape[:2], 255, np.uint8)
+            cover = np.minimum(cover, mask) if mask is not None and masked == "empty" else cover
+            image = np.dstack([image[..., :3], cover])
+        rectified = None if lens is None else undistort(lens)
+        K[i] = K[i] if rectified is None else rectified.K
+
+        def finished(picture: UInt8[np.ndarray, "H W C"]) -> UInt8[np.ndarray, "N C"]:
+            straight = picture if rectified is None else rectified.apply(picture)
+            return area_resize(straight, *size).reshape(-1, picture.shape[2])
+
+        part = slice(starts[i], starts[i + 1])
+        pixels[part] = finished(image)
+        if mask is not None and known is not None:
+            known[part] = finished(np.dstack([mask] * 3))[:, 0] >= SURE
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        for _ in tracked(pool.map(read, range(len(shots))), len(shots), "reading photos"):
+            pass
+    bent = None
+    if any(shot.optics.bent for shot in shots) and not reading.undistort:
+        coefficients = torch.tensor([shot.optics.distortion for shot in shots])
+        bent = Lenses(coefficients.float(), torch.tensor([shot.optics.fisheye for shot in shots]))
+    c2w = torch.from_numpy(np.stack([shot.c2w for shot in shots]))
+    of = sizes if reading.undistort else [(shot.optics.width, shot.optics.height) for shot in shots]
+    cameras = Cameras(torch.from_numpy(K).float(), c2w.float(), torch.tensor(of), bent).resized(torch.tensor(small))
+    counted = None if known is None or known.all() else Runs.of(torch.from_numpy(known))
+    return Views(torch.from_numpy(pixels), cameras, counted)
+
+
+def what_masks_mean(shots: Sequence[Shot], reading: Reading) -> Literal["unknown", "empty"] | None:
+    """What masks of their own files leave out, see `Reading`; None where there are none. A few are looked at."""
+    having = [shot for shot in shots if shot.mask is not None]
+    if not having:
+        return None
+    kept: list[Bool[np.ndarray, "H W"]] = []
+    cut = []
+    for shot in (having[i] for i in evenly(len(having), LOOKED)):
+        assert shot.mask is not None
+        image = read_pixels(shot.photo, shot.upright)
+        kept.append(read_mask(shot.mask, image.shape[1], image.shape[0], reading.invert_masks) > 0)
+        cut.append(cut_out(image, kept[-1]))
+        other = image_header(shot.mask)[:2]
+        if other != (image.shape[1], image.shape[0]) and len(kept) == 1:
+            size = f"{image.shape[1]}x{image.shape[0]}"
+            log.info("masks of %dx%d pixels are enlarged or reduced to their photos' %s", *other, size)
+    if np.mean([empty_middle(one) for one in kept]) > 0.5:
+        todo = "false" if reading.invert_masks else "true"
+        text = "most masks leave out the middle of the photo: are they inverted? dataset.invert_masks=%s takes them so"
+        log.warning(text, todo)
+    meaning: Literal["unknown", "empty"] = "empty" if np.mean(cut) > 0.5 else "unknown"
+    if reading.masked != "auto":
+        meaning = reading.masked
+    share = 1 - float(np.mean([one.mean() for one in kept]))
+    log.info("masks leave out about %.0f %% of the pixels: taken as %s", 100 * share, meaning)
+    return meaning
+
+
+def _check_shape(source: Path, shot: Shot, width: int, height: int) -> None:
+    """The photo may be the camera's at another size, but not of another shape."""
+    optics = shot.optics
+    off = max(abs(optics.width * height / optics.height - width), abs(optics.height * width / optics.width - height))
+    if off > 1.5:
+        found = f"{width}x{height} pixels"
+        expected = f"{optics.width}x{optics.height}, the size of its camera, or the same reduced"
+        raise InputError(shot.photo, "", found, expected, f"are these the photos of {source}?")
+
+
+def _pinhole(source: Path, shot: Shot, size: tuple[int, int]) -> Lens:
+    """The lens of a photo of this size, to be undone."""
+    o, (width, height) = shot.optics, size
+    x, y = width / o.width, height / o.height
+    lens = replace(o, width=width, height=height, fx=o.fx * x, fy=o.fy * y, cx=o.cx * x, cy=o.cy * y).perspective()
+    if lens is None:
+        expected = "at most k1, k2, k3, p1, p2 for undistort=true"
+        raise InputError(
+            source, shot.name, "a lens with more than these, or a fisheye", expected, "leave undistort=false"
+        )
+    return lens
+
+
+def _check_memory(source: Path, shots: Sequence[Shot], size: int, sides: Sequence[tuple[int, int]]) -> None:
+    """Photos must fit into the free memory, twice: they are split into training and held-out ones once."""
+    free = ROOM * psutil.virtual_memory().available
+    if 2 * size > free:
+        longest = max(max(side) for side in sides)
+        fits = max(1, int(longest * math.sqrt(free / (2 * size))))
+        found = f"{len(shots)} photos that take {size / 2**30:.1f} GiB, twice while they are read"
+        raise InputError(source, "", found, f"at most {free / 2**30:.1f} GiB", f"dataset.resize={fits} would fit")

@@ -1,0 +1,89 @@
+"""Rays through lenses, against OpenCV's own."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.cameras import Cameras, Distortion, Lenses
+
+WIDTH, HEIGHT = 640, 480
+K = np.array([[520.0, 0, 322.3], [0, 510, 236.7], [0, 0, 1]])
+MODELS = {
+    "radial": (Distortion(k1=-0.2, k2=0.05), False),
+    "barrel": (Distortion(k1=0.1, k2=-0.02, p1=0.004, p2=-0.006, k3=0.003), False),
+    "rational": (Distortion(k1=0.1, k2=0.03, k3=0.01, d1=0.12, d2=0.01, d3=0.002, p1=0.004, p2=-0.006), False),
+    "prism": (Distortion(k1=-0.1, s1=0.01, s2=-0.02), False),
+    "fisheye": (Distortion(k1=0.05, k2=-0.02, k3=0.01, k4=-0.003), True),
+}
+STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+
+
+def cameras_with(name: str) -> Cameras:
+    distortion, fisheye = MODELS[name]
+    lenses = Lenses(torch.tensor([distortion]), torch.tensor([fisheye]))
+    return Cameras(torch.from_numpy(K).float()[None], torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]), lenses)
+
+
+def places(count: int = 10_000) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.randint(HEIGHT, (count,)), torch.randint(WIDTH, (count,))
+
+
+def opencv(name: str, row: torch.Tensor, col: torch.Tensor) -> np.ndarray:
+    """Directions by OpenCV, whose pixel centres are at integers."""
+    d, fisheye = MODELS[name]
+    seen = torch.stack([col, row], dim=1).double().numpy()[:, None]
+    intrinsics = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    if fisheye:
+        flat = cv2.fisheye.undistortPoints(seen, intrinsics, np.array(d[:4]), criteria=STOP)
+    else:
+        four = np.array([d.k1, d.k2, d.p1, d.p2, d.k3, d.d1, d.d2, d.d3, d.s1, 0, d.s2, 0])
+        flat = cv2.undistortPoints(seen, intrinsics, four, None, None, None, STOP)
+    return np.concatenate([flat[:, 0], np.ones((len(flat), 1))], axis=1)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_rays_are_those_of_opencv(name: str):
+    row, col = places()
+    rays = cameras_with(name).rays(torch.zeros_like(row), row, col).directions.double().numpy()
+    expected = opencv(name, row, col)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    angle = np.linalg.norm(np.cross(rays, expected), axis=1)
+    assert (np.sum(rays * expected, axis=1) > 0).all() and angle.max() < 1e-5
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_projecting_leads_back_to_the_pixel(name: str):
+    cameras, (row, col) = cameras_with(name), places(500)
+    rays = cameras.rays(torch.zeros_like(row), row, col)
+    pixels, depth, inside = cameras.project(rays.directions * torch.linspace(0.5, 9, 500)[:, None], 0)
+    torch.testing.assert_close(pixels, torch.stack([col, row], dim=1) + 0.5, atol=2e-3, rtol=0)
+    assert inside.all() and (depth > 0).all()
+
+
+def test_a_fisheye_sees_beside_and_behind_itself():
+    lens = Lenses(torch.tensor([Distortion(k1=0.01)]), torch.tensor([True]))
+    wide = torch.tensor([[[200.0, 0, 322], [0, 200, 237], [0, 0, 1]]])
+    cameras = Cameras(wide, torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]), lens)
+    rays = cameras.view_rays(0)
+    assert float(rays.directions[:, 2].min()) < -0.1
+    pixels, _, inside = cameras.project(3 * rays.directions[::997], 0)
+    assert inside.all()
+    torch.testing.assert_close(pixels[1], torch.tensor([997 % WIDTH + 0.5, 997 // WIDTH + 0.5]), atol=5e-3, rtol=0)
+
+
+def test_what_lies_beyond_the_rim_is_not_in_the_picture():
+    # This polynomial leads back into the picture from far outside.
+    lens = Lenses(torch.tensor([Distortion(k1=-0.2)]), torch.tensor([False]))
+    cameras = Cameras(torch.from_numpy(K).float()[None], torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]), lens)
+    outside = torch.tensor([[2.2, 0.0, 1.0]])
+    assert not cameras.project(outside, 0)[2] and not cameras.project(torch.tensor([[0.0, 0.0, -1.0]]), 0)[2]
+    assert cameras.project(torch.tensor([[0.1, 0.1, 1.0]]), 0)[2]
+
+
+def test_a_lens_without_distortion_is_a_pinhole():
+    pinhole = Cameras(torch.from_numpy(K).float()[None], torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]))
+    lens = Cameras(pinhole.K, pinhole.c2w, pinhole.sizes, Lenses(torch.zeros(1, 11), torch.tensor([False])))
+    row, col = places(200)
+    view = torch.zeros_like(row)
+    torch.testing.assert_close(lens.rays(view, row, col).directions, pinhole.rays(view, row, col).directions)

@@ -1,0 +1,104 @@
+"""Writes posed photos as other programs do: COLMAP, binary and text, LLFF, and transforms.json."""
+
+import json
+import struct
+from pathlib import Path
+
+import cv2
+import imageio.v3 as imageio
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nerf_lightning.dataset import Views
+from nerf_lightning.dataset.formats.colmap_model import MODELS, NUMBERS
+
+Camera = tuple[str, int, int, tuple[float, ...]]
+"""Model, width, height and parameters."""
+
+
+def photos(folder: Path, views: Views, ending: str = ".png", first: int = 0) -> list[str]:
+    """Writes the photos; returns their names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"{first + i:04d}{ending}" for i in range(len(views))]
+    for i, name in enumerate(names):
+        imageio.imwrite(folder / name, views.image(i).numpy())
+    return names
+
+
+def cameras_of(views: Views, model: str = "PINHOLE", more: tuple[float, ...] = ()) -> dict[int, Camera]:
+    """A camera for each view."""
+    cameras: dict[int, Camera] = {}
+    for i, K in enumerate(views.cameras.K.double().numpy()):
+        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+        one = MODELS[NUMBERS[model]][1] - len(more) == 3
+        cameras[i + 1] = (model, *views.cameras.size(i), ((fx, cx, cy) if one else (fx, fy, cx, cy)) + more)
+    return cameras
+
+
+def quaternion(w2c: np.ndarray) -> list[float]:
+    x, y, z, w = Rotation.from_matrix(w2c[:3, :3]).as_quat()
+    return [w, x, y, z]
+
+
+def write_colmap(
+    folder: Path,
+    c2w: np.ndarray,
+    names: list[str],
+    cameras: dict[int, Camera],
+    text: bool = False,
+    points: np.ndarray | None = None,
+) -> None:
+    """A sparse model; image i has camera i + 1, or the last there is."""
+    folder.mkdir(parents=True, exist_ok=True)
+    points = np.zeros((1, 3)) if points is None else points
+    images = []
+    for i, (pose, name) in enumerate(zip(c2w.astype(np.float64), names, strict=True)):
+        w2c = np.linalg.inv(pose)
+        images.append((i + 1, [*quaternion(w2c), *w2c[:3, 3]], min(i + 1, len(cameras)), name))
+    if text:
+        lines = [f"{n} {m} {w} {h} {' '.join(map(repr, map(float, p)))}" for n, (m, w, h, p) in cameras.items()]
+        (folder / "cameras.txt").write_text("# cameras\n" + "\n".join(lines) + "\n")
+        rows = [f"{n} {' '.join(map(repr, map(float, pose)))} {c} {name}\n1.5 2.5 -1" for n, pose, c, name in images]
+        (folder / "images.txt").write_text("# images\n" + "\n".join(rows) + "\n")
+        places = [f"{n} {x} {y} {z} 0 0 0 0.5 1 0" for n, (x, y, z) in enumerate(points)]
+        (folder / "points3D.txt").write_text("\n".join(places) + "\n")
+        return
+    packed = [
+        struct.pack("<iiQQ", n, NUMBERS[m], w, h) + struct.pack(f"<{len(p)}d", *p)
+        for n, (m, w, h, p) in cameras.items()
+    ]
+    (folder / "cameras.bin").write_bytes(struct.pack("<Q", len(packed)) + b"".join(packed))
+    rows = [
+        struct.pack("<i7di", n, *pose, c) + name.encode() + b"\0" + struct.pack("<QddQ", 1, 1.5, 2.5, 2**64 - 1)
+        for n, pose, c, name in images
+    ]
+    (folder / "images.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
+    spots = [struct.pack("<Q3d3BdQii", n, *xyz, 0, 0, 0, 0.5, 1, 1, 0) for n, xyz in enumerate(points)]
+    (folder / "points3D.bin").write_bytes(struct.pack("<Q", len(spots)) + b"".join(spots))
+
+
+def write_llff(path: Path, views: Views) -> None:
+    """poses_bounds.npy."""
+    rows = []
+    for i, pose in enumerate(views.cameras.c2w.double().numpy()):
+        width, height = views.cameras.size(i)
+        hwf = [[height], [width], [float(views.cameras.K[i, 0, 0])]]
+        columns = [pose[:3, 1:2], pose[:3, 0:1], -pose[:3, 2:3], pose[:3, 3:4], hwf]
+        rows.append(np.concatenate([np.concatenate(columns, axis=1).ravel(), [1.0, 9.0]]))
+    np.save(path, np.stack(rows))
+
+
+def write_transforms(path: Path, views: Views, names: list[str], **more: object) -> None:
+    """transforms.json with a lens for each frame."""
+    frames = []
+    for i, (pose, name) in enumerate(zip(views.cameras.c2w.double().numpy(), names, strict=True)):
+        K = views.cameras.K[i].double()
+        own = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+        matrix = (pose * [1, -1, -1, 1]).tolist()
+        frames.append({"file_path": name, "transform_matrix": matrix, **own, **more})
+    path.write_text(json.dumps({"frames": frames}), encoding="utf-8")
+
+
+def rotated(image: np.ndarray) -> np.ndarray:
+    """By a quarter turn."""
+    return cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)
