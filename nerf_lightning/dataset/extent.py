@@ -49,7 +49,7 @@ def estimate_bounds(
     return Bounds(torch.from_numpy(aabb).float(), unbounded=False, near=near, far=far)
 
 
-def silhouettes(views: Views, background: tuple[float, float, float]) -> list[Bool[np.ndarray, "H W"]] | None:
+def silhouettes(views: Views, background: tuple[float, float, float]) -> list[Bool[np.ndarray, "_ _"]] | None:
     """Which pixels of each photo show content; None where neither alpha nor a flat background at the borders tells.
 
     Masked pixels may show content.
@@ -147,7 +147,7 @@ def sightings(aabb: Float[np.ndarray, "2 3"], count: int, cameras: Cameras) -> I
 
 
 def visual_hull(
-    masks: Sequence[Bool[np.ndarray, "H W"]], sightings: Iterable[Sighting], least: float
+    masks: Sequence[Bool[np.ndarray, "_ _"]], sightings: Iterable[Sighting], least: float
 ) -> Bool[np.ndarray, "N"]:
     """Which voxels at least `least` views see, and nearly all of these find in their silhouettes."""
     seen: Any = 0
@@ -159,7 +159,7 @@ def visual_hull(
 
 
 def _carve(
-    aabb: Float[np.ndarray, "2 3"], masks: Sequence[Bool[np.ndarray, "H W"]], cameras: Cameras
+    aabb: Float[np.ndarray, "2 3"], masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Cameras
 ) -> Float[np.ndarray, "2 3"] | None:
     """The box of the voxels inside (nearly) all silhouettes, one voxel wider; None when there are none."""
     voxel = (aabb[1] - aabb[0]) / GRID

@@ -17,8 +17,8 @@ KEPT = 128
 """Brightness, or alpha, from which a mask keeps a pixel: white is kept, as nerfstudio and COLMAP have it."""
 SURE = 250
 """Share of a pixel, in 1/255, that must be known after averaging for the pixel to be known."""
-MIDDLE = 0.25
-"""The middle of a photo starts at this share of its sides."""
+CELLS = 16
+"""Along each side of a photo, to see where most masks leave something out."""
 FLAT = 12
 """In 1/255: JPEG lets one colour wobble by that much."""
 
@@ -85,10 +85,10 @@ def cut_out(image: UInt8[np.ndarray, "H W C"], kept: Bool[np.ndarray, "H W"]) ->
     return bool(np.mean(np.abs(masked - middle).max(axis=1) <= FLAT) > 0.95)
 
 
-def empty_middle(kept: Bool[np.ndarray, "H W"]) -> bool:
-    """Whether a mask leaves out most of the middle of a photo and keeps most of the rest: it may be inverted."""
-    height, width = kept.shape
-    top, left = int(MIDDLE * height), int(MIDDLE * width)
-    middle = kept[top : height - top, left : width - left]
-    rest = (kept.sum() - middle.sum()) / max(1, kept.size - middle.size)
-    return bool(middle.mean() < 0.3 and rest > 0.7)
+def seem_inverted(masks: Sequence[Bool[np.ndarray, "_ _"]]) -> bool:
+    """Whether masks leave out one spot in the middle of most photos and keep the borders: what is photographed, it seems."""
+    small = [cv2.resize(kept.astype(np.float32), (CELLS, CELLS), interpolation=cv2.INTER_AREA) for kept in masks]
+    kept = np.mean(small, axis=0)
+    border = np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])
+    quarter = CELLS // 4
+    return bool(kept[quarter:-quarter, quarter:-quarter].min() < 0.3 and border.mean() > 0.7)

@@ -114,7 +114,7 @@ def misfits(scene: Scene) -> Iterator[Doubt]:
         yield Doubt(text, hopeless=explained < FITS)
 
 
-def hull_coverage(masks: Sequence[Bool[np.ndarray, "H W"]], cameras: Cameras, bounds: Bounds) -> float:
+def hull_coverage(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Cameras, bounds: Bounds) -> float:
     """Share of the silhouettes that their visual hull within the bounds covers, in [0, 1]."""
     seen = list(sightings(bounds.aabb.double().numpy(), HULL, cameras))
     hull = visual_hull(masks, seen, least=1)

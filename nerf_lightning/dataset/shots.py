@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import psutil
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from nerf_lightning.cameras import Cameras, Lenses
 from nerf_lightning.dataset.formats.decode import THREADS, image_header, read_pixels
 from nerf_lightning.dataset.lens import Lens, rectify
-from nerf_lightning.dataset.masks import SURE, cut_out, empty_middle, read_mask
+from nerf_lightning.dataset.masks import SURE, cut_out, read_mask, seem_inverted
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.views import Runs, Views
@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 Masked = Literal["auto", "unknown", "empty"]
 ROOM = 0.8
 """Share of the free memory that photos may take."""
+SMALLEST = 16
+"""A photo may be reduced that many times against its camera's size."""
 LOOKED = 8
 """Photos, evenly chosen, that tell what their masks mean."""
 
@@ -49,14 +51,14 @@ class Reading:
 
     resize: int | None = None
     holdout: int = 8
-    masked: Masked = "auto"
+    masked: str = "auto"
     invert_masks: bool = False
     undistort: bool = False
 
     def __post_init__(self) -> None:
         if self.holdout < 2:
             raise InputError("holdout", "", str(self.holdout), "2 or more: every N-th photo is held out")
-        if self.masked not in ("auto", "unknown", "empty"):
+        if self.masked not in get_args(Masked):
             raise InputError("dataset.masked", "", repr(self.masked), "auto, unknown or empty")
 
 
@@ -144,12 +146,12 @@ def read_shots(source: Path, shots: Sequence[Shot], reading: Reading) -> Views:
     return Views(torch.from_numpy(pixels), cameras, counted)
 
 
-def what_masks_mean(shots: Sequence[Shot], reading: Reading) -> Literal["unknown", "empty"] | None:
-    """What masks of their own files leave out, see `Reading`; None where there are none. A few are looked at."""
+def what_masks_mean(shots: Sequence[Shot], reading: Reading) -> str | None:
+    """What masks in files of their own leave out, see `Reading`; None where there are none. A few are looked at."""
     having = [shot for shot in shots if shot.mask is not None]
     if not having:
         return None
-    kept: list[Bool[np.ndarray, "H W"]] = []
+    kept: list[Bool[np.ndarray, "_ _"]] = []
     cut = []
     for shot in (having[i] for i in evenly(len(having), LOOKED)):
         assert shot.mask is not None
@@ -160,13 +162,13 @@ def what_masks_mean(shots: Sequence[Shot], reading: Reading) -> Literal["unknown
         if other != (image.shape[1], image.shape[0]) and len(kept) == 1:
             size = f"{image.shape[1]}x{image.shape[0]}"
             log.info("masks of %dx%d pixels are enlarged or reduced to their photos' %s", *other, size)
-    if np.mean([empty_middle(one) for one in kept]) > 0.5:
+    if seem_inverted(kept):
         todo = "false" if reading.invert_masks else "true"
-        text = "most masks leave out the middle of the photo: are they inverted? dataset.invert_masks=%s takes them so"
+        text = "most masks leave out one spot in the middle: are they inverted? dataset.invert_masks=%s takes them so"
         log.warning(text, todo)
-    meaning: Literal["unknown", "empty"] = "empty" if np.mean(cut) > 0.5 else "unknown"
-    if reading.masked != "auto":
-        meaning = reading.masked
+    meaning = reading.masked
+    if meaning == "auto":
+        meaning = "empty" if np.mean(cut) > 0.5 else "unknown"
     share = 1 - float(np.mean([one.mean() for one in kept]))
     log.info("masks leave out about %.0f %% of the pixels: taken as %s", 100 * share, meaning)
     return meaning
@@ -175,8 +177,10 @@ def what_masks_mean(shots: Sequence[Shot], reading: Reading) -> Literal["unknown
 def _check_shape(source: Path, shot: Shot, width: int, height: int) -> None:
     """The photo may be the camera's at another size, but not of another shape."""
     optics = shot.optics
+    if min(width, height) < 2:
+        raise InputError(shot.photo, "", f"{width}x{height} pixels", "a photo")
     off = max(abs(optics.width * height / optics.height - width), abs(optics.height * width / optics.width - height))
-    if off > 1.5:
+    if off > 1.5 or SMALLEST * width < optics.width:
         found = f"{width}x{height} pixels"
         expected = f"{optics.width}x{optics.height}, the size of its camera, or the same reduced"
         raise InputError(shot.photo, "", found, expected, f"are these the photos of {source}?")

@@ -1,0 +1,180 @@
+"""COLMAP and LLFF folders: the same scene as transforms.json has."""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.cameras import Distortion
+from nerf_lightning.dataset import Scene, Views, open_scene
+from nerf_lightning.dataset.formats.colmap_model import MODELS, NUMBERS, optics_of
+from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.errors import InputError
+from tests.dataset.colmap_files import cameras_of, photos, write_colmap, write_llff, write_transforms
+
+
+@pytest.fixture(scope="session")
+def views(ball_views_of: Callable[..., Views]) -> Views:
+    return ball_views_of(6)
+
+
+def colmap(folder: Path, views: Views, where: str = "sparse/0", text: bool = False) -> Path:
+    names = photos(folder / "images", views)
+    write_colmap(folder / where, views.cameras.c2w.numpy(), names, cameras_of(views), text)
+    return folder
+
+
+def same(a: Scene, b: Scene) -> None:
+    for ours, theirs in ((a.train, b.train), (a.val, b.val)):
+        torch.testing.assert_close(ours.cameras.c2w, theirs.cameras.c2w, atol=1e-5, rtol=0)
+        torch.testing.assert_close(ours.cameras.K, theirs.cameras.K, atol=1e-3, rtol=0)
+        assert torch.equal(ours.pixels, theirs.pixels)
+    torch.testing.assert_close(a.to_source, b.to_source, atol=1e-4, rtol=0)
+
+
+def test_every_format_gives_the_same_scene(views: Views, tmp_path: Path):
+    binary = open_scene(str(colmap(tmp_path / "binary", views)))
+    assert (len(binary.train), len(binary.val)) == (15, 3), "every 8th of 18 is held out"
+    same(binary, open_scene(str(colmap(tmp_path / "text", views, text=True))))
+    names = photos(tmp_path / "llff" / "images", views)
+    write_llff(tmp_path / "llff" / "poses_bounds.npy", views)
+    same(binary, open_scene(str(tmp_path / "llff")))
+    write_transforms(tmp_path / "llff" / "transforms.json", views, [f"images/{name}" for name in names])
+    same(binary, open_scene(str(tmp_path / "llff")))
+
+
+@pytest.mark.parametrize("where", ["sparse/0", "sparse", "colmap/sparse/0", "distorted/sparse/0", "."])
+def test_a_model_is_found_wherever_programs_put_it(where: str, views: Views, tmp_path: Path):
+    folder = colmap(tmp_path / "scene", views, where)
+    scene = open_scene(str(folder))
+    assert scene.name == "scene" and len(scene.train) == 15
+    if where != ".":
+        same(scene, open_scene(str(folder / where)))
+        same(scene, open_scene(str((folder / where).parent)))
+
+
+def test_the_largest_of_several_models_is_taken_and_the_others_named(
+    views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    folder = colmap(tmp_path, views, "sparse/1")
+    few = views[torch.arange(4)]
+    write_colmap(folder / "sparse/0", few.cameras.c2w.numpy(), photos(folder / "images", few), cameras_of(few))
+    with caplog.at_level(logging.WARNING):
+        assert len(open_scene(str(folder)).train) == 15
+    assert "the model with most photos (18); others: 0 (4)" in caplog.text
+
+
+def test_photos_without_a_place_and_places_without_a_photo_are_named(
+    views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    folder = colmap(tmp_path, views)
+    (folder / "images" / "0005.png").rename(folder / "images" / "9999.png")
+    with caplog.at_level(logging.WARNING):
+        scene = open_scene(str(folder))
+    assert len(scene.train) + len(scene.val) == 17
+    assert "1 of 18 photos are not there, 0005.png" in caplog.text
+    assert "1 photos have no place in the model, 9999.png" in caplog.text
+
+
+def test_reduced_photos_are_used_where_they_are_large_enough(views: Views, tmp_path: Path):
+    folder = colmap(tmp_path, views)
+    (folder / "images_2").mkdir()
+    for file in (folder / "images").iterdir():
+        imageio.imwrite(folder / "images_2" / file.name, np.full((20, 24, 3), 77, np.uint8))
+    large, small = (open_scene(str(folder), resize=side) for side in (25, 24))
+    assert large.train.channels == 4 and (small.train.pixels == 77).all()
+    assert small.train.cameras.size(0) == (24, 20)
+    torch.testing.assert_close(small.train.cameras.K[0], views.cameras.resized((24, 20)).K[0], atol=1e-4, rtol=0)
+
+
+def test_photos_of_a_model_below_its_own_folder(views: Views, tmp_path: Path):
+    names = [f"left/{name}" for name in photos(tmp_path / "input" / "left", views)]
+    write_colmap(tmp_path / "sparse", views.cameras.c2w.numpy(), names, cameras_of(views), text=True)
+    assert len(open_scene(str(tmp_path)).train) == 15
+
+
+PARAMETERS = {
+    "SIMPLE_PINHOLE": ((50.0, 24, 20), Optics(48, 40, 50, 50, 24, 20)),
+    "PINHOLE": ((50.0, 51, 24, 20), Optics(48, 40, 50, 51, 24, 20)),
+    "SIMPLE_RADIAL": ((50.0, 24, 20, 0.1), Optics(48, 40, 50, 50, 24, 20, Distortion(0.1))),
+    "RADIAL": ((50.0, 24, 20, 0.1, 0.2), Optics(48, 40, 50, 50, 24, 20, Distortion(0.1, 0.2))),
+    "OPENCV": (
+        (50.0, 51, 24, 20, 0.1, 0.2, 0.01, 0.02),
+        Optics(48, 40, 50, 51, 24, 20, Distortion(0.1, 0.2, p1=0.01, p2=0.02)),
+    ),
+    "OPENCV_FISHEYE": (
+        (50.0, 51, 24, 20, 0.1, 0.02, 0.03, 0.04),
+        Optics(48, 40, 50, 51, 24, 20, Distortion(0.1, 0.02, 0.03, 0.04), True),
+    ),
+    "FULL_OPENCV": (
+        (50.0, 51, 24, 20, 0.1, 0.2, 0.01, 0.02, 0.3, 0.01, 0.02, 0.03),
+        Optics(48, 40, 50, 51, 24, 20, Distortion(0.1, 0.2, 0.3, d1=0.01, d2=0.02, d3=0.03, p1=0.01, p2=0.02)),
+    ),
+    "SIMPLE_RADIAL_FISHEYE": ((50.0, 24, 20, 0.1), Optics(48, 40, 50, 50, 24, 20, Distortion(0.1), True)),
+    "RADIAL_FISHEYE": ((50.0, 24, 20, 0.1, 0.02), Optics(48, 40, 50, 50, 24, 20, Distortion(0.1, 0.02), True)),
+    "THIN_PRISM_FISHEYE": (
+        (50.0, 51, 24, 20, 0.1, 0.02, 0.01, 0.02, 0.03, 0.04, 0.001, 0.002),
+        Optics(48, 40, 50, 51, 24, 20, Distortion(0.1, 0.02, 0.03, 0.04, p1=0.01, p2=0.02, s1=0.001, s2=0.002), True),
+    ),
+    "SIMPLE_FISHEYE": ((50.0, 24, 20), Optics(48, 40, 50, 50, 24, 20, fisheye=True)),
+    "FISHEYE": ((50.0, 51, 24, 20), Optics(48, 40, 50, 51, 24, 20, fisheye=True)),
+}
+
+
+@pytest.mark.parametrize("model", [name for name in NUMBERS if name != "FOV"])
+def test_camera_models(model: str):
+    parameters, expected = PARAMETERS[model]
+    assert len(parameters) == MODELS[NUMBERS[model]][1]
+    assert optics_of("file", "camera 1", model, 48, 40, parameters) == expected
+
+
+def test_camera_models_agree_with_pycolmap():
+    pycolmap = pytest.importorskip("pycolmap")
+    uv = np.array([[1.5, 2.5], [24, 20], [40.25, 3], [47, 39]])
+    for model, (parameters, _) in {**PARAMETERS, "FOV": ((50.0, 51, 24, 20, 0.8), None)}.items():
+        camera = pycolmap.Camera(model=model, width=48, height=40, params=parameters)
+        flat = np.asarray(camera.cam_from_img(uv))
+        optics = optics_of("file", "camera 1", model, 48, 40, tuple(map(float, parameters)))
+        rays = rays_of(optics, uv)
+        np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], flat, atol=3e-5, err_msg=model)
+
+
+def rays_of(optics: Optics, uv: np.ndarray) -> np.ndarray:
+    """Directions of places in a photo, camera frame."""
+    from nerf_lightning.cameras.lenses import to_directions, undistort
+
+    seen = torch.from_numpy((uv - (optics.cx, optics.cy)) / (optics.fx, optics.fy))
+    flat = undistort(seen, torch.tensor([optics.distortion], dtype=torch.float64))
+    return to_directions(flat, torch.tensor([optics.fisheye])).numpy()
+
+
+def test_a_lens_that_folds_the_photo_is_refused():
+    with pytest.raises(InputError, match="camera 7: found SIMPLE_RADIAL with 50, 24, 20, -2"):
+        optics_of("cameras.bin", "camera 7", "SIMPLE_RADIAL", 48, 40, (50.0, 24, 20, -2.0))
+
+
+def test_distances_of_llff_and_of_reduced_photos(views: Views, tmp_path: Path):
+    names = photos(tmp_path / "images", views)
+    write_llff(tmp_path / "poses_bounds.npy", views)
+    whole = open_scene(str(tmp_path), resize=24)
+    for name in names:
+        image = imageio.imread(tmp_path / "images" / name)
+        (tmp_path / "images" / name).unlink()
+        (tmp_path / "images_2").mkdir(exist_ok=True)
+        imageio.imwrite(tmp_path / "images_2" / name, image[::2, ::2])
+    small = open_scene(str(tmp_path))
+    torch.testing.assert_close(whole.train.cameras.K, small.train.cameras.K, atol=1e-4, rtol=0)
+
+
+@pytest.mark.real_data
+def test_a_real_capture_is_the_same_in_both_formats(real_data: Path, tmp_path: Path):
+    a = open_scene(str(real_data / "cup"), resize=40)
+    (tmp_path / "images").symlink_to(real_data / "cup" / "images")
+    (tmp_path / "poses_bounds.npy").symlink_to(real_data / "cup" / "poses_bounds.npy")
+    b = open_scene(str(tmp_path), resize=40)
+    torch.testing.assert_close(a.train.cameras.c2w, b.train.cameras.c2w, atol=1e-5, rtol=0)
+    assert a.bounds.unbounded and len(a.train) == 67

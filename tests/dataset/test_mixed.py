@@ -1,0 +1,193 @@
+"""Photos of several sizes, and masks."""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.cameras import Bounds, Cameras
+from nerf_lightning.dataset import RayDataModule, Scene, Views, draw_rays, open_scene
+from nerf_lightning.dataset.shots import Reading
+from nerf_lightning.dataset.views import Runs
+from nerf_lightning.errors import InputError
+from tests.dataset.colmap_files import cameras_of, photos, write_colmap
+
+
+@pytest.fixture(scope="session")
+def views(ball_views_of: Callable[..., Views]) -> Views:
+    return ball_views_of(6)
+
+
+def mixed() -> Views:
+    """Three sizes; each pixel is its own colour."""
+    sizes = torch.tensor([[4, 3], [2, 5], [7, 1]])
+    K = torch.eye(3).repeat(3, 1, 1)
+    K[:, :2, 2] = sizes / 2
+    pixels = torch.arange(29 * 3).to(torch.uint8).view(29, 3)
+    return Views(pixels, Cameras(K, torch.eye(4).repeat(3, 1, 1), sizes))
+
+
+def test_photos_of_several_sizes_lie_one_after_the_other():
+    views = mixed()
+    assert [tuple(views.image(i).shape) for i in range(3)] == [(3, 4, 3), (5, 2, 3), (1, 7, 3)]
+    assert torch.equal(torch.cat([views.image(i).reshape(-1, 3) for i in range(3)]), views.pixels)
+    assert views.nbytes == 29 * 3, "no padding"
+    some = views[torch.tensor([2, 0])]
+    assert torch.equal(some.image(0), views.image(2)) and torch.equal(some.image(1), views.image(0))
+    with pytest.raises(ValueError, match="several sizes"):
+        _ = views.images
+
+
+def test_rays_and_colours_of_several_sizes_belong_together():
+    views = mixed()
+    batch = draw_rays(views, 2000, torch.Generator().manual_seed(0))
+    seen = set()
+    for view in range(3):
+        rays, image = views.cameras.view_rays(view), views.image(view).reshape(-1, 3)
+        for direction, colour in zip(rays.directions, image, strict=True):
+            match = (batch.pixels == colour).all(1)
+            assert match.any() and torch.allclose(batch.rays.directions[match], direction)
+            seen.add(tuple(colour.tolist()))
+    assert len(seen) == 29, "each pixel is drawn"
+
+
+def test_masked_pixels_are_never_drawn_and_not_scored():
+    views = mixed()
+    known = torch.ones(29, dtype=torch.bool)
+    known[3:9], known[11:13], known[22:] = False, False, False
+    views = Views(views.pixels, views.cameras, Runs.of(known))
+    assert len(views.known) == int(known.sum()) and torch.equal(views.mask, known)
+    assert torch.equal(views.known.find(torch.arange(len(views.known))), known.nonzero()[:, 0])
+    drawn = draw_rays(views, 3000, torch.Generator().manual_seed(0)).pixels
+    assert set(drawn[:, 0].tolist()) == set(views.pixels[known][:, 0].tolist())
+    assert torch.equal(views[torch.tensor([1])].mask_of(0), views.mask_of(1))
+    scene = Scene("mixed", "test", views, views, views.cameras, Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])))
+    batch = RayDataModule(scene).held_out(1)
+    assert (batch.width, batch.height) == (2, 5) and torch.equal(batch.known, known[12:22])
+
+
+def capture(folder: Path, views: Views, edit: Callable[[int, np.ndarray], np.ndarray] = lambda i, x: x) -> Path:
+    """A COLMAP capture whose photos are RGB on grey noise."""
+    rng = np.random.default_rng(0)
+    rgb = []
+    for i in range(len(views)):
+        image = views.image(i).numpy()
+        alpha = image[..., 3:] / 255
+        noise = rng.integers(0, 255, image.shape[:2])[..., None]
+        rgb.append(edit(i, np.rint(image[..., :3] * alpha + noise * (1 - alpha)).astype(np.uint8)))
+    names = photos(folder / "images", Views.of(torch.from_numpy(np.stack(rgb)), views.cameras))
+    write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
+    return folder
+
+
+def write_masks(folder: Path, views: Views, ending: str = ".png", side: int = 1, invert: bool = False) -> None:
+    """White where the ball is."""
+    folder.mkdir()
+    for i in range(len(views)):
+        mask = (views.image(i)[..., 3] > 127).numpy().astype(np.uint8) * 255
+        mask = 255 - mask if invert else mask
+        imageio.imwrite(folder / f"{i:04d}{ending}", mask.repeat(side, 0).repeat(side, 1))
+
+
+@pytest.mark.parametrize("ending", [".png", ".png.png", "-cut.png", ".jpg"])
+def test_masks_beside_photos_are_found(ending: str, views: Views, tmp_path: Path):
+    folder = capture(tmp_path, views)
+    write_masks(folder / "masks", views, ending)
+    scene = open_scene(str(folder))
+    ball = (views.image(1)[..., 3] > 127)[None]
+    assert scene.train.channels == 3 and scene.train.known is not None
+    agreement = (scene.train.mask_of(0) == ball).float().mean()
+    assert agreement > 0.97 if ending == ".jpg" else agreement == 1
+
+
+def test_masks_of_another_size_and_inverted_ones(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    folder = capture(tmp_path, views)
+    write_masks(folder / "masks", views, side=2, invert=True)
+    with caplog.at_level(logging.INFO):
+        straight = open_scene(str(folder))
+    assert "96x80" in caplog.text and "dataset.invert_masks=true takes them so" in caplog.text
+    turned = open_scene(str(folder), invert_masks=True)
+    assert torch.equal(turned.train.mask, ~straight.train.mask)
+
+
+def test_what_is_masked_may_be_empty(views: Views, tmp_path: Path):
+    folder = capture(tmp_path / "a", views)
+    write_masks(folder / "masks", views)
+    scene = open_scene(str(folder), masked="empty")
+    assert scene.train.channels == 4 and scene.train.known is None and not scene.bounds.unbounded
+    assert torch.equal(scene.train.image(0)[..., 3], ((views.image(1)[..., 3] > 127) * 255).to(torch.uint8))
+
+    def white(i: int, image: np.ndarray) -> np.ndarray:
+        return np.where(views.image(i).numpy()[..., 3:] > 127, image, 255)
+
+    cut = capture(tmp_path / "b", views, white)
+    write_masks(cut / "images_mask", views)
+    assert open_scene(str(cut)).train.channels == 4, "these photos are cut out already"
+    assert open_scene(str(cut), masked="unknown").train.channels == 3
+
+
+def test_alpha_may_be_unknown(views: Views, tmp_path: Path):
+    names = photos(tmp_path / "images", views)
+    write_colmap(tmp_path / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
+    scene = open_scene(str(tmp_path), masked="unknown")
+    assert scene.train.channels == 3 and scene.bounds.unbounded
+    assert torch.equal(scene.train.mask_of(0), views.image(1)[..., 3] >= 250)
+
+
+def test_masks_follow_resizing(views: Views, tmp_path: Path):
+    folder = capture(tmp_path, views)
+    write_masks(folder / "masks", views)
+    small = open_scene(str(folder), resize=24).train
+    whole = (views.image(1)[..., 3] > 127).view(20, 2, 24, 2).permute(0, 2, 1, 3).reshape(20, 24, 4).all(2)
+    assert torch.equal(small.mask_of(0), whole), "known where all of a pixel is"
+
+
+def test_views_that_are_masked_entirely_are_not_held_out(
+    views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    folder = capture(tmp_path, views)
+    write_masks(folder / "masks", views)
+    imageio.imwrite(folder / "masks" / "0008.png", np.zeros((40, 48), np.uint8))
+    with caplog.at_level(logging.WARNING):
+        assert len(open_scene(str(folder)).val) == 2
+    assert "1 held-out photos are masked entirely, 0008.png first" in caplog.text
+
+
+def test_a_scene_of_portrait_and_landscape(views: Views, tmp_path: Path):
+    """Photos are cropped to several sizes; the field's rays stay those of the whole photos."""
+    names = photos(tmp_path / "images", views)
+    cameras = cameras_of(views)
+    for i in range(0, len(names), 2):
+        image = imageio.imread(tmp_path / "images" / names[i])
+        imageio.imwrite(tmp_path / "images" / names[i], image[4:-3, 10:-12])
+        model, _, _, (fx, fy, cx, cy) = cameras[i + 1]
+        cameras[i + 1] = (model, 26, 33, (fx, fy, cx - 10, cy - 4))
+    write_colmap(tmp_path / "sparse/0", views.cameras.c2w.numpy(), names, cameras)
+    scene = open_scene(str(tmp_path))
+    assert {tuple(size) for size in scene.train.cameras.sizes.tolist()} == {(48, 40), (26, 33)}
+    assert scene.resolution == (48, 40)
+    whole = views.cameras.view_rays(2).directions.view(40, 48, 3)[4:-3, 10:-12].reshape(-1, 3)
+    turn = torch.linalg.inv(scene.to_source[:3, :3])
+    expected = torch.nn.functional.normalize(whole @ turn.T, dim=1)
+    torch.testing.assert_close(scene.train.cameras.view_rays(1).directions, expected, atol=1e-5, rtol=0)
+
+
+def test_too_many_photos_are_told_before_they_are_read(views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = capture(tmp_path, views)
+
+    class Memory:
+        available = 2 * 18 * 48 * 40 * 3  # of which four fifths are taken
+
+    monkeypatch.setattr("psutil.virtual_memory", Memory)
+    with pytest.raises(InputError, match="dataset.resize=42 would fit"):
+        open_scene(str(folder))
+    assert open_scene(str(folder), resize=42).train.cameras.size(0) == (42, 35)
+
+
+def test_words_for_masks():
+    with pytest.raises(InputError, match="dataset.masked: found 'white', expected auto, unknown or empty"):
+        Reading(masked="white")
