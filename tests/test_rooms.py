@@ -15,7 +15,7 @@ ORDER = (
     ("callbacks",),
     ("config",),
     ("runs",),
-    ("gallery", "capture", "chart", "evaluate", "export", "render", "view"),
+    ("gallery", "capture", "chart", "evaluate", "export", "inspect", "render", "view"),
     ("training",),
     ("stability", "rightsize", "api", "__main__"),
     ("__init__",),

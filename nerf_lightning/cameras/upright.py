@@ -6,6 +6,8 @@ from torch import Tensor
 
 LEVEL = 0.005
 """Weight of the photos' mean up direction against their level axes: decides only where all cameras look the same way."""
+CLEARLY = 0.1
+"""By how much the photos' rows must be less flat (see `flatness`) than their columns for them to lie on their side."""
 
 
 def image_axes(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 3"]:
@@ -14,19 +16,24 @@ def image_axes(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 3"]:
     return torch.stack([-down, right, down, -right], dim=1)
 
 
+def flatness(axes: Float[Tensor, "V 3"]) -> float:
+    """How surely unit vectors point everywhere in one plane, from 0 (all along one line, or in all directions) to 0.5."""
+    smallest, middle, _ = torch.linalg.eigvalsh(axes.mT @ axes / len(axes)).tolist()
+    return middle - smallest
+
+
 def held(c2w: Float[Tensor, "V 4 4"]) -> tuple[Float[Tensor, "3"], Int[Tensor, "V"]]:
     """Up, and which side of each photo is its top.
 
-    Photos are taken level, upright or on their side. All around a subject, the mean of the sides that are up is long, that of
-    the others short. Up is then the direction most nearly perpendicular to the photos' level axes.
+    Photos are taken level, upright or on their side. All around a subject, their level axes point everywhere in one plane;
+    up is perpendicular to it.
 
     Returns:
         Unit vector, world frame; 0 to 3 for a photo whose top, right, bottom or left side is up.
     """
     axes = image_axes(c2w.double())
-    means = axes.mean(0)
-    sideways = bool(means[1].norm() > means[0].norm() + 0.1)
-    up = torch.nn.functional.normalize(means[1 if sideways else 0], dim=0)
+    sideways = flatness(axes[:, 0]) > flatness(axes[:, 1]) + CLEARLY
+    up = torch.nn.functional.normalize(axes[:, 1 if sideways else 0].mean(0), dim=0)
     slope = float((c2w[:, :3, 2].double() @ up).mean())
     # Which side of a photo that lies on its side is up it does not tell; people look down at what they photograph.
     if sideways and slope > 0:

@@ -11,7 +11,7 @@ from nerf_lightning.dataset.formats.nerfstudio import load_nerfstudio
 from nerf_lightning.dataset.formats.npz import load_npz
 from nerf_lightning.dataset.resize import resize_scene
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import Masked, Reading
+from nerf_lightning.dataset.shots import Reading
 from nerf_lightning.errors import InputError
 
 SUPPORTED = (
@@ -27,7 +27,7 @@ def open_scene(
     holdout: int = 8,
     near: float | None = None,
     far: float | None = None,
-    masked: Masked = "auto",
+    masked: str = "auto",
     invert_masks: bool = False,
     undistort: bool = False,
 ) -> Scene:

@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
 import psutil
@@ -27,7 +26,7 @@ from nerf_lightning.utils.progress import tracked
 
 log = logging.getLogger(__name__)
 
-Masked = Literal["auto", "unknown", "empty"]
+MASKED = ("auto", "unknown", "empty")
 ROOM = 0.8
 """Share of the free memory that photos may take."""
 SMALLEST = 16
@@ -58,7 +57,7 @@ class Reading:
     def __post_init__(self) -> None:
         if self.holdout < 2:
             raise InputError("holdout", "", str(self.holdout), "2 or more: every N-th photo is held out")
-        if self.masked not in get_args(Masked):
+        if self.masked not in MASKED:
             raise InputError("dataset.masked", "", repr(self.masked), "auto, unknown or empty")
 
 
@@ -143,7 +142,7 @@ def read_shots(source: Path, shots: Sequence[Shot], reading: Reading) -> Views:
     of = sizes if reading.undistort else [(shot.optics.width, shot.optics.height) for shot in shots]
     cameras = Cameras(torch.from_numpy(K).float(), c2w.float(), torch.tensor(of), bent).resized(torch.tensor(small))
     counted = None if known is None or known.all() else Runs.of(torch.from_numpy(known))
-    return Views(torch.from_numpy(pixels), cameras, counted)
+    return Views(torch.from_numpy(pixels), cameras, counted, tuple(shot.name for shot in shots))
 
 
 def what_masks_mean(shots: Sequence[Shot], reading: Reading) -> str | None:

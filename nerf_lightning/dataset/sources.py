@@ -19,7 +19,6 @@ from nerf_lightning.dataset.pixels import Picture, PixelDataModule
 from nerf_lightning.dataset.rays import RAYS, SAMPLES, RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
-from nerf_lightning.dataset.shots import Masked
 from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.options import AtLeast, Count
 
@@ -34,7 +33,7 @@ def from_photos(
     name: str | None = None,
     resize: Count | None = None,
     holdout: Annotated[int, AtLeast(2)] = 8,
-    masked: Masked = "auto",
+    masked: str = "auto",
     invert_masks: bool = False,
     undistort: bool = False,
     near: float | None = None,

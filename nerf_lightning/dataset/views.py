@@ -51,6 +51,8 @@ class Views:
     cameras: Cameras
     known: Runs | None = None
     """Pixels that count; None for all of them."""
+    names: tuple[str, ...] = ()
+    """Of the photos' files; empty where they have none."""
 
     @classmethod
     def of(cls, images: UInt8[Tensor, "V H W C"], cameras: Cameras) -> "Views":
@@ -124,7 +126,8 @@ class Views:
         known = None
         if self.known is not None:
             known = Runs.of(torch.cat([self.mask[part] for part in chosen]) if chosen else self.mask[:0])
-        return Views(pixels, self.cameras[index], known)
+        names = tuple(self.names[view] for view in index.tolist()) if self.names else ()
+        return Views(pixels, self.cameras[index], known, names)
 
     def spread(self, count: int) -> "Views":
         """At most `count` views, evenly spaced from the first to the last."""
@@ -132,4 +135,4 @@ class Views:
 
     def to(self, device: torch.device) -> "Views":
         known = None if self.known is None else self.known.to(device)
-        return Views(self.pixels.to(device), self.cameras.to(device), known)
+        return Views(self.pixels.to(device), self.cameras.to(device), known, self.names)

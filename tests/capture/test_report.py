@@ -15,15 +15,15 @@ from nerf_lightning.capture.pack import pack
 from nerf_lightning.capture.poses.calibrate import calibrate
 from nerf_lightning.capture.poses.geometry import inverse, project
 from nerf_lightning.capture.poses.solve import solve
-from nerf_lightning.capture.report.camera_map import frustum, tag_corners
 from nerf_lightning.capture.report.contact_sheet import MOST, annotated, contact_sheet, heading
 from nerf_lightning.capture.report.coverage_chart import displacement, parameters
 from nerf_lightning.capture.report.error_chart import cell_means, corners_and_residuals, error_chart
-from nerf_lightning.capture.report.write import write_report
+from nerf_lightning.capture.report.write import tag_corners, write_report
 from nerf_lightning.capture.run import Capture, Placed
 from nerf_lightning.capture.tags.detect import Mark, Sighting
 from nerf_lightning.capture.tags.layout import SQUARE
 from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.drawing.camera_map import frustum
 from nerf_lightning.drawing.ink import ORANGE, SKY, magnification, pixels_of, readable, rgb, shortened
 
 LENS = Lens(320, 240, 290.0, 290.0, 160.0, 120.0, (-0.2, 0.0, 0.0, 0.0, 0.0))

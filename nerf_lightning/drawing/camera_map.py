@@ -1,4 +1,4 @@
-"""A map of a capture: the cameras, the tags, and the scene's box and orbit."""
+"""A map of a scene: the cameras, the tags, and its box and orbit."""
 
 from collections.abc import Sequence
 
@@ -9,9 +9,6 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from nerf_lightning.capture.outputs import Placed
-from nerf_lightning.capture.poses.geometry import move
-from nerf_lightning.capture.run import Capture
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.drawing.ink import BLUE, DPI, GREY, ORANGE, VERMILLION
 
@@ -30,32 +27,30 @@ def frustum(K: Float[np.ndarray, "3 3"], width: int, height: int, depth: float) 
     return depth * np.concatenate([np.zeros((1, 3)), np.linalg.solve(K, corners.T).T])
 
 
-def tag_corners(capture: Capture) -> dict[int, Float[np.ndarray, "M 3"]]:
-    """Corners in the world of the tags that placed photos show, by id; metres."""
-    points = {tag: mark.points for sighting in capture.sightings for tag, mark in sighting.marks.items()}
-    return {tag: move(pose, points[tag]) for tag, pose in capture.solved.tags.items() if tag in points}
-
-
-def camera_map(photos: Sequence[Placed], scene: Scene, tags: dict[int, Float[np.ndarray, "M 3"]]) -> Figure:
+def camera_map(
+    numbered: Sequence[tuple[int, Float[np.ndarray, "4 4"]]],
+    scene: Scene,
+    tags: dict[int, Float[np.ndarray, "M 3"]],
+    unit: str = "in the scene's unit",
+) -> Figure:
     """A view from above, and one from the side below it, at the same scale.
 
     Args:
-        photos: all of the capture; those without a pose are only counted.
+        numbered: photos' numbers and poses, camera to world.
         scene: made of them.
         tags: corners in the world by id.
+        unit: of lengths, in words.
     """
     cameras = scene.train.cameras
-    numbered = [(number, photo.c2w) for number, photo in enumerate(photos, 1) if photo.c2w is not None]
     orbit = scene.orbit.centres.double().numpy()
     box = scene.bounds.aabb.double().numpy()
     solid = np.concatenate([np.stack([c2w[:3, 3] for _, c2w in numbered]), orbit, box, *tags.values()])
     depth = FRUSTUM * float(np.ptp(solid[:, :2], axis=0).max())
-    shape = frustum(cameras.K[0].double().numpy(), cameras.width, cameras.height, depth)
-    frusta = [(number, move(c2w, shape)) for number, c2w in numbered]
+    shape = frustum(cameras.K[0].double().numpy(), *cameras.size(0), depth)
+    frusta = [(number, shape @ c2w[:3, :3].T + c2w[:3, 3]) for number, c2w in numbered]
     everything = np.concatenate([solid, *[points for _, points in frusta]])
     low, high = everything.min(0) - depth / 2, everything.max(0) + depth / 2
 
-    unit = "metres" if tags else "in the scene's unit"
     span = high - low
     scale = min(WIDE / span[0], HIGH / (span[1] + span[2]))
     size = max(scale * span[0] + 1.5, 8.0), scale * (span[1] + span[2]) + 2.5
@@ -72,7 +67,7 @@ def camera_map(photos: Sequence[Placed], scene: Scene, tags: dict[int, Float[np.
         x, y = corners[:, :2].mean(0)
         above.annotate(str(tag), (x, y), ha="center", va="center", fontsize=9, color=VERMILLION, annotation_clip=True)
     key = [
-        Line2D([], [], color=BLUE, label=f"cameras, numbered 1 to {len(photos)} as the photos are"),
+        Line2D([], [], color=BLUE, label="cameras, numbered as the photos are"),
         Line2D([], [], color=GREY, linestyle="--", label="box of the scene"),
         Line2D([], [], color=ORANGE, linewidth=2, label="orbit"),
     ]

@@ -1,0 +1,1 @@
+"""A look at a scene's photos before training: sharpness, exposure, cameras, and what the checks doubt."""

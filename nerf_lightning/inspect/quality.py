@@ -1,0 +1,121 @@
+"""What is wrong with a photo, judged against the others of its scene."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from nerf_lightning.dataset.views import Views
+
+SIDE = 400
+"""Longest side in pixels at which photos are compared."""
+BRIGHT, DARK = 252, 4
+"""In 1/255: channels at or beyond these have lost what was there."""
+LOST = 0.1
+"""Share of a photo beyond them, above its scene's median, that makes it over- or under-exposed."""
+OFF = 0.25
+"""Difference of mean brightness to the median photo's, in [0, 1], that makes a photo too dark or too bright."""
+SOFT, SPREADS = 0.75, 3.0
+"""A photo is blurred where its sharpness is below that share of the median and that many spreads below it."""
+THUMB, ALIKE = 48, 10
+"""Two photos are one where all but 1 % of their thumbnails' pixels differ by less than that, in 1/255."""
+
+
+@dataclass
+class Photo:
+    """One photo and what is known of it."""
+
+    number: int
+    name: str
+    split: str
+    """"train" or "held out"."""
+    small: UInt8[np.ndarray, "h w 3"]
+    """Reduced, transparent parts on grey."""
+    sharpness: float
+    brightness: float
+    """Mean, in [0, 1]."""
+    over: float
+    """Share of pixels whose brightest channel is saturated."""
+    under: float
+    """Share of pixels that are black."""
+    troubles: list[str] = field(default_factory=list)
+
+
+def look_at(views: Views, split: str, first: int) -> list[Photo]:
+    """Measures photos; `first` is the number of the first."""
+    found = []
+    for view in range(len(views)):
+        image = views.image(view).numpy()
+        shown = np.ones(image.shape[:2], bool) if image.shape[2] == 3 else image[..., 3] > 127
+        if views.known is not None:
+            shown &= views.mask_of(view).numpy()
+        rgb = np.where(shown[..., None], image[..., :3], 128).astype(np.uint8)
+        height, width = rgb.shape[:2]
+        scale = min(1.0, SIDE / max(height, width))
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+        pixels = rgb[shown] if shown.any() else rgb.reshape(-1, 3)
+        name = views.names[view] if views.names else f"{split} {view}"
+        number = first + view
+        over, under = (float(np.mean(mask)) for mask in (pixels.max(1) >= BRIGHT, pixels.max(1) <= DARK))
+        found.append(Photo(number, name, split, small, sharpness(rgb), float(pixels.mean() / 255), over, under))
+    return found
+
+
+def sharpness(image: UInt8[np.ndarray, "H W 3"]) -> float:
+    """How much of a photo's detail is fine: the spread of its second derivatives against that of the photo blurred by 2 pixels.
+
+    A ratio, so that content and exposure matter little. Noise is taken off first by a slight blur.
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    fine, coarse = (cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), sigma), cv2.CV_32F) for sigma in (0.7, 2.0))
+    return float(fine.std() / max(float(coarse.std()), 1e-3))
+
+
+def judge(photos: Sequence[Photo], plain: bool) -> None:
+    """Notes the troubles of each photo.
+
+    Args:
+        photos: all of a scene.
+        plain: whether they stand before a plain background, which may be saturated.
+    """
+    level = Level.of([photo.sharpness for photo in photos])
+    brightness = float(np.median([photo.brightness for photo in photos]))
+    usual = {side: float(np.median([getattr(photo, side) for photo in photos])) for side in ("over", "under")}
+    thumbs = np.stack([cv2.resize(p.small, (THUMB, THUMB), interpolation=cv2.INTER_AREA) for p in photos]).astype(
+        np.float32
+    )
+    for i, photo in enumerate(photos):
+        if level.far_below(photo.sharpness):
+            photo.troubles.append(f"blurred: sharpness {photo.sharpness / level.middle:.0%} of the others'")
+        for side, word in (("over", "over-exposed"), ("under", "under-exposed")):
+            share = getattr(photo, side)
+            if share > usual[side] + LOST and not plain:
+                photo.troubles.append(f"{word}: {share:.0%} of it has no detail left")
+        if abs(photo.brightness - brightness) > OFF:
+            word = "brighter" if photo.brightness > brightness else "darker"
+            photo.troubles.append(f"{word} than the others")
+        if i:
+            off = np.percentile(np.abs(thumbs[:i] - thumbs[i]).max(3), 99, axis=(1, 2))
+            if float(off.min()) < ALIKE:
+                photo.troubles.append(f"doubled: it shows what {photos[int(off.argmin())].name} shows")
+
+
+@dataclass(frozen=True)
+class Level:
+    """What is usual among some figures."""
+
+    middle: float
+    spread: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Level":
+        """Median, and median absolute deviation as a standard deviation."""
+        array: Float[np.ndarray, "N"] = np.array(values, np.float64)
+        middle = float(np.median(array))
+        return cls(middle, 1.4826 * float(np.median(np.abs(array - middle))))
+
+    def far_below(self, value: float) -> bool:
+        return value < SOFT * self.middle and value < self.middle - SPREADS * self.spread
