@@ -1,4 +1,4 @@
-"""python -m benchmarks: what methods, kernels, framework, capture, 2D fields, sizes and shapes cost, and how well they do.
+"""python -m benchmarks: what methods, kernels, framework, capture, photos, 2D fields, sizes and shapes cost and give.
 
 `python -m benchmarks device` tells whether the GPU at hand gives what the CPU gives, and how fast: its last line says it.
 """
@@ -14,13 +14,13 @@ from typing import Any
 import torch
 
 import nerf_lightning
-from benchmarks import capture, device, growth, kernels, methods, overhead, pictures, shapes, sizes
+from benchmarks import capture, device, growth, kernels, methods, overhead, photos, pictures, shapes, sizes
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.device import the_device
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.machine import describe_machine
 
-PARTS = ("methods", "kernels", "growth", "overhead", "capture", "pictures", "sizes", "shapes")
+PARTS = ("methods", "kernels", "growth", "overhead", "capture", "photos", "pictures", "sizes", "shapes")
 ALONE = ("device",)
 """Runs only when it is named."""
 
@@ -88,6 +88,8 @@ def main() -> None:
             tables, unequal = device.measure(chosen_device, overrides, budgets[0], seeds[0], arguments.output)
         elif part == "capture":
             tables = capture.measure(seeds, arguments.output)
+        elif part == "photos":
+            tables = photos.measure(seeds, arguments.output)
         elif part == "pictures":
             tables = pictures.measure(overrides, seeds, arguments.output)
         elif part == "sizes":

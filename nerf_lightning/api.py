@@ -152,7 +152,7 @@ def train(
     given = [
         "dataset=photos",
         f"dataset.path={scene.source}",
-        f"dataset.resize={max(scene.resolution)}",
+        f"dataset.resize={scene.train.cameras.longest}",
         f"name={scene.name}",
         f"seed={seed}",
         f"device={device}",

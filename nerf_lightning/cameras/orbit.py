@@ -11,6 +11,10 @@ from nerf_lightning.cameras.upright import held
 
 ONE_SIDED = 0.35
 """Length of the mean viewing direction's horizontal part above which the cameras are all on one side of the subject."""
+MOSTLY = 0.7
+"""Share of the views that lie within a loop before the subject."""
+STEEPEST = 1.4
+"""Largest angle above the subject in such a loop, radians."""
 
 
 def look_at(
@@ -68,33 +72,38 @@ def orbit_around(
     return look_at(centre + radius * ring, centre, up)
 
 
-def loop_before(
-    centre: Float[Tensor, "3"],
-    axis: Float[Tensor, "3"],
-    up: Float[Tensor, "3"],
-    radius: float,
-    angle: float,
-    frames: int,
+def swing_before(
+    centre: Float[Tensor, "3"], up: Float[Tensor, "3"], offset: Float[Tensor, "V 3"], radius: float, frames: int
 ) -> Float[Tensor, "frames 4 4"]:
-    """A small circle of poses in front of a subject, all looking at it.
+    """A closed loop of poses on the side of a subject from which it was seen, all looking at it: to the left and right, up and
+    down, as far as most of the views.
 
     Args:
         centre: the subject, world frame.
-        axis: unit vector from the subject to the middle of the circle.
-        up: unit vector, up in the pictures.
+        up: unit vector.
+        offset: from the subject to each view, world units; they lie on one side.
         radius: distance to the subject, scene's unit.
-        angle: between the axis and each line of sight, radians.
         frames: number of poses; the last stops one step short of the first.
     """
-    circle = orbit_around(centre, axis, radius, math.pi / 2 - angle, frames)
-    return look_at(circle[:, :3, 3], centre, up)
+    direction = torch.nn.functional.normalize(offset, dim=-1)
+    mean = direction.mean(0)
+    front = torch.nn.functional.normalize(mean - (mean @ up) * up, dim=-1)
+    right = torch.linalg.cross(up, front)
+    azimuth, elevation = torch.atan2(direction @ right, direction @ front), torch.asin((direction @ up).clamp(-1, 1))
+    middle, height = azimuth.median(), elevation.median()
+    wide, high = (angle.abs().quantile(MOSTLY) for angle in (azimuth - middle, elevation - height))
+    turn = torch.arange(frames, dtype=up.dtype, device=up.device) * (2 * math.pi / frames)
+    around, above = middle + wide * torch.cos(turn), (height + high * torch.sin(turn)).clamp(-STEEPEST, STEEPEST)
+    level = torch.cos(around)[:, None] * front + torch.sin(around)[:, None] * right
+    eye = centre + radius * (torch.cos(above)[:, None] * level + torch.sin(above)[:, None] * up)
+    return look_at(eye, centre, up)
 
 
 def orbit_like(cameras: Cameras, frames: int = 60) -> Cameras:
     """A closed path around what `cameras` look at, on the sides they saw, upright, with the lens of a typical one.
 
-    Cameras all around give a full turn at their mean distance and height; cameras on one side give a loop there, as wide as
-    their spread.
+    Cameras all around give a full turn at their mean distance and height; cameras on one side give a loop there, as wide
+    and as high as most of them.
     """
     centre = focus_point(cameras.c2w)
     up, sides = held(cameras.c2w)
@@ -104,9 +113,7 @@ def orbit_like(cameras: Cameras, frames: int = 60) -> Cameras:
     mean = direction.mean(0)
     aside = mean - (mean @ up) * up  # near zero for cameras all around, whatever their height
     if float(aside.norm()) > ONE_SIDED:
-        axis = torch.nn.functional.normalize(mean, dim=-1)
-        spread = torch.acos((direction @ axis).clamp(-1, 1)).mean()
-        c2w = loop_before(centre, axis, up, radius, float(spread), frames)
+        c2w = swing_before(centre, up, offset, radius, frames)
     else:
         elevation = math.asin(max(-0.95, min(0.95, float((offset @ up).mean()) / max(radius, 1e-9))))
         c2w = orbit_around(centre, up, radius, elevation, frames)

@@ -12,7 +12,7 @@ RENAMED = {
     "sampler.thin": "sampler.alpha_thre",
 }
 GRIDS = ("HashGridField", "TensoRFField", "VoxelField")
-"""Models whose runs without the option `size` were made with a fixed size."""
+"""Models whose runs without `size` were made with a fixed size; runs on photos without `undistort` resampled these."""
 
 
 def with_new_names(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -26,6 +26,9 @@ def with_new_names(config: Mapping[str, Any]) -> dict[str, Any]:
     model = renamed.get("model")
     if isinstance(model, dict) and str(model.get("_target_")).rpartition(".")[2] in GRIDS:
         renamed["model"] = {"size": "fixed", **model}
+    dataset = renamed.get("dataset")
+    if isinstance(dataset, dict) and str(dataset.get("_target_")).endswith(".from_photos"):
+        renamed["dataset"] = {"undistort": True, **dataset}
     return renamed
 
 

@@ -3,13 +3,40 @@
 import copy
 import inspect
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
+import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.config.build import build_data, target_of
-from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.config.build import SceneFrame, build_data, target_of
+from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
+from nerf_lightning.runs.folder import frame_from
+
+
+def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
+    """A scene in the frame that a run was trained in, which other photos of it, or a later version of this package, may place
+    and turn in another way: both know the frame of the files they came from.
+
+    Args:
+        scene: just read.
+        content: of the run's scene.json.
+    """
+    frame, _, to_source = frame_from(dict(content)) if "aabb" in content else (None, None, None)
+    if to_source is None or not isinstance(frame, SceneFrame) or torch.allclose(to_source, scene.to_source, atol=1e-5):
+        return scene
+    moved = torch.linalg.solve(to_source.double(), scene.to_source.double())
+    scale = torch.linalg.det(moved[:3, :3]) ** (1 / 3)
+
+    def placed(cameras: Cameras) -> Cameras:
+        c2w = moved @ cameras.c2w.double()
+        c2w[:, :3, :3] /= scale
+        return replace(cameras, c2w=c2w.float())
+
+    train, val = (replace(views, cameras=placed(views.cameras)) for views in (scene.train, scene.val))
+    return replace(scene, train=train, val=val, orbit=placed(scene.orbit), bounds=frame.bounds, to_source=to_source)
 
 
 def data_again(cfg: DictConfig, scene: Mapping[str, Any], photos: str | None = None) -> RayDataModule | PixelDataModule:
@@ -30,6 +57,8 @@ def data_again(cfg: DictConfig, scene: Mapping[str, Any], photos: str | None = N
         if at_hand.dataset.get("path") is None and source != BUILT_IN:
             at_hand.dataset.path = source
     data = build_data(at_hand, photos)
+    if isinstance(data, RayDataModule):
+        data.scene = in_frame_of(data.scene, scene)
     name = scene.get("name", data.scene.name)
     if photos is None and data.scene.name != name:
         expected = f"{name!r}, which the run was trained on"

@@ -1,0 +1,128 @@
+"""Photos as people have them: several sizes, passers-by with and without masks, a fisheye; against plain ones."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+import torch
+
+import nerf_lightning as nl
+from nerf_lightning.cameras import Cameras, Distortion, Lenses
+from nerf_lightning.dataset import Scene, Views, draw_rays
+from nerf_lightning.dataset.views import Runs
+from nerf_lightning.stability.toys import PILE, around, enclosing, photograph, toy
+
+Rows = list[dict[str, Any]]
+SIZE, VIEWS, HELD_OUT = 128, 48, 6
+STEPS = 1500
+GREY = (0.5, 0.5, 0.5)
+BOXED = 0.3
+"""Share of the training photos that have boxes pasted on."""
+FISHEYE = Distortion(k1=-0.02, k2=0.004)
+ROUNDS, DRAWS, RAYS = 7, 200, 1024
+QUIET = ("callbacks.snapshots=null", "callbacks.orbit=null", "~logger", "callbacks.heldout=null")
+
+
+def joined(parts: Sequence[Views]) -> Views:
+    """Views of several sizes, one after the other."""
+    K, c2w, sizes = (torch.cat([getattr(part.cameras, name) for part in parts]) for name in ("K", "c2w", "sizes"))
+    return Views(torch.cat([part.pixels for part in parts]), Cameras(K, c2w, sizes))
+
+
+def cropped(views: Views, left: int, top: int) -> Views:
+    """Photos without margins of so many pixels on either side."""
+    cameras = views.cameras
+    K = cameras.K.clone()
+    K[:, 0, 2] -= left
+    K[:, 1, 2] -= top
+    width, height = cameras.width - 2 * left, cameras.height - 2 * top
+    images = views.images[:, top : top + height, left : left + width]
+    return Views.of(images.contiguous(), Cameras.of_size(K, cameras.c2w, width, height))
+
+
+def of_several_sizes(scene: Scene) -> Scene:
+    """A third of the training photos is landscape, a third portrait, a third halved in size."""
+    train = scene.train
+    thirds = [train[torch.arange(first, len(train), 3)] for first in range(3)]
+    small = thirds[2].cameras.scaled(0.5)
+    halved = Views.of(photograph(PILE, small, scene.background), small)
+    margin = SIZE // 8
+    return replace(scene, train=joined([cropped(thirds[0], 0, margin), cropped(thirds[1], margin, 0), halved]))
+
+
+def with_boxes(scene: Scene, seed: int) -> tuple[Scene, Scene]:
+    """Random boxes pasted over some training photos; and the same with masks of them."""
+    generator = torch.Generator().manual_seed(seed)
+    images = scene.train.images.clone()
+    known = torch.ones(images.shape[:3], dtype=torch.bool)
+    for view in torch.randperm(len(images), generator=generator)[: round(BOXED * len(images))].tolist():
+        for _ in range(3):
+            top, left = torch.randint(SIZE, (2,), generator=generator).tolist()
+            height, width = torch.randint(SIZE // 5, SIZE // 2, (2,), generator=generator).tolist()
+            place = slice(top, top + height), slice(left, left + width)
+            images[view][place] = torch.randint(256, (3,), generator=generator).to(torch.uint8)
+            known[view][place] = False
+    spoiled = Views.of(images, scene.train.cameras)
+    masked = replace(spoiled, known=Runs.of(known.flatten()))
+    return replace(scene, train=spoiled), replace(scene, train=masked)
+
+
+def through_fisheye(views: int, phase: float) -> Views:
+    """Photos of the same field of view as those of `around`, through a fisheye."""
+    straight = around(views, SIZE, phase)
+    K = straight.K.clone()
+    half = math.atan(float(0.5 * SIZE / K[0, 0, 0]))
+    focal = 0.5 * SIZE / (half * (1 + FISHEYE.k1 * half**2 + FISHEYE.k2 * half**4))
+    K[:, 0, 0] = K[:, 1, 1] = focal
+    lenses = Lenses(torch.tensor([FISHEYE]).repeat(views, 1), torch.ones(views, dtype=torch.bool))
+    cameras = Cameras(K, straight.c2w, straight.sizes, lenses)
+    return Views.of(photograph(PILE, cameras, GREY), cameras)
+
+
+def batch_seconds(scene: Scene) -> float:
+    """Of drawing one batch."""
+    start = time.perf_counter()
+    for step in range(DRAWS):
+        draw_rays(scene.train, RAYS, torch.Generator().manual_seed(step))
+    return (time.perf_counter() - start) / DRAWS
+
+
+def measure(seeds: list[int], output: Path) -> dict[str, Rows]:
+    """The table, a line a kind of photos."""
+    plain = replace(toy(PILE, GREY, SIZE, VIEWS, HELD_OUT), bounds=enclosing(PILE))
+    boxes, masks = with_boxes(plain, seeds[0])
+    fisheye = replace(plain, train=through_fisheye(VIEWS, 0.0), val=through_fisheye(HELD_OUT, 0.7))
+    scenes = {
+        "one size": plain,
+        "several sizes": of_several_sizes(plain),
+        "boxes": boxes,
+        "boxes, masked": masks,
+        "fisheye": fisheye,
+    }
+    for scene in scenes.values():
+        batch_seconds(scene)  # caches
+    # In turn: other work on the machine comes and goes.
+    rounds = [{name: batch_seconds(scene) for name, scene in scenes.items()} for _ in range(ROUNDS)]
+    rows = []
+    for name, scene in scenes.items():
+        found = []
+        for seed in seeds:
+            print(f"photos: {name}, seed {seed}", flush=True)
+            folder = output / "photos" / f"{name}_{seed}".replace(" ", "_")
+            found.append(nl.train(scene, steps=STEPS, seed=seed, device="cpu", folder=folder, options=QUIET).psnr)
+        held = scene.train
+        runs = 0 if held.known is None else held.known.starts.nbytes + held.known.ends.nbytes
+        rows.append(
+            {
+                "photos": name,
+                "psnr": fmean(found),
+                "bytes/pixel": (held.nbytes + runs) / len(held.pixels),
+                "batch_ms": 1000 * median(one[name] for one in rounds),
+                "batch": median(one[name] / one["one size"] for one in rounds),
+            }
+        )
+    return {"photos": rows}
