@@ -42,3 +42,10 @@ def test_grids_of_runs_that_say_no_size_are_as_fine_as_asked_for():
 def test_new_names_are_options(tmp_path: Path):
     cfg = composed([], tmp_path)
     assert all(value_at(cfg, new) is not None and value_at(cfg, old) is None for old, new in RENAMED.items())
+
+
+def test_runs_on_photos_that_say_nothing_of_lenses_had_them_undone():
+    dataset = {"_target_": "nerf_lightning.dataset.from_photos", "path": "x"}
+    assert check_config({"dataset": dataset}, "config.yaml")["dataset"]["undistort"] is True
+    said = {**dataset, "undistort": False}
+    assert check_config({"dataset": said}, "config.yaml")["dataset"] == said

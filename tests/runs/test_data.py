@@ -6,15 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
-from nerf_lightning.dataset import save_npz
+from nerf_lightning.dataset import Views, save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, load_scene, save_config, save_scene
+from tests.dataset.colmap_files import cameras_of, photos, write_colmap
 
 URL = "http://stranger.example/published.npz"
 
@@ -87,3 +89,28 @@ def test_a_strangers_run_neither_asks_the_network_nor_leaves_a_file(small_run: P
     assert "the network was asked" not in err
     assert code == 0, err
     assert not (tmp_path / ".profile").exists()
+
+
+def test_photos_are_seen_in_the_frame_of_the_run(tmp_path: Path):
+    """Half of a capture has another middle and another scale than all of it; its cameras still stand where they stood."""
+    whole = bricks(size=16, train_views=12, val_views=2, cache="")
+    views: Views = whole.train
+
+    def capture(name: str, chosen: list[int]) -> str:
+        some = views[torch.tensor(chosen)]
+        names = [f"{i:04d}.png" for i in chosen]
+        for old, new in zip(photos(tmp_path / name / "images", some, first=100), names, strict=True):
+            (tmp_path / name / "images" / old).rename(tmp_path / name / "images" / new)
+        write_colmap(tmp_path / name / "sparse/0", some.cameras.c2w.numpy(), names, cameras_of(some))
+        return str(tmp_path / name)
+
+    cfg = composed(["dataset=photos", f"dataset.path={capture('all', list(range(12)))}"], tmp_path / "run")
+    data = build_data(cfg)
+    (tmp_path / "run").mkdir()
+    save_scene(data, tmp_path / "run")
+    save_config(cfg, tmp_path / "run")
+    same, half = again(tmp_path / "run"), again(tmp_path / "run", capture("half", list(range(1, 8))))
+    assert torch.equal(same.train.cameras.c2w, data.scene.train.cameras.c2w)
+    at = [data.scene.train.names.index(name) for name in half.train.names]
+    torch.testing.assert_close(half.train.cameras.c2w, data.scene.train.cameras.c2w[at], atol=1e-4, rtol=0)
+    assert torch.equal(half.bounds.aabb, data.scene.bounds.aabb) and torch.equal(half.to_source, data.scene.to_source)
