@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import trimesh
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From z up, as tags and most scenes have it, to y up, as glTF wants it: written as the node's transform."""
+"""From z up, as scenes have it, to y up, as glTF wants it: written as the node's transform."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,13 @@ def colours_at(system: NeRF3D, places: Float[Tensor, "N 3"], outwards: Float[Ten
         for some, away in zip(places.split(together), outwards.split(together), strict=True)
     ]
     return to_bytes(torch.cat([torch.zeros(0, 3), *parts]))
+
+
+def upright(run: SceneRun) -> Float[ndarray, "4 4"]:
+    """The rotation from the photos' frame, whatever is up in it, to the scene's, whose z axis points up."""
+    turn = np.eye(4)
+    turn[:3, :3] = np.linalg.inv(run.to_source[:3, :3].double().numpy()) * run.scale
+    return turn
 
 
 def coloured_mesh(
@@ -66,7 +73,7 @@ def mesh_file(run: SceneRun, cameras: Cameras, volume: Volume, threshold: float 
     mesh, surface = coloured_mesh(run, cameras, volume, threshold)
     if suffix == "glb":
         scene = trimesh.Scene()
-        scene.add_geometry(mesh, transform=Y_UP)
+        scene.add_geometry(mesh, transform=Y_UP @ upright(run))
         content = scene.export(file_type="glb")
     else:
         content = mesh.export(file_type=suffix)

@@ -19,7 +19,7 @@ from nerf_lightning.export.mesh import mesh_file, points_file, voxels_file
 from nerf_lightning.export.volume import cells_across, region_of, sample_volume, volume_of
 
 SCALE, SHIFT = 0.02, torch.tensor([5.0, -1.0, 2.0])
-TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+TURN = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 RESOLUTION = 40
 
 
@@ -43,13 +43,15 @@ def test_meshes_stand_in_the_photos_own_frame(suffix: str):
     mesh = trimesh.load(io.BytesIO(shape.content), file_type=suffix, force="mesh")
     vertices = np.asarray(mesh.vertices)
     if suffix == "glb":
-        vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
+        # What is up in the scene is y in glTF, whatever is up in the photos' frame.
+        vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1) @ TURN.T.numpy()
     cell = SCALE * 2 / RESOLUTION
     radius = np.linalg.norm(vertices - there(CENTRE), axis=1)
     assert np.percentile(np.abs(radius - SCALE * RADIUS), 95) < 1.5 * cell
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * (SCALE * RADIUS) ** 3, rel=0.2)
     red, blue = mesh.visual.vertex_colors[:, 0], mesh.visual.vertex_colors[:, 2]
-    top, bottom = vertices[:, 2].argmax(), vertices[:, 2].argmin()
+    height = (vertices @ TURN.numpy())[:, 2]
+    top, bottom = height.argmax(), height.argmin()
     assert red[top] > 240 > 20 > blue[top] and blue[bottom] > 240 > 20 > red[bottom], "seen from outside"
 
 
