@@ -66,6 +66,13 @@ def test_rgb_renders(folder: Path):
     assert scene.background == (1.0, 1.0, 1.0)
 
 
+def test_renders_of_several_sizes(folder: Path):
+    imageio.imwrite(folder / "train" / "r_1.png", np.full((12, 16, 4), 7, np.uint8))
+    cameras = load_blender(folder).train.cameras
+    assert cameras.sizes.tolist() == [[8, 6], [16, 12]]
+    assert cameras.K[:, 0, 0].tolist() == [10, 20], "the angle of view is the same"
+
+
 def test_resize_never_enlarges(folder: Path):
     assert load_blender(folder, resize=100).resolution == (8, 6)
 

@@ -174,6 +174,10 @@ LLFF: dict[str, tuple[Spoil, str]] = {
 TRANSFORMS: dict[str, tuple[Spoil, str]] = {
     "another machine": (elsewhere, "which is not there (nor are 11 more)"),
     "pose nan": (frame(transform_matrix=[[math.nan] * 4] * 4), "frames[3].transform_matrix: found nan"),
+    "applied transform": (
+        lambda f: replaced("transforms.json", '{"frames"', '{"applied_transform": [[1, 0], [0, 1]], "frames"')(f),
+        "applied_transform: found shape (2, 2)",
+    ),
     "mask of no name": (frame(mask_path=3), "frames[3].mask_path: found 3"),
     "fisheye that folds": (frame(camera_model="OPENCV_FISHEYE", k1=-5), "found a distortion that folds the photo over"),
 }

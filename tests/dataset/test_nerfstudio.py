@@ -179,6 +179,42 @@ def test_split_by_name(capture: Path):
     assert (scene.val.images[1].numpy() == cv2.imread(str(capture / "images/0002.png"))).all()
 
 
+def test_what_nerfstudio_turned_is_turned_back(capture: Path):
+    before = load_nerfstudio(capture)
+    turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 2]])
+    whole = np.concatenate([turn, [[0, 0, 0, 1]]])
+
+    def apply(content: dict) -> None:
+        content.update(applied_transform=turn.tolist(), aabb_scale=4)
+        for frame in content["frames"]:
+            frame["transform_matrix"] = (whole @ np.array(frame["transform_matrix"])).tolist()
+
+    change(capture, apply)
+    after = load_nerfstudio(capture)
+    torch.testing.assert_close(after.to_source, before.to_source, atol=1e-5, rtol=0)
+    torch.testing.assert_close(after.train.cameras.c2w, before.train.cameras.c2w, atol=1e-5, rtol=0)
+
+
+def test_a_mask_of_a_frame(capture: Path, caplog: pytest.LogCaptureFixture):
+    mask = np.full((H, W), 255, np.uint8)
+    mask[:50] = 0
+    cv2.imwrite(str(capture / "mask.png"), mask)
+    change(capture, lambda c: c["frames"][1].update(mask_path="mask.png", depth_file_path="depth.png"))
+    with caplog.at_level(logging.INFO):
+        scene = load_nerfstudio(capture, reading=Reading(masked="unknown"))
+    assert "depth_file_path is not used" in caplog.text
+    assert torch.equal(scene.train.mask_of(0), torch.from_numpy(mask > 0)) and scene.train.mask_of(1).all()
+
+
+def test_a_fisheye_of_a_frame(tmp_path: Path):
+    lens = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": -0.001}
+    scene = load_nerfstudio(write(tmp_path / "capture", INTRINSICS, per_frame=lambda i: lens if i == 3 else {}))
+    lenses = scene.train.cameras.lenses
+    assert lenses is not None and lenses.fisheye.sum() == 1
+    which = int(lenses.fisheye.int().argmax())
+    assert lenses.coefficients[which, :4].tolist() == pytest.approx([0.02, -0.01, 0.003, -0.001])
+
+
 def test_holdout_counts(capture: Path):
     scene = load_nerfstudio(capture, reading=Reading(holdout=5))
     assert (len(scene.train), len(scene.val)) == (9, 3)

@@ -21,8 +21,8 @@ from nerf_lightning.errors import InputError
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
-LEFT_OUT = ("depth_file_path", "normal_file_path", "semantics_path")
-"""Keys of frames that other programs read."""
+LEFT_OUT = ("depth_file_path", "normal_file_path", "semantics_path", "aabb_scale", "ply_file_path")
+"""Keys that other programs read; the box comes from the photos and cameras."""
 
 log = logging.getLogger(__name__)
 
@@ -54,19 +54,36 @@ def load_nerfstudio(path: Path, name: str | None = None, reading: Reading = AS_I
     file = path / "transforms.json" if path.is_dir() else path
     content = checks.read_json(file)
     frames = _frames(file, content)
+    applied = _applied(file, content)
     optics = [_optics(file, content, frame, *image_header(frame.image)[:2]) for frame in frames]
     for key in LEFT_OUT:
-        if any(key in frame.entry for frame in frames):
-            log.warning("%s: %s is not used", file, key)
+        if key in content or any(key in frame.entry for frame in frames):
+            log.info("%s: %s is not used", file, key)
     folder = file.resolve().parent
     named = [_mask(file, frame) for frame in frames]
     masks = named if any(named) else find_masks([frame.image for frame in frames], folder)
     shots = [
-        Shot(frame.name, frame.image, frame.c2w, one, mask)
+        Shot(frame.name, frame.image, applied @ frame.c2w, one, mask)
         for frame, one, mask in zip(frames, optics, masks, strict=True)
     ]
     split = _split(file, content, frames, reading.holdout)
     return scene_of(path, name or (folder.name if file.stem == "transforms" else file.stem), shots, reading, split)
+
+
+def _applied(file: Path, content: dict) -> Float[np.ndarray, "4 4"]:
+    """From the file's world frame back to that of the capture, which nerfstudio turns by `applied_transform`, so that several
+    files made of one capture agree."""
+    if "applied_transform" not in content:
+        return np.eye(4)
+    key, last = "applied_transform", [[0.0, 0.0, 0.0, 1.0]]
+    try:
+        matrix = np.array(content[key], dtype=np.float64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise InputError(file, key, f"no matrix ({error})", "3 rows of 4 numbers") from error
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise InputError(file, key, f"shape {matrix.shape}", "3 rows of 4 numbers")
+    matrix = checks.rigid_poses(file, key, np.concatenate([matrix[:3], last])[None])[0]
+    return np.linalg.inv(matrix)
 
 
 def _mask(file: Path, frame: Frame) -> Path | None:
