@@ -1,6 +1,7 @@
 """From posed photos to a scene: one frame and one unit, split, bounds and an orbit, the same for every format."""
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, focus_point, held, orbit_like, turn_upright
+from nerf_lightning.cameras import Bounds, focus_point, held, orbit_like, transform, turn_upright
 from nerf_lightning.dataset.extent import border_colour, estimate_bounds, viewing_distance
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.scene import Scene
@@ -20,6 +21,12 @@ from nerf_lightning.dataset.views import Views
 log = logging.getLogger(__name__)
 
 BLACK = (0.0, 0.0, 0.0)
+NEAR = 0.25
+"""Sampling starts at this share of the nearest camera's distance to what all look at: nothing is photographed nearer by."""
+CLEAR = 0.7
+"""Or at this share of the nearest known content's distance, if that is less."""
+POINTS, STRAY = 4096, 0.01
+"""Points that are looked at, and the share of a view's that may be wrong."""
 
 
 def scene_of(
@@ -28,6 +35,8 @@ def scene_of(
     shots: Sequence[Shot],
     reading: Reading,
     split: tuple[list[int], list[int]] | None = None,
+    nearest: float | None = None,
+    points: Float[np.ndarray, "P 3"] | None = None,
 ) -> Scene:
     """Posed photos in some frame become a scene.
 
@@ -41,6 +50,8 @@ def scene_of(
         shots: sorted by name.
         reading: see there.
         split: indices of training and held-out photos; None holds out every `reading.holdout`-th.
+        nearest: distance of the nearest content to a camera, in the file's unit, where the file tells.
+        points: on surfaces, in the file's frame; they tell it too.
 
     Raises:
         InputError: nothing to train on or to hold out, or photos that cannot be read.
@@ -56,7 +67,13 @@ def scene_of(
     views = read_shots(source, moved, reading)
     train_views, val_views = views[train], views[seen(views, val, shots)]
     background = BLACK
-    bounds = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), unbounded=True)
+    known = [] if nearest is None else [nearest * float(torch.linalg.det(to_source[:3, :3])) ** (-1 / 3)]
+    if points is not None and len(points):
+        known.append(
+            nearest_point(transform(torch.linalg.inv(to_source), torch.from_numpy(points).float()), train_views)
+        )
+    near = min([NEAR * nearest_camera(train_views), *(CLEAR * distance for distance in known)])
+    bounds = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), unbounded=True, near=near)
     if views.channels == 4:
         bounds = estimate_bounds(train_views, BLACK)
     elif (colour := border_colour(train_views)) is not None:
@@ -71,6 +88,22 @@ def scene_of(
         background=background,
         to_source=to_source,
     )
+
+
+def nearest_camera(views: Views) -> float:
+    """Distance of the nearest camera to what all look at, at most the usual one, in the scene's unit."""
+    return min(1.0, float(views.cameras.centres.norm(dim=1).min()))
+
+
+def nearest_point(points: Float[Tensor, "P 3"], views: Views) -> float:
+    """Distance of the nearest points to the camera that sees them, stray ones aside; infinite where none sees any."""
+    some = points[:: -(-len(points) // POINTS)]
+    found = [math.inf]
+    for view in range(len(views)):
+        distance = (some - views.cameras.centres[view]).norm(dim=1)[views.cameras.project(some, view)[2]]
+        if len(distance):
+            found.append(float(distance.quantile(STRAY)))
+    return min(found)
 
 
 def seen(views: Views, val: Tensor, shots: Sequence[Shot]) -> Tensor:

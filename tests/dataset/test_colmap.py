@@ -178,3 +178,32 @@ def test_a_real_capture_is_the_same_in_both_formats(real_data: Path, tmp_path: P
     b = open_scene(str(tmp_path), resize=40)
     torch.testing.assert_close(a.train.cameras.c2w, b.train.cameras.c2w, atol=1e-5, rtol=0)
     assert a.bounds.unbounded and len(a.train) == 67
+
+
+def test_points_tell_where_content_starts(views: Views, tmp_path: Path):
+    """Photos on grey noise, so that the scene is unbounded; cameras stand 4 units from the middle."""
+    rng = np.random.default_rng(0)
+    noise = torch.from_numpy(rng.integers(0, 255, (*views.images.shape[:3], 3), np.uint8))
+    grey = Views.of(noise, views.cameras)
+    names = photos(tmp_path / "images", grey)
+
+    def near(points: np.ndarray) -> float | None:
+        write_colmap(tmp_path / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views), points=points)
+        return open_scene(str(tmp_path)).bounds.near
+
+    middle = rng.normal(0, 0.1, (300, 3))
+    assert near(middle) == near(np.zeros((0, 3))) == pytest.approx(0.25, abs=0.01)
+    ahead = views.cameras.centres[2].numpy() + 0.2 * views.cameras.c2w[2, :3, 2].numpy()
+    assert near(np.concatenate([middle, ahead + 0.01 * middle])) == pytest.approx(0.7 * 0.2 / 4, rel=0.1)
+
+
+def test_llff_tells_where_content_starts(views: Views, tmp_path: Path):
+    rng = np.random.default_rng(0)
+    grey = Views.of(torch.from_numpy(rng.integers(0, 255, (*views.images.shape[:3], 3), np.uint8)), views.cameras)
+    photos(tmp_path / "images", grey)
+    write_llff(tmp_path / "poses_bounds.npy", views)
+    rows = np.load(tmp_path / "poses_bounds.npy")
+    assert open_scene(str(tmp_path)).bounds.near == pytest.approx(0.7 / 4, rel=0.02), "the file says 1"
+    rows[:, 15] = 4
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    assert open_scene(str(tmp_path)).bounds.near == pytest.approx(0.25, rel=0.02)

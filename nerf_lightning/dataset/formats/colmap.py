@@ -87,7 +87,7 @@ def load_colmap(
         Shot(image.name, path, np.linalg.inv(image.w2c), model.cameras[image.camera], mask, upright)
         for image, path, mask in zip(kept, paths, masks, strict=True)
     ]
-    return scene_of(place, name or scene_folder.resolve().name, shots, reading)
+    return scene_of(place, name or scene_folder.resolve().name, shots, reading, points=model.points)
 
 
 def _check(folder: Path, model: Model) -> None:

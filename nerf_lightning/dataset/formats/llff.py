@@ -32,7 +32,7 @@ def load_llff(folder: Path, name: str | None = None, reading: Reading = AS_IT_IS
         InputError: a damaged file, or as many photos as poses are not there.
     """
     path = folder / POSES
-    c2w, sizes = _rows(path)
+    c2w, sizes, nearest = _rows(path)
     photos = _photos(folder, len(c2w))
     masks = find_masks(photos, folder)
     shots = []
@@ -44,11 +44,11 @@ def load_llff(folder: Path, name: str | None = None, reading: Reading = AS_IT_IS
             raise InputError(photo, "", found, f"{width:g}x{height:g} as in {POSES}, or the same reduced")
         optics = Optics(wide, high, focal, focal, wide / 2, high / 2)
         shots.append(Shot(photo.name, photo, pose, optics, mask))
-    return scene_of(folder, name or folder.resolve().name, shots, reading)
+    return scene_of(folder, name or folder.resolve().name, shots, reading, nearest=nearest)
 
 
-def _rows(path: Path) -> tuple[Float[np.ndarray, "V 4 4"], Float[np.ndarray, "V 3"]]:
-    """Poses, OpenCV camera to world, and height, width and focal length."""
+def _rows(path: Path) -> tuple[Float[np.ndarray, "V 4 4"], Float[np.ndarray, "V 3"], float | None]:
+    """Poses, OpenCV camera to world; height, width and focal length; and the least depth, if it is one."""
     checks.existing_file(path)
     try:
         with path.open("rb") as file:
@@ -67,7 +67,8 @@ def _rows(path: Path) -> tuple[Float[np.ndarray, "V 4 4"], Float[np.ndarray, "V 
     sizes = poses[:, :, 4]
     if not len(poses) or not (np.isfinite(sizes).all() and (sizes > 0).all()):
         raise InputError(path, "", "no photo, or a height, width or focal length that is none", "positive numbers")
-    return checks.rigid_poses(path, "row {}", c2w), sizes
+    nearest = float(rows[:, 15].min())
+    return checks.rigid_poses(path, "row {}", c2w), sizes, nearest if 0 < nearest < np.inf else None
 
 
 def _photos(folder: Path, count: int) -> list[Path]:
