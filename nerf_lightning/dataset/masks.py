@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from nerf_lightning.dataset.extent import around
 from nerf_lightning.dataset.formats.decode import EXTENSIONS, read_pixels
 
 log = logging.getLogger(__name__)
@@ -77,10 +78,10 @@ def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.nda
 
 
 def cut_out(image: UInt8[np.ndarray, "H W C"], kept: Bool[np.ndarray, "H W"]) -> bool:
-    """Whether what a mask leaves out is of one colour: the photo is cut out already."""
+    """Whether what a mask leaves out is most of the photo's border, and of one colour: its subject is cut out already."""
+    if around(kept).mean() > 0.5:
+        return False
     masked = image[..., :3][~kept]
-    if not len(masked):
-        return True
     middle = np.median(masked, axis=0)
     return bool(np.mean(np.abs(masked - middle).max(axis=1) <= FLAT) > 0.95)
 
@@ -89,6 +90,5 @@ def seem_inverted(masks: Sequence[Bool[np.ndarray, "_ _"]]) -> bool:
     """Whether masks leave out one spot in the middle of most photos and keep the borders: what is photographed, it seems."""
     small = [cv2.resize(kept.astype(np.float32), (CELLS, CELLS), interpolation=cv2.INTER_AREA) for kept in masks]
     kept = np.mean(small, axis=0)
-    border = np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])
     quarter = CELLS // 4
-    return bool(kept[quarter:-quarter, quarter:-quarter].min() < 0.3 and border.mean() > 0.7)
+    return bool(kept[quarter:-quarter, quarter:-quarter].min() < 0.3 and around(kept).mean() > 0.7)

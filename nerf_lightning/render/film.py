@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
+from nerf_lightning.dataset.formats.decode import image_header
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.files import atomic, write_json
@@ -51,7 +52,7 @@ def make_film(plan: dict[str, Any], draw: Callable[[int], Picture], count: int, 
 
     Args:
         plan: all that the frames depend on, as plain values.
-        draw: makes a frame, all of one size.
+        draw: makes a frame.
         count: how many.
         output: a folder, or a file whose suffix says what kind of film.
         fps: frames a second.
@@ -90,12 +91,21 @@ def prepare(folder: Path, plan: dict[str, Any], own: bool) -> None:
     write_json(folder / PLAN, plan)
 
 
+def framed(files: list[Path]) -> Iterator[UInt8[ndarray, "H W C"]]:
+    """Frames on disk, those of smaller photos in the middle of a black or transparent frame of the size of the largest."""
+    sizes = [image_header(file)[:2] for file in files]
+    width, height = (max(sides) for sides in zip(*sizes, strict=True))
+    for file, (w, h) in zip(files, sizes, strict=True):
+        left, top = (width - w) // 2, (height - h) // 2
+        yield np.pad(imageio.imread(file), ((top, height - h - top), (left, width - w - left), (0, 0)))
+
+
 def join(files: list[Path], output: Path, fps: float) -> None:
     """Frames on disk -> one film, of the kind that its suffix says."""
     if output.suffix == ".mp4":
         join_mp4(files, output, fps)
         return
-    frames = np.stack([imageio.imread(file) for file in files])
+    frames = np.stack(list(framed(files)))
     quality: dict[str, Any] = {"quality": QUALITY} if output.suffix == ".webp" else {}
     imageio.imwrite(output, frames, plugin="pillow", duration=1000 / fps, loop=0, **quality)
 
@@ -108,8 +118,8 @@ def join_mp4(files: list[Path], output: Path, fps: float) -> None:
         stream: Any = container.add_stream(
             "libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": str(CRF)}
         )
-        for index, file in enumerate(files):
-            picture = even(imageio.imread(file))
+        for index, frame in enumerate(framed(files)):
+            picture = even(frame)
             if not index:
                 stream.height, stream.width = picture.shape[:2]
                 stream.pix_fmt = "yuv420p"

@@ -50,7 +50,8 @@ def render(options: RenderOptions) -> None:
     there = make_film(plan, frame, len(route.cameras), output, options.fps)
     synchronize(device)
     seconds = time.perf_counter() - began
-    frames = f"{len(route.cameras)} frames of {route.cameras.width} x {route.cameras.height} pixels"
+    width, height = route.cameras.sizes.amax(0).tolist()
+    frames = f"{len(route.cameras)} frames of {width} x {height} pixels"
     before = f", {there} of them there already" if there else ""
     print(f"{output}: {frames} in {seconds:.1f} s on {device_in_words(device)}{before}")
 

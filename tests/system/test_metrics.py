@@ -41,6 +41,18 @@ def test_ssim_of_pictures_below_its_window_is_not_a_number(height, width):
     assert math.isnan(ssim(torch.rand(height, width, 3), torch.rand(height, width, 3)))
 
 
+def test_only_known_pixels_are_scored():
+    image, truth = torch.rand(20, 24, 3), torch.rand(20, 24, 3)
+    known = torch.rand(20, 24) < 0.6
+    assert psnr(image, truth, known) == pytest.approx(psnr(image[known], truth[known]))
+    spoiled = torch.where(known[..., None], truth, torch.rand(20, 24, 3))
+    assert psnr(image, spoiled, known) == psnr(image, truth, known)
+    assert ssim(image, spoiled, known) == pytest.approx(ssim(image, truth, known))
+    assert ssim(image, truth, torch.ones_like(known)) == pytest.approx(ssim(image, truth))
+    nothing = torch.zeros_like(known)
+    assert math.isnan(psnr(image, truth, nothing)) and math.isnan(ssim(image, truth, nothing))
+
+
 def test_pictures_of_different_sizes_are_refused_in_tests():
     for call in (psnr, ssim):
         with pytest.raises(jaxtyping.TypeCheckError):

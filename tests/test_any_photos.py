@@ -1,0 +1,78 @@
+"""Photos of several sizes through a fisheye, some masked: trained on, judged, filmed, exported and looked at."""
+
+import json
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+import nerf_lightning as nl
+from nerf_lightning.cameras import Cameras, Distortion, Lenses
+from nerf_lightning.config.compose import composed
+from nerf_lightning.dataset import Views
+from nerf_lightning.evaluate.__main__ import task as evaluate
+from nerf_lightning.export.__main__ import task as export
+from nerf_lightning.render.__main__ import task as render
+from nerf_lightning.stability.toys import PILE, around, photograph
+from nerf_lightning.view.drawing import frusta
+from tests.dataset.colmap_files import cameras_of, photos, write_colmap
+
+K1, STEPS = 0.02, 12
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """16 photos on grey: every second is twice as wide as high; a box is masked in every third."""
+    root = tmp_path_factory.mktemp("capture")
+    cameras = around(16, 24)
+    lenses = Lenses(torch.tensor([Distortion(K1)]).repeat(16, 1), torch.ones(16, dtype=torch.bool))
+    square = Cameras(cameras.K, cameras.c2w, cameras.sizes, lenses)
+    K = cameras.K.clone()
+    K[:, 0, 2] += 12
+    wide = Cameras(K, cameras.c2w, torch.tensor([[48, 24]]).repeat(16, 1), lenses)
+    names, sizes = [], {}
+    for i in range(16):
+        camera = (wide if i % 2 else square)[i]
+        some = Views.of(photograph(PILE, camera, (0.5, 0.5, 0.5)), camera)
+        names += photos(root / "images", some, first=i)
+        sizes[i + 1] = cameras_of(some, "SIMPLE_RADIAL_FISHEYE", (K1,))[1]
+        mask = np.full((24, camera.width), 255, np.uint8)
+        mask[4:15, 3:13] = 0 if i % 3 == 0 else 255
+        (root / "masks").mkdir(exist_ok=True)
+        imageio.imwrite(root / "masks" / names[-1], mask)
+    write_colmap(root / "sparse/0", cameras.c2w.numpy(), names, sizes)
+    return root
+
+
+def test_a_run_on_any_photos(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    scene = nl.load_scene(folder)
+    assert scene.train.known is not None and scene.train.cameras.lenses is not None
+    assert sorted(map(tuple, scene.val.cameras.sizes.tolist())) == [(24, 24), (24, 24)]
+    assert {tuple(size) for size in scene.train.cameras.sizes.tolist()} == {(24, 24), (48, 24)}
+    options = [
+        "callbacks.snapshots=null",
+        "callbacks.orbit.frames=2",
+        "~logger",
+        "sampler.samples=32",
+    ]
+    run = nl.train(scene, steps=STEPS, seed=1, device="cpu", folder=tmp_path / "run", options=options)
+    assert np.isfinite(run.psnr) and run.psnr > 10
+
+    evaluate(composed([f"run={tmp_path / 'run'}", "device=cpu"], tmp_path, "evaluate"))
+    judged = json.loads((tmp_path / "run/evaluation/views.json").read_text())
+    assert np.mean([view["psnr"] for view in judged["views"]]) == pytest.approx(run.psnr, abs=0.02)
+    assert imageio.imread(tmp_path / "run/evaluation/worst.png").ndim == 3
+
+    film = tmp_path / "film.webp"
+    render(
+        composed(
+            [f"run={tmp_path / 'run'}", "path=train", "frames=4", f"output={film}", "device=cpu"], tmp_path, "render"
+        )
+    )
+    assert imageio.improps(film, plugin="pillow", index=...).n_images == 4, "frames of two sizes make one film"
+
+    export(composed([f"run={tmp_path / 'run'}", "loss=20", "device=cpu"], tmp_path, "export"))
+    assert (tmp_path / "run/compact.npz").exists()
+    assert len(list(frusta(scene.train, "train", 16))) == len(scene.train)
