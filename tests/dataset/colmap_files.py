@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerf_lightning.dataset import Views
-from nerf_lightning.dataset.formats.colmap_model import MODELS, NUMBERS
+from nerf_lightning.dataset.formats.colmap_cameras import MODELS, NUMBERS
 
 Camera = tuple[str, int, int, tuple[float, ...]]
 """Model, width, height and parameters."""

@@ -11,7 +11,7 @@ import torch
 
 from nerf_lightning.cameras import Distortion
 from nerf_lightning.dataset import Scene, Views, open_scene
-from nerf_lightning.dataset.formats.colmap_model import MODELS, NUMBERS, optics_of
+from nerf_lightning.dataset.formats.colmap_cameras import MODELS, NUMBERS, optics_of
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.errors import InputError
 from tests.dataset.colmap_files import cameras_of, photos, write_colmap, write_llff, write_transforms
