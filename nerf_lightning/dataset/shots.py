@@ -115,7 +115,7 @@ def read_shots(source: Path, shots: Sequence[Shot], reading: Reading) -> Views:
         if image.shape[2] == 4 and channels == 3:
             mask = image[..., 3] if mask is None else np.minimum(mask, image[..., 3])
             image = np.ascontiguousarray(image[..., :3])
-        if channels == 4:
+        if channels == 4 and (image.shape[2] == 3 or mask is not None):
             cover = image[..., 3] if image.shape[2] == 4 else np.full(image.shape[:2], 255, np.uint8)
             cover = np.minimum(cover, mask) if mask is not None and masked == "empty" else cover
             image = np.dstack([image[..., :3], cover])
