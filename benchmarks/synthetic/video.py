@@ -33,8 +33,10 @@ def around(layout: TagLayout, lens: Lens, count: int) -> Float[np.ndarray, "coun
     return np.stack(c2w)
 
 
-def blurred(picture: UInt8[np.ndarray, "H W 3"], pixels: float, angle: float | None = None) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture blurred by a Gaussian of a standard deviation in pixels, or along a line of that length at an angle (radians)."""
+def blurred(
+    picture: UInt8[np.ndarray, "H W 3"], pixels: float, angle: float | None = None
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture blurred by a Gaussian of a standard deviation in pixels, or along a line that long at an angle (radians)."""
     if angle is None:
         return cv2.GaussianBlur(picture, (0, 0), pixels)
     half = int(np.ceil(pixels / 2)) + 1
@@ -69,7 +71,7 @@ def write_video(file: Path, pictures: Iterable[UInt8[np.ndarray, "H W 3"]], quar
 
 
 def _flag(file: Path, quarter_turns: int) -> None:
-    """Writes the rotation into the track header, where no encoder's option reaches: a matrix of 16.16 numbers (ISO 14496-12)."""
+    """Writes the rotation into the track header, which no option reaches: a matrix of 16.16 numbers (ISO 14496-12)."""
     data = bytearray(file.read_bytes())
     at = data.index(b"tkhd") + 4 + 40
     c, s = round(np.cos(np.pi / 2 * quarter_turns)), round(np.sin(np.pi / 2 * quarter_turns))

@@ -1,5 +1,5 @@
-import importlib.util
 import json
+import sys
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -75,6 +75,7 @@ def test_photos_that_show_nothing(tmp_path: Path):
 
 
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    imageio.imwrite(tmp_path / "0.png", np.zeros((12, 16, 3), np.uint8))
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[colmap\]'"):
         capture_without_tags(tmp_path, Packing(tmp_path / "scene.npz"))

@@ -19,7 +19,7 @@ STILL = 0.05
 ALIKE = 0.03
 """Difference in sharpness (3 % of the fine detail) up to which frames are equally sharp: noise makes up as much."""
 FINE, COARSE = 1.0, 3.0
-"""Standard deviations of the Gaussians, in pixels, that the two scales of detail are smoothed with; the first takes noise away."""
+"""Standard deviations in pixels of the Gaussians that bring out the two scales of detail; the first takes noise away."""
 
 
 def motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float:
@@ -42,7 +42,9 @@ def sharpness(picture: UInt8[np.ndarray, "H W"]) -> float:
     shows, so that only pictures of nearly the same can be compared.
     """
     pixels = picture.astype(np.float32)
-    fine, coarse = (cv2.Laplacian(cv2.GaussianBlur(pixels, (0, 0), sigma), cv2.CV_32F).var() for sigma in (FINE, COARSE))
+    fine, coarse = (
+        cv2.Laplacian(cv2.GaussianBlur(pixels, (0, 0), sigma), cv2.CV_32F).var() for sigma in (FINE, COARSE)
+    )
     return math.log((float(fine) + 1e-6) / (float(coarse) + 1e-6))
 
 

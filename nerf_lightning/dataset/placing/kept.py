@@ -38,7 +38,9 @@ def find_kept(beside: Path, sources: dict[str, Any], whole: Callable[[Path], boo
             continue
         if not (folder / RECORD).is_file():
             found = f"a folder without {RECORD}, which was not made here"
-            raise InputError(folder, "", found, "nothing, or what an earlier run made", "move it elsewhere or rename it")
+            raise InputError(
+                folder, "", found, "nothing, or what an earlier run made", "move it elsewhere or rename it"
+            )
         if _read(folder / RECORD) == sources and whole(folder):
             return folder
         log.info("%s was made of other files, or is not whole: it is made again", folder)

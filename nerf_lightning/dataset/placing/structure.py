@@ -2,7 +2,6 @@
 
 import itertools
 import logging
-import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -135,11 +134,13 @@ def _match(database: Path, names: Sequence[str], file: Path) -> None:
     jobs = sorted(pairs(len(names)), key=lambda pair: (pair[0] // BLOCK, pair[1] // BLOCK, pair))
     options = pycolmap.ImportedPairingOptions()
     options.match_list_path = file
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
     with counted(len(jobs), "matching pairs of photos") as step:
         for start in range(0, len(jobs), CHUNK):
             chunk = jobs[start : start + CHUNK]
             file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in chunk), encoding="utf-8")
-            pycolmap.match_image_pairs(database, pairing_options=options)
+            pycolmap.match_image_pairs(database, pairing_options=options, verification_options=verification)
             step(len(chunk))
 
 
