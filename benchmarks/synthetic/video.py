@@ -1,12 +1,13 @@
 """Videos of a known path around the tabletop, some of whose frames are blurred."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import av
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 
 from benchmarks.synthetic.tabletop import Tabletop
@@ -29,8 +30,8 @@ def around(layout: TagLayout, lens: Lens, count: int) -> Float[np.ndarray, "coun
     distance = reach * 2.4 * lens.fx / lens.height * (1 + 0.12 * np.cos(3 * turns))
     ring = np.cos(elevation)
     eye = centre + distance[:, None] * np.stack([ring * np.cos(turns), ring * np.sin(turns), np.sin(elevation)], -1)
-    c2w = [look_at(*_tensors(one, centre, np.array([0.0, 0.0, 1.0]))).numpy() for one in eye]
-    return np.stack(c2w)
+    up = torch.tensor([0.0, 0.0, 1.0]).double()
+    return look_at(torch.from_numpy(eye), torch.from_numpy(centre), up).numpy()
 
 
 def blurred(
@@ -48,6 +49,21 @@ def blurred(
             col, row = np.floor(x).astype(int) + dx, np.floor(y).astype(int) + dy
             np.add.at(kernel, (row, col), (1 - np.abs(x - col)) * (1 - np.abs(y - row)))
     return cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT)
+
+
+BLURS = ((0.5, False), (0.7, False), (1.0, False), (2.0, False), (1.5, True), (2.5, True), (4.0, True), (8.0, True))
+"""Pixels, and whether along a line; the weakest can hardly be seen."""
+
+
+def with_blurs(
+    pictures: Iterable[UInt8[np.ndarray, "H W 3"]], seed: int, every: int = 3
+) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    """Pictures of which each `every`-th is blurred, from the second on, by each of `BLURS` in turn, along random lines."""
+    rng = np.random.default_rng(seed)
+    for index, picture in enumerate(pictures):
+        pixels, line = BLURS[index // every % len(BLURS)]
+        angle = float(rng.uniform(0, np.pi)) if line else None
+        yield blurred(picture, pixels, angle) if index % every == 1 else picture
 
 
 def write_video(file: Path, pictures: Iterable[UInt8[np.ndarray, "H W 3"]], quarter_turns: int = 0) -> None:
@@ -79,9 +95,3 @@ def _flag(file: Path, quarter_turns: int) -> None:
     for offset, value in ((0, c), (4, -s), (12, s), (16, c)):
         data[at + offset : at + offset + 4] = (value * 65536).to_bytes(4, "big", signed=True)
     file.write_bytes(data)
-
-
-def _tensors(*vectors: Float[np.ndarray, "3"]) -> Any:
-    import torch
-
-    return [torch.from_numpy(vector) for vector in vectors]

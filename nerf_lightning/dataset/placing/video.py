@@ -21,7 +21,7 @@ VIDEOS = {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".3gp", ".mts", ".m2t
 
 
 def frames(video: Path, words: str) -> Iterator["av.VideoFrame"]:
-    """Decodes all pictures of a video's first picture stream, with a progress bar; memory holds a few.
+    """Decodes all whole pictures of a video's first picture stream, with a progress bar; memory holds a few.
 
     Args:
         video: of any kind that FFmpeg reads.
@@ -44,7 +44,9 @@ def frames(video: Path, words: str) -> Iterator["av.VideoFrame"]:
         seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
         seconds = seconds or float(container.duration or 0) / av.time_base
         total = max(1, stream.frames or round(seconds * rate))
-        yield from tracked(container.decode(stream), total, words)
+        for frame in tracked(container.decode(stream), total, words):
+            if not frame.is_corrupt:  # FFmpeg paints over what is damaged
+                yield frame
 
 
 @contextmanager
