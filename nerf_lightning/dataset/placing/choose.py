@@ -14,6 +14,8 @@ CHOICE = 3
 """Frames in a stretch, at the least: that the sharpest is no blurred one, though every third is."""
 FEWEST = 3
 """Frames of which a scene can be made."""
+SLOW = 1 / 8
+"""Of the mean motion: where there is less, the camera counts as standing still."""
 STILL = 0.05
 """Motion in pixels of the small pictures that noise and compression make up where nothing moves."""
 ALIKE = 0.03
@@ -50,14 +52,15 @@ def sharpness(picture: UInt8[np.ndarray, "H W"]) -> float:
 
 def suitable_count(motions: Float[np.ndarray, "N"]) -> int:
     """How many frames to take of a video, from the motion that leads to each of its frames."""
-    return max(FEWEST, min(MOST, len(motions) // CHOICE, math.ceil(float(motions.sum()) / STEP)))
+    moving = 1 + int(np.count_nonzero(motions > SLOW * motions.mean()))
+    return max(FEWEST, min(MOST, moving // CHOICE, math.ceil(float(motions.sum()) / STEP)))
 
 
 def choose(motions: Float[np.ndarray, "N"], sharp: Float[np.ndarray, "N"], count: int) -> list[int]:
     """Divides a video into stretches of equal motion and takes the sharpest frame of each, compared with those around it.
 
     Of equally sharp frames it is the one nearest to the stretch's middle. Where the camera moves fast a stretch holds
-    `CHOICE` frames nevertheless, if the video is long enough.
+    `CHOICE` frames nevertheless, if there are enough that show motion.
 
     Args:
         motions: that lead to each frame.
@@ -67,12 +70,11 @@ def choose(motions: Float[np.ndarray, "N"], sharp: Float[np.ndarray, "N"], count
     Returns:
         Indices in order.
     """
-    choice = min(CHOICE, len(motions) / count)
     # Frames where nothing moves count a little, so that a video of a still scene can be divided too.
     steps = motions + 1e-6 * max(float(motions.sum()), 1.0) / len(motions)
     capped = steps
     for _ in range(100):
-        capped = np.minimum(steps, capped.sum() / (choice * count))
+        capped = np.minimum(steps, max(capped.sum() / (CHOICE * count), SLOW * steps.mean()))
     path = np.cumsum(capped)
     place = count * (path - capped / 2) / path[-1]  # of each frame's middle, in stretches
     around = max(4, round(len(motions) / count))
