@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from dataset.exif import tags
 from PIL import Image
 
 from benchmarks.synthetic.photos import Truth
@@ -28,17 +29,6 @@ TURNED = ("5.jpg", "6.jpg")
 """Stored lying, with a tag that says so."""
 
 
-def tags(orientation: int = 1, focal_35mm: int | None = None, **more: object) -> bytes:
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    details = exif.get_ifd(0x8769)
-    if focal_35mm:
-        details[0xA405] = focal_35mm
-    for name, value in more.items():
-        {"make": exif, "model": exif, "focal": details}[name][{"make": 271, "model": 272, "focal": 37386}[name]] = value
-    return exif.tobytes()
-
-
 @pytest.fixture(scope="module")
 def photos(made: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A third of the way around an object: two cameras, and two photos with an EXIF rotation; read only."""
@@ -50,7 +40,7 @@ def photos(made: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -
             pixels = cv2.resize(pixels, (380, 285), interpolation=cv2.INTER_AREA)
         stored = np.rot90(pixels) if name in TURNED else pixels
         # 350 pixels of 400x300 are 30 mm of a film; the smaller photos do not tell.
-        exif = tags(6 if name in TURNED else 1, None if name in SMALLER else 30)
+        exif = tags(6 if name in TURNED else 1, focal_35mm=0 if name in SMALLER else 30)
         Image.fromarray(np.ascontiguousarray(stored)).save(folder / name, quality=97, exif=exif)
     return folder
 
@@ -85,7 +75,10 @@ def test_photos_of_two_cameras_are_placed_upright_and_in_full_size(placed, made:
     model = pycolmap.Reconstruction(tmp_path)
     images = {image.name: image for image in model.images.values() if image.has_pose}
     assert len(images) >= 7 and set(images) <= {f"{number}.jpg" for number in range(8)}
-    sizes = {name: (model.cameras[image.camera_id].width, model.cameras[image.camera_id].height) for name, image in images.items()}
+    sizes = {
+        name: (model.cameras[image.camera_id].width, model.cameras[image.camera_id].height)
+        for name, image in images.items()
+    }
     assert sizes == {name: (380, 285) if name in SMALLER else (400, 300) for name in images}
     kinds = {image.camera_id: model.cameras[image.camera_id].model_name for image in images.values()}
     assert sorted(kinds.values()) == ["OPENCV", "SIMPLE_RADIAL"]

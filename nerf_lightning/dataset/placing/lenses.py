@@ -6,10 +6,12 @@ import struct
 import tempfile
 import warnings
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 MAKE, MODEL, DETAILS, FOCAL, FOCAL_35MM = 0x010F, 0x0110, 0x8769, 0x920A, 0xA405
 """Numbers of EXIF tags."""
@@ -65,7 +67,7 @@ def _of_known_sensor(shot: Shot) -> float | None:
 
     exif = Image.Exif()
     exif[MAKE], exif[MODEL] = shot.make, shot.model
-    exif.get_ifd(DETAILS)[FOCAL] = shot.focal
+    exif.get_ifd(DETAILS)[FOCAL] = IFDRational(Fraction(shot.focal).limit_denominator(1000))
     with tempfile.TemporaryDirectory() as folder:
         blank = Path(folder) / "blank.jpg"
         Image.new("L", (shot.width, shot.height)).save(blank, exif=exif.tobytes())
