@@ -4,6 +4,7 @@ from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
+import pycolmap
 import pytest
 import yaml
 from capture.views import SIX, SMALL, camera
@@ -11,6 +12,7 @@ from capture.views import SIX, SMALL, camera
 from benchmarks.synthetic.photos import Flaws, render_photo
 from benchmarks.synthetic.viewpoints import object_cameras
 from nerf_lightning.capture.outputs import Packing
+from nerf_lightning.capture.poses import structure
 from nerf_lightning.capture.poses.geometry import to_matrix
 from nerf_lightning.capture.poses.structure import capture_without_tags, upright
 from nerf_lightning.dataset import open_scene
@@ -62,6 +64,18 @@ def test_photos_without_tags_give_the_same_outputs(tmp_path: Path):
     assert [entry["name"] for entry in entries] == sorted(truth)
     content = yaml.safe_load((tmp_path / "calibration.yaml").read_text())
     assert content["fx"] == pytest.approx(SMALL.fx, rel=0.1)
+
+
+def test_photos_of_another_size_or_zoom_are_left_out(tmp_path: Path):
+    model, shots = pycolmap.Reconstruction(), {"a": 1, "b": 1, "c": 2, "d": 3, "e": 1}
+    for number, (focal, width, height) in enumerate(((50.0, 40, 30), (90.0, 40, 30), (50.0, 30, 40)), 1):
+        model.add_camera(pycolmap.Camera.create_from_model_name(number, "OPENCV", focal, width, height))
+    images = {name: pycolmap.Image(name=name, camera_id=number, image_id=7) for name, number in shots.items()}
+    others = structure._others(tmp_path, images, model)
+    assert set(others) == {"c", "d"} and "zoom" in others["c"] and "30x40 pixels, held the other way" in others["d"]
+    assert structure._lens(model.cameras[2]).fx == 90
+    simple = structure._lens(pycolmap.Camera.create_from_model_name(4, "SIMPLE_RADIAL", 50.0, 40, 30))
+    assert (simple.fx, simple.fy, simple.cx, simple.cy, simple.distortion) == (50, 50, 20, 15, (0,) * 5)
 
 
 def test_photos_that_show_nothing(tmp_path: Path):

@@ -75,6 +75,7 @@ def measure(video: Path) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]
 
 
 def _write(video: Path, folder: Path, count: int | None) -> None:
+    log.info("%s: measuring blur and motion", video)
     motions, sharp = measure(video)
     if len(motions) < FEWEST:
         found = f"{len(motions)} frame{'' if len(motions) == 1 else 's'}"

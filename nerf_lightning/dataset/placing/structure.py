@@ -53,7 +53,7 @@ def reconstruct(photos: Sequence[Path], workspace: Path) -> "pycolmap.Reconstruc
     """
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # what fails is told in our own words
     pycolmap.set_random_seed(0)
     database, copies = workspace / "database.db", workspace / "photos"
     names = [f"{number:06d}.png" for number in range(len(photos))]  # no file name matters to COLMAP
@@ -110,6 +110,7 @@ def _features(database: Path, copies: Path, names: Sequence[str], shots: Sequenc
             number = content.write_camera(camera)
             log.info("%d photos of %s, focal length %s", len(members), _described(taken), _pixels(told))
             calls += [(number, members[i : i + FEATURED]) for i in range(0, len(members), FEATURED)]
+    log.info("looking for features in them")
     with counted(len(names), "looking for features") as step:
         for number, members in calls:
             reader = pycolmap.ImageReaderOptions()
@@ -136,6 +137,7 @@ def _match(database: Path, names: Sequence[str], file: Path) -> None:
     options.match_list_path = file
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
+    log.info("matching %d pairs", len(jobs))
     with counted(len(jobs), "matching pairs of photos") as step:
         for start in range(0, len(jobs), CHUNK):
             chunk = jobs[start : start + CHUNK]
@@ -151,6 +153,7 @@ def _map(database: Path, copies: Path, folder: Path, count: int) -> "dict[int, p
     options.min_model_size = FEWEST
     options.random_seed = 0
     folder.mkdir()
+    log.info("placing them")
     with counted(count, "placing photos") as step:
         return pycolmap.incremental_mapping(
             database,
