@@ -1,4 +1,4 @@
-"""python -m benchmarks: what methods, kernels, framework, capture, photos, 2D fields, sizes and shapes cost and give.
+"""python -m benchmarks: what methods, kernels, framework, captures, photos, 2D fields, sizes, shapes and videos cost and give.
 
 `python -m benchmarks device` tells whether the GPU at hand gives what the CPU gives, and how fast: its last line says it.
 """
@@ -14,13 +14,13 @@ from typing import Any
 import torch
 
 import nerf_lightning
-from benchmarks import capture, device, growth, kernels, methods, overhead, photos, pictures, shapes, sizes
+from benchmarks import capture, device, growth, kernels, methods, overhead, photos, pictures, shapes, sizes, video
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.device import the_device
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.machine import describe_machine
 
-PARTS = ("methods", "kernels", "growth", "overhead", "capture", "photos", "pictures", "sizes", "shapes")
+PARTS = ("methods", "kernels", "growth", "overhead", "capture", "photos", "pictures", "sizes", "shapes", "video")
 ALONE = ("device",)
 """Runs only when it is named."""
 
@@ -96,6 +96,8 @@ def main() -> None:
             tables = sizes.measure(overrides, budgets[0], arguments.output)
         elif part == "shapes":
             tables = shapes.measure(budgets[0], arguments.output)
+        elif part == "video":
+            tables = video.measure(seeds[0], arguments.output)
         elif part == "methods":
             rows, report["runs"] = methods.measure(experiments, overrides, budgets, seeds, arguments.output)
             tables = {part: rows}

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nerf_lightning.capture.photos import natural, spread
+from nerf_lightning.capture.photos import spread
 from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.run import Capture
 from nerf_lightning.capture.tags.detect import Mark, Sighting
+from nerf_lightning.dataset.placing.photos import natural
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
-"""A folder of photos: which files, in which order, of which size."""
+"""Photos of a folder: a few of them, and those of one size."""
 
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,37 +10,6 @@ import numpy as np
 from nerf_lightning.errors import InputError
 
 T = TypeVar("T")
-
-EXTENSIONS = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
-UNREAD = {".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".webp", ".avif", ".mov", ".mp4"}
-"""Files of cameras and phones that nothing here reads."""
-
-
-def natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sorts photo 9 before photo 10."""
-    parts = re.findall(r"(\d+)|(\D+)", path.name.lower())
-    return [(0, int(number), "") if number else (1, 0, text) for number, text in parts]
-
-
-def find_photos(folder: Path, key: str) -> list[Path]:
-    """The photos in a folder in natural order, without those in folders below it.
-
-    Args:
-        folder: where they are.
-        key: the config key that named it, for the message.
-
-    Raises:
-        InputError: no such folder, or no photo in it.
-    """
-    if not folder.is_dir():
-        raise InputError("config", key, f"{folder}, which is no folder", "a folder of photos")
-    files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
-    photos = sorted((file for file in files if file.suffix.lower() in EXTENSIONS), key=natural)
-    if not photos:
-        others = sorted({file.suffix.lower() for file in files} & UNREAD)
-        found = f"only {', '.join(others)} files" if others else "no photo"
-        raise InputError(folder, "", found, "JPEG, PNG or TIFF photos", "convert them first" if others else "")
-    return photos
 
 
 def spread(items: Sequence[T], most: int) -> list[T]:

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from nerf_lightning.capture.outputs import Packing, Placed, write_scene
-from nerf_lightning.capture.photos import find_photos, of_one_size
+from nerf_lightning.capture.photos import of_one_size
 from nerf_lightning.capture.poses.calibrate import Calibration, calibrate, off_by, without
 from nerf_lightning.capture.poses.geometry import inverse
 from nerf_lightning.capture.poses.solve import Solved, misfits, solve
 from nerf_lightning.capture.tags.board import Board, board_detector
 from nerf_lightning.capture.tags.detect import Sighting, guess_family, sight, tag_detector
 from nerf_lightning.capture.tags.layout import read_layout
+from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
 

@@ -1,6 +1,7 @@
-"""A progress bar for a loop."""
+"""A progress bar for a loop, or for work that tells how far it is."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import TypeVar
 
@@ -17,7 +18,17 @@ def animates(console: Console) -> bool:
 
 def tracked(items: Iterable[T], total: int, words: str) -> Iterator[T]:
     """Yields the items while a bar shows their count and the time left; where it can move."""
+    with counted(total, words) as step:
+        for item in items:
+            yield item
+            step(1)
+
+
+@contextmanager
+def counted(total: int, words: str) -> Iterator[Callable[[int], None]]:
+    """Yields what to call after a number of items, for work that is no loop of our own."""
     console = Console(stderr=True)
     columns = TextColumn(words), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True, disable=not animates(console)) as bar:
-        yield from bar.track(items, total=total)
+        task = bar.add_task(words, total=total)
+        yield lambda count: bar.advance(task, count)

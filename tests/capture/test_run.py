@@ -17,7 +17,6 @@ from benchmarks.synthetic.tabletop import Tabletop
 from nerf_lightning.cameras import transform
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.pack import pack
-from nerf_lightning.capture.photos import find_photos
 from nerf_lightning.capture.poses.calibrate import calibrate
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
 from nerf_lightning.capture.run import Capture, capture
@@ -25,6 +24,7 @@ from nerf_lightning.capture.tags.detect import guess_family, sight, tag_detector
 from nerf_lightning.capture.tags.layout import TagLayout, flat_pose, read_layout
 from nerf_lightning.dataset import open_scene
 from nerf_lightning.dataset.lens import rectify
+from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.errors import InputError
 
 
@@ -159,10 +159,12 @@ def test_an_orbit_through_a_photo_left_out_is_refused(made: tuple[Path, Truth]):
 
 
 def test_folders_of_the_wrong_kind(few: Path, tmp_path: Path):
-    (tmp_path / "heic").mkdir()
-    (tmp_path / "heic" / "a.HEIC").write_bytes(b"x")
-    with pytest.raises(InputError, match="only .heic files, expected JPEG, PNG or TIFF photos; convert them first"):
-        run(few, tmp_path, photos=tmp_path / "heic")
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw" / "a.DNG").write_bytes(b"x")
+    with pytest.raises(
+        InputError, match="only .dng files, expected JPEG, PNG, TIFF or HEIC photos; convert them first"
+    ):
+        run(few, tmp_path, photos=tmp_path / "raw")
     plain = tmp_path / "plain"
     plain.mkdir()
     imageio.imwrite(plain / "a.png", np.full((300, 400, 3), 90, np.uint8))

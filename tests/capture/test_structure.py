@@ -1,9 +1,10 @@
-import importlib.util
 import json
+import sys
 from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
+import pycolmap
 import pytest
 import yaml
 from capture.views import SIX, SMALL, camera
@@ -11,6 +12,7 @@ from capture.views import SIX, SMALL, camera
 from benchmarks.synthetic.photos import Flaws, render_photo
 from benchmarks.synthetic.viewpoints import object_cameras
 from nerf_lightning.capture.outputs import Packing
+from nerf_lightning.capture.poses import structure
 from nerf_lightning.capture.poses.geometry import to_matrix
 from nerf_lightning.capture.poses.structure import capture_without_tags, upright
 from nerf_lightning.dataset import open_scene
@@ -64,6 +66,18 @@ def test_photos_without_tags_give_the_same_outputs(tmp_path: Path):
     assert content["fx"] == pytest.approx(SMALL.fx, rel=0.1)
 
 
+def test_photos_of_another_size_or_zoom_are_left_out(tmp_path: Path):
+    model, shots = pycolmap.Reconstruction(), {"a": 1, "b": 1, "c": 2, "d": 3, "e": 1}
+    for number, (focal, width, height) in enumerate(((50.0, 40, 30), (90.0, 40, 30), (50.0, 30, 40)), 1):
+        model.add_camera(pycolmap.Camera.create_from_model_name(number, "OPENCV", focal, width, height))
+    images = {name: pycolmap.Image(name=name, camera_id=number, image_id=7) for name, number in shots.items()}
+    others = structure._others(tmp_path, images, model)
+    assert set(others) == {"c", "d"} and "zoom" in others["c"] and "30x40 pixels, held the other way" in others["d"]
+    assert structure._lens(model.cameras[2]).fx == 90
+    simple = structure._lens(pycolmap.Camera.create_from_model_name(4, "SIMPLE_RADIAL", 50.0, 40, 30))
+    assert (simple.fx, simple.fy, simple.cx, simple.cy, simple.distortion) == (50, 50, 20, 15, (0,) * 5)
+
+
 def test_photos_that_show_nothing(tmp_path: Path):
     for i in range(3):
         imageio.imwrite(tmp_path / f"{i}.png", np.full((120, 160, 3), 100 + i, np.uint8))
@@ -75,6 +89,7 @@ def test_photos_that_show_nothing(tmp_path: Path):
 
 
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    imageio.imwrite(tmp_path / "0.png", np.zeros((12, 16, 3), np.uint8))
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[colmap\]'"):
         capture_without_tags(tmp_path, Packing(tmp_path / "scene.npz"))

@@ -1,84 +1,60 @@
 """Photos without tags: COLMAP finds lens and cameras from the photos' own texture (structure from motion)."""
 
-import importlib.util
-import logging
-import tempfile
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
-import imageio.v3 as imageio
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from nerf_lightning.cameras import focus_point
 from nerf_lightning.capture.outputs import Packing, Placed, write_scene
-from nerf_lightning.capture.photos import find_photos, of_one_size
+from nerf_lightning.capture.photos import of_one_size
 from nerf_lightning.capture.poses.geometry import inverse
 from nerf_lightning.dataset.extent import viewing_distance
-from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.dataset.lens import Lens
-from nerf_lightning.dataset.resize import fit_size
+from nerf_lightning.dataset.placing.photos import find_photos
+from nerf_lightning.dataset.placing.place import FEWEST, OVERLAP, place
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.progress import tracked
 
 if TYPE_CHECKING:
     import pycolmap
 
-log = logging.getLogger(__name__)
-
-SIDE = 1600
-"""Longest side in pixels of the copies in which COLMAP looks for features."""
-FEWEST = 3
-"""Placed photos that make a result."""
-OVERLAP = "take more photos, in small steps around the subject, sharp, of something with texture; or use tags"
-
 
 def capture_without_tags(folder: Path, packing: Packing) -> tuple[list[Placed], Scene]:
-    """Places photos by structure from motion (Schoenberger and Frahm 2016), and writes what `capture` writes.
+    """Places photos by structure from motion (see `place`), and writes what `capture` writes.
 
     Photos do not tell the scale: the unit is the cameras' median distance to what they look at, which is the origin. z points
     up, as far as the photos were held level.
 
     Args:
-        folder: of photos taken with one camera without zooming.
+        folder: of photos taken with one camera without zooming; others are left out.
         packing: the scene to write.
 
     Raises:
         InputError: pycolmap is not installed, or the photos do not hang together.
     """
-    if importlib.util.find_spec("pycolmap") is None:
-        todo = "pip install 'nerf_lightning[colmap]'"
-        raise InputError("pycolmap", "", "no such package", "the optional extra for photos without tags", todo)
     paths = find_photos(folder, "photos")
     packing.check(paths)
-    with tempfile.TemporaryDirectory() as workspace:
-        sizes = _copies(paths, Path(workspace) / "photos")
-        turned = of_one_size(folder, sizes)
-        usable = [path for path in paths if path.name not in turned]
-        model = _reconstruct(Path(workspace), [f"{paths.index(path):06d}.png" for path in usable])
-    if model is None or model.num_reg_images() < FEWEST:
-        found = f"{0 if model is None else model.num_reg_images()} of {len(usable)} photos that hang together"
-        raise InputError(folder, "", found, f"at least {FEWEST}", OVERLAP)
-    width, height = Counter(sizes[path.name] for path in usable).most_common(1)[0][0]
-    lens = _lens(model, width, height)
-    scale = width / next(iter(model.cameras.values())).width
+    model = _model(place(folder))
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    numbers = {path.name: f"{number:06d}.png" for number, path in enumerate(paths)}
-    names = [path.name for path in usable if numbers[path.name] in images]
+    others = _others(folder, images, model)
+    names = [path.name for path in paths if path.name in images and path.name not in others]
+    if len(names) < FEWEST:
+        found = f"{len(names)} of {len(paths)} photos of one size and zoom that hang together"
+        raise InputError(folder, "", found, f"at least {FEWEST}", OVERLAP)
+    lens = _lens(model.cameras[images[names[0]].camera_id])
     last = [[0.0, 0.0, 0.0, 1.0]]
-    raw = np.stack([inverse(np.concatenate([images[numbers[name]].cam_from_world().matrix(), last])) for name in names])
+    raw = np.stack([inverse(np.concatenate([images[name].cam_from_world().matrix(), last])) for name in names])
     poses = dict(zip(names, upright(raw), strict=True))
     photos = []
     for path in paths:
         if path.name in poses:
-            error = _error(images[numbers[path.name]], model) * scale
-            photos.append(Placed(path.name, "", poses[path.name], error))
+            photos.append(Placed(path.name, "", poses[path.name], _error(images[path.name], model)))
         else:
-            reason = turned.get(path.name, "it shares too few points with the other photos")
+            reason = others.get(path.name, "it shares too few points with the other photos")
             photos.append(Placed(path.name, reason))
     errors = [photo.reprojection_px for photo in photos if photo.reprojection_px]
     details = {
@@ -90,51 +66,33 @@ def capture_without_tags(folder: Path, packing: Packing) -> tuple[list[Placed], 
     return photos, write_scene(folder, photos, lens, packing, details)
 
 
-def _copies(paths: list[Path], folder: Path) -> dict[str, tuple[int, int]]:
-    """Writes upright copies of at most SIDE pixels, numbered, so that no file name matters; returns the photos' own sizes."""
-    folder.mkdir()
-    sizes = {}
-    for number, path in tracked(enumerate(paths), len(paths), "reading photos"):
-        photo = np.ascontiguousarray(read_pixels(path, upright=True)[..., :3])
-        height, width = photo.shape[:2]
-        sizes[path.name] = width, height
-        small = cv2.resize(photo, fit_size(width, height, SIDE), interpolation=cv2.INTER_AREA)
-        imageio.imwrite(folder / f"{number:06d}.png", small)
-    return sizes
-
-
-def _reconstruct(workspace: Path, names: list[str]) -> "pycolmap.Reconstruction | None":
-    """The largest model that COLMAP makes of the copies; None where it makes none."""
+def _model(folder: Path) -> "pycolmap.Reconstruction":
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    pycolmap.set_random_seed(0)
-    database, photos = workspace / "database.db", workspace / "photos"
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "OPENCV"
-    log.info("looking for features in %d photos", len(names))
-    pycolmap.extract_features(database, photos, names, pycolmap.CameraMode.SINGLE, reader)
-    log.info("matching them")
-    pycolmap.match_exhaustive(database)
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = FEWEST
-    options.random_seed = 0
-    (workspace / "models").mkdir()
-    log.info("placing them")
-    models = pycolmap.incremental_mapping(database, photos, workspace / "models", options)
-    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    return pycolmap.Reconstruction(folder)
 
 
-def _lens(model: "pycolmap.Reconstruction", width: int, height: int) -> Lens:
-    """The lens for photos of their own size; COLMAP's pixel centres are at +0.5 as ours are."""
-    (camera,) = model.cameras.values()
-    fx, fy, cx, cy, k1, k2, p1, p2 = camera.params
-    x, y = width / camera.width, height / camera.height
-    return Lens(width, height, fx * x, fy * y, cx * x, cy * y, (k1, k2, p1, p2, 0.0))
+def _others(folder: Path, images: "dict[str, pycolmap.Image]", model: "pycolmap.Reconstruction") -> dict[str, str]:
+    """Placed photos that were not taken as most were, and what is different: a scene has one lens."""
+    cameras = {name: model.cameras[image.camera_id] for name, image in images.items()}
+    others = of_one_size(folder, {name: (camera.width, camera.height) for name, camera in cameras.items()})
+    numbers = {name: camera.camera_id for name, camera in cameras.items() if name not in others}
+    most = Counter(numbers.values()).most_common(1)[0][0]
+    zoomed = {name: "taken with another camera or zoom than most" for name, n in numbers.items() if n != most}
+    return others | zoomed
+
+
+def _lens(camera: "pycolmap.Camera") -> Lens:
+    """COLMAP's pixel centres are at +0.5, as ours are."""
+    if camera.model_name == "OPENCV":
+        fx, fy, cx, cy, k1, k2, p1, p2 = camera.params
+        return Lens(camera.width, camera.height, fx, fy, cx, cy, (k1, k2, p1, p2, 0.0))
+    f, cx, cy, k1 = camera.params  # SIMPLE_RADIAL
+    return Lens(camera.width, camera.height, f, f, cx, cy, (k1, 0.0, 0.0, 0.0, 0.0))
 
 
 def _error(image: "pycolmap.Image", model: "pycolmap.Reconstruction") -> float:
-    """Root mean square reprojection distance of a copy's points, in its pixels."""
+    """Root mean square reprojection distance of a photo's points, pixels."""
     squares = []
     for point in image.points2D:
         if point.has_point3D():

@@ -20,7 +20,7 @@ from nerf_lightning.dataset.bricks.trace import picture, shadow
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import atomic, cache_folder
 
 VERSION = 1
 """Part of the cache file's name: raise it whenever model, shading or cameras change."""
@@ -52,7 +52,7 @@ def bricks(
     val = _cameras(_hemisphere(-torch.arange(1, val_views + 1)), size)
     orbit = _cameras(orbit_around(torch.zeros(3), torch.tensor(UP), RADIUS, ORBIT_ELEVATION, orbit_views), size)
 
-    folder = _cache_folder() if cache is None else Path(cache) if cache else None
+    folder = cache_folder() if cache is None else Path(cache) if cache else None
     path = folder / f"bricks-v{VERSION}-{size}px-{train_views}-{val_views}.npz" if folder else None
     images = _load(path, train, val) if path else None
     if images is None:
@@ -97,12 +97,6 @@ def _pictures(cameras: Cameras) -> UInt8[np.ndarray, "V H W 4"]:
     shadow()  # made once, before the threads ask for it
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
         return np.stack(list(pool.map(lambda view: picture(cameras, view), range(len(cameras)))))
-
-
-def _cache_folder() -> Path:
-    if own := os.environ.get("NERF_LIGHTNING_CACHE"):
-        return Path(own)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nerf_lightning"
 
 
 def _load(path: Path, train: Cameras, val: Cameras) -> tuple[np.ndarray, np.ndarray] | None:

@@ -13,11 +13,14 @@ from PIL import Image, UnidentifiedImageError
 
 from nerf_lightning.dataset.formats.checks import existing_file
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.extras import require
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 THREADS = 4
 ORIENTATION, QUARTER_TURNS = 0x0112, (5, 6, 7, 8)
 """EXIF's tag for how the camera was held, and its values for photos that lie on their side."""
+HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+"""Brands after `ftyp` in photos of phones (ISO 23008-12); the last two stand for any codec."""
 
 
 def find_image(folder: Path, file_path: str) -> Path | None:
@@ -32,12 +35,12 @@ def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]
     """Decodes one image: RGB, or RGBA with straight alpha; 16 bits become 8, grey becomes RGB.
 
     Args:
-        path: PNG, JPEG, TIFF or whatever else OpenCV reads.
+        path: PNG, JPEG, TIFF or whatever else OpenCV reads, or HEIC.
         upright: apply the EXIF rotation (not to images with alpha). Off for posed photos, whose poses and intrinsics
-            are about the pixels as stored.
+            are about the pixels as stored. HEIC photos are upright always: the rotation is part of their format.
 
     Raises:
-        InputError: missing, truncated, not an image, or of floating-point pixels.
+        InputError: missing, truncated, not an image, or of floating-point pixels; HEIC without the package that reads it.
     """
     existing_file(path)
     try:
@@ -50,6 +53,8 @@ def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]
             raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     except (cv2.error, OSError) as error:
         raise InputError(path, "", f"an unreadable image ({error})", "a PNG, JPEG or TIFF") from error
+    if raw is None and data[8:12] in HEIC:
+        return _heic(path, data)
     if raw is None:
         raise InputError(path, "", f"{len(data)} bytes that are no image", "a PNG, JPEG or TIFF", "copy it again")
     return _rgb8(path, raw)
@@ -94,6 +99,17 @@ def _rgb8(path: Path, raw: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "H W 
             return cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA)
         case channels:
             raise InputError(path, "", f"{channels} channels", "1 to 4")
+
+
+def _heic(path: Path, data: bytes) -> UInt8[np.ndarray, "H W C"]:
+    require("heic", "pillow_heif", purpose="the optional extra that reads HEIC photos", otherwise=", or convert them")
+    import pillow_heif
+
+    try:
+        image = pillow_heif.read_heif(data, convert_hdr_to_8bit=True).to_pillow()
+    except (OSError, ValueError, RuntimeError, SyntaxError, EOFError) as error:
+        raise InputError(path, "", f"an unreadable image ({error})", "a whole HEIC photo", "copy it again") from error
+    return np.asarray(image.convert("RGBA" if "A" in image.mode else "RGB"))
 
 
 def _cut_short(data: bytes) -> bool:

@@ -1,0 +1,97 @@
+"""Videos of a known path around the tabletop, some of whose frames are blurred."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from benchmarks.synthetic.tabletop import Tabletop
+from nerf_lightning.cameras import look_at
+from nerf_lightning.capture.tags.layout import TagLayout
+from nerf_lightning.dataset.lens import Lens
+
+CRF = 20
+"""Of H.264, about what phones write."""
+FPS = 30
+
+
+def around(layout: TagLayout, lens: Lens, count: int) -> Float[np.ndarray, "count 4 4"]:
+    """Camera to world: one smooth turn around the bulldozer, whose height and distance swing."""
+    top = Tabletop(layout)
+    centre = top.box.mean(0)
+    reach = float(np.linalg.norm(top.box[1] - top.box[0])) / 2
+    turns = 2 * np.pi * np.arange(count) / count
+    elevation = np.radians(42 + 14 * np.sin(2 * turns))
+    distance = reach * 2.4 * lens.fx / lens.height * (1 + 0.12 * np.cos(3 * turns))
+    ring = np.cos(elevation)
+    eye = centre + distance[:, None] * np.stack([ring * np.cos(turns), ring * np.sin(turns), np.sin(elevation)], -1)
+    up = torch.tensor([0.0, 0.0, 1.0]).double()
+    return look_at(torch.from_numpy(eye), torch.from_numpy(centre), up).numpy()
+
+
+def blurred(
+    picture: UInt8[np.ndarray, "H W 3"], pixels: float, angle: float | None = None
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture blurred by a Gaussian of a standard deviation in pixels, or along a line that long at an angle (radians)."""
+    if angle is None:
+        return cv2.GaussianBlur(picture, (0, 0), pixels)
+    half = int(np.ceil(pixels / 2)) + 1
+    steps = np.linspace(-pixels / 2, pixels / 2, 64)
+    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+    x, y = half + steps * np.cos(angle), half + steps * np.sin(angle)
+    for dx in (0, 1):
+        for dy in (0, 1):
+            col, row = np.floor(x).astype(int) + dx, np.floor(y).astype(int) + dy
+            np.add.at(kernel, (row, col), (1 - np.abs(x - col)) * (1 - np.abs(y - row)))
+    return cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT)
+
+
+BLURS = ((0.5, False), (0.7, False), (1.0, False), (2.0, False), (1.5, True), (2.5, True), (4.0, True), (8.0, True))
+"""Pixels, and whether along a line; the weakest can hardly be seen."""
+
+
+def with_blurs(
+    pictures: Iterable[UInt8[np.ndarray, "H W 3"]], seed: int, every: int = 3
+) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    """Pictures of which each `every`-th is blurred, from the second on, by each of `BLURS` in turn, along random lines."""
+    rng = np.random.default_rng(seed)
+    for index, picture in enumerate(pictures):
+        pixels, line = BLURS[index // every % len(BLURS)]
+        angle = float(rng.uniform(0, np.pi)) if line else None
+        yield blurred(picture, pixels, angle) if index % every == 1 else picture
+
+
+def write_video(file: Path, pictures: Iterable[UInt8[np.ndarray, "H W 3"]], quarter_turns: int = 0) -> None:
+    """H.264 as phones write it.
+
+    Args:
+        file: .mp4 or .mov to write.
+        pictures: of even height and width.
+        quarter_turns: counter-clockwise, that a player gives the pictures, as the flag of a phone held upright does.
+    """
+    with av.open(str(file), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=FPS, options={"crf": str(CRF)})
+        for index, picture in enumerate(pictures):
+            if not index:
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode(None))
+    if quarter_turns:
+        _flag(file, quarter_turns)
+
+
+def _flag(file: Path, quarter_turns: int) -> None:
+    """Writes the rotation into the track header, which no option reaches: a matrix of 16.16 numbers (ISO 14496-12)."""
+    data = bytearray(file.read_bytes())
+    at = data.index(b"tkhd") + 4 + 40
+    c, s = round(np.cos(np.pi / 2 * quarter_turns)), round(np.sin(np.pi / 2 * quarter_turns))
+    # Rows (a, b, u), (c, d, v), in a frame whose y points down.
+    for offset, value in ((0, c), (4, -s), (12, s), (16, c)):
+        data[at + offset : at + offset + 4] = (value * 65536).to_bytes(4, "big", signed=True)
+    file.write_bytes(data)

@@ -1,0 +1,1 @@
+"""From a video or plain photos to photos with known cameras."""

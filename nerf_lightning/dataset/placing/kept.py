@@ -1,0 +1,89 @@
+"""Results that are kept beside what they were made of, so that a second run does not make them again."""
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import atomic_folder, cache_folder, write_json
+
+log = logging.getLogger(__name__)
+
+RECORD = "made_of.json"
+"""In each such folder: what it was made of."""
+
+
+def made_of(files: Iterable[Path]) -> dict[str, Any]:
+    """What tells whether files are the same as before: names, sizes in bytes, and times of the last change in nanoseconds."""
+    states = {file.name: file.stat() for file in files}
+    return {name: [state.st_size, state.st_mtime_ns] for name, state in states.items()}
+
+
+def find_kept(beside: Path, sources: dict[str, Any], whole: Callable[[Path], bool]) -> Path | None:
+    """The folder that was made of the same sources, beside them or in the cache; None where it must be made.
+
+    Args:
+        beside: where it stands if that could be written.
+        sources: what it must have been made of, as plain values.
+        whole: whether a folder still holds what belongs there.
+
+    Raises:
+        InputError: a folder of somebody else has that name.
+    """
+    for folder in (beside, _cached(beside)):
+        if not folder.is_dir() or not any(folder.iterdir()):
+            continue
+        if not (folder / RECORD).is_file():
+            found = f"a folder without {RECORD}, which was not made here"
+            raise InputError(
+                folder, "", found, "nothing, or what an earlier run made", "move it elsewhere or rename it"
+            )
+        if _read(folder / RECORD) == sources and whole(folder):
+            return folder
+        log.info("%s was made of other files, or is not whole: it is made again", folder)
+    return None
+
+
+def keep(beside: Path, sources: dict[str, Any], fill: Callable[[Path], None]) -> Path:
+    """Makes the folder: beside its sources, or in the cache where that cannot be written.
+
+    Args:
+        beside, sources: see `find_kept`.
+        fill: writes what belongs there into an empty folder.
+
+    Raises:
+        InputError: neither can be written.
+    """
+    try:
+        return _filled(beside, sources, fill)
+    except OSError as error:
+        cached = _cached(beside)
+        log.warning("%s cannot be written (%s): %s is, instead", beside, error.strerror, cached)
+    try:
+        return _filled(cached, sources, fill)
+    except OSError as error:
+        todo = "set NERF_LIGHTNING_CACHE to one that can"
+        raise InputError(cached, "", str(error.strerror), "a folder that can be written", todo) from error
+
+
+def _filled(folder: Path, sources: dict[str, Any], fill: Callable[[Path], None]) -> Path:
+    with atomic_folder(folder) as temporary:
+        fill(temporary)
+        write_json(temporary / RECORD, sources)
+    return folder
+
+
+def _cached(beside: Path) -> Path:
+    digest = hashlib.sha256(str(beside.resolve()).encode()).hexdigest()[:16]
+    return cache_folder() / "placing" / digest / beside.name
+
+
+def _read(record: Path) -> Any:
+    """None where it cannot be read: it fits no sources then."""
+    try:
+        return json.loads(record.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None

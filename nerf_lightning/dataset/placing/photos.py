@@ -1,0 +1,37 @@
+"""A folder of photos: which files, in which order."""
+
+import re
+from pathlib import Path
+
+from nerf_lightning.errors import InputError
+
+EXTENSIONS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif"}
+UNREAD = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".webp", ".avif", ".mov", ".mp4"}
+"""Files of cameras and phones that are no photos that can be read."""
+
+
+def natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sorts photo 9 before photo 10."""
+    parts = re.findall(r"(\d+)|(\D+)", path.name.lower())
+    return [(0, int(number), "") if number else (1, 0, text) for number, text in parts]
+
+
+def find_photos(folder: Path, key: str) -> list[Path]:
+    """The photos in a folder in natural order, without those in folders below it.
+
+    Args:
+        folder: where they are.
+        key: the config key that named it, for the message.
+
+    Raises:
+        InputError: no such folder, or no photo in it.
+    """
+    if not folder.is_dir():
+        raise InputError("config", key, f"{folder}, which is no folder", "a folder of photos")
+    files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
+    photos = sorted((file for file in files if file.suffix.lower() in EXTENSIONS), key=natural)
+    if not photos:
+        others = sorted({file.suffix.lower() for file in files} & UNREAD)
+        found = f"only {', '.join(others)} files" if others else "no photo"
+        raise InputError(folder, "", found, "JPEG, PNG, TIFF or HEIC photos", "convert them first" if others else "")
+    return photos

@@ -1,0 +1,22 @@
+"""What cameras write into photos."""
+
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+
+def tags(
+    orientation: int = 1, make: str = "", model: str = "", focal: float | IFDRational = 0.0, focal_35mm: int = 0
+) -> bytes:
+    """EXIF, without the tags that are empty or 0; focal lengths in millimetres."""
+    exif = Image.Exif()
+    details = exif.get_ifd(0x8769)
+    for place, tag, value in (
+        (exif, 0x0112, orientation),
+        (exif, 0x010F, make),
+        (exif, 0x0110, model),
+        (details, 0x920A, focal),
+        (details, 0xA405, focal_35mm),
+    ):
+        if value:
+            place[tag] = value
+    return exif.tobytes()

@@ -1,0 +1,151 @@
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import av
+import cv2
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from benchmarks.synthetic.video import FPS, with_blurs, write_video
+from nerf_lightning.dataset.placing import frames as module
+from nerf_lightning.dataset.placing import video as decoding
+from nerf_lightning.dataset.placing.choose import MOST, choose, motion, sharpness, suitable_count
+from nerf_lightning.dataset.placing.frames import frames_of, kept_frames
+from nerf_lightning.errors import InputError
+
+PAUSE = 24
+SHIFTS = np.concatenate([4 * np.arange(31), np.full(PAUSE, 120), 120 + 4 * np.arange(1, 36)])
+"""Of the camera in pixels, by frame: it stands still in between."""
+
+
+def texture(height: int, width: int) -> np.ndarray:
+    """Detail of all sizes."""
+    rng, out = np.random.default_rng(0), np.zeros((height, width, 3))
+    for sigma in (0.7, 2.0, 6.0):
+        layer = cv2.GaussianBlur(rng.standard_normal((height, width, 3)), (0, 0), sigma)
+        out += layer / layer.std()
+    return (128 + 30 * out).clip(0, 255).astype(np.uint8)
+
+
+def pan(shifts: np.ndarray) -> Iterator[np.ndarray]:
+    """A camera that moves along a wall. Each third picture, the second first, is brighter than the others."""
+    wall, rng = texture(120, 160 + int(max(shifts))), np.random.default_rng(1)
+    for index, shift in enumerate(shifts):
+        picture = wall[:, shift : shift + 160] * (1.0 if index % 3 == 1 else 0.75)
+        yield (picture + rng.standard_normal(picture.shape)).clip(0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Every third picture is blurred, weakly or strongly, and brighter; read only."""
+    file = tmp_path_factory.mktemp("video") / "wall.mp4"
+    write_video(file, with_blurs(pan(SHIFTS), seed=0))
+    return file
+
+
+def test_blurred_frames_are_rejected_and_the_way_is_covered_evenly(video: Path, tmp_path: Path):
+    photos = frames_of(video, tmp_path / "photos", 30)
+    indices = [round(float(photo.stem.removesuffix("s")) * FPS) for photo in photos]
+    assert indices == sorted(indices) and 28 <= len(indices) <= 30
+    assert sum(index % 3 == 1 for index in indices) <= 0.05 * len(SHIFTS) / 3
+    assert sum(31 <= index < 31 + PAUSE for index in indices) <= 2
+    assert max(np.diff(SHIFTS[indices])) <= 4 * 4
+    first, pictures = imageio.imread(photos[0]).astype(int), list(pan(SHIFTS))
+    assert np.argmin([np.abs(first - picture).mean() for picture in pictures]) == indices[0]
+
+
+def test_a_count_follows_from_the_motion(video: Path, tmp_path: Path):
+    motions, _ = module.measure(video)
+    assert suitable_count(motions) == (1 + np.count_nonzero(np.diff(SHIFTS))) // 3
+    assert suitable_count(np.full(100_000, 0.01)) == MOST
+    assert suitable_count(np.zeros(900)) == 3
+    assert suitable_count(np.full(50, 0.002)) == 10
+
+
+def test_fast_stretches_offer_a_choice_too():
+    motions, sharp = np.concatenate([np.full(60, 0.001), np.full(12, 0.1)]), np.zeros(72)
+    sharp[1::3] = -0.2
+    chosen = choose(motions, sharp, 12)
+    assert len(chosen) == 12 and not [index for index in chosen if index % 3 == 1]
+    assert 3 <= sum(index >= 60 for index in chosen) <= 5
+    assert choose(np.zeros(9), np.zeros(9), 3) == [1, 4, 7]
+    assert choose(np.zeros(4), np.zeros(4), 4) == [0, 1, 2, 3]
+
+
+def test_motion_is_a_share_of_the_side_and_sharpness_knows_no_exposure():
+    wall = texture(120, 200)[..., 0]
+    assert motion(wall[:, :160], wall[:, 4:164]) == pytest.approx(4 / 160, rel=0.1)
+    assert motion(wall, wall) == 0
+    assert sharpness(wall // 2) == pytest.approx(sharpness(wall), abs=0.02)
+    assert sharpness(cv2.GaussianBlur(wall, (0, 0), 0.7)) < sharpness(wall) - 0.1
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_a_phones_rotation_is_applied(turns: int, tmp_path: Path):
+    picture = np.zeros((64, 96, 3), np.uint8)
+    picture[:32, 48:], picture[32:, :48] = (255, 0, 0), (0, 0, 255)
+    write_video(tmp_path / "a.mp4", [picture] * 3, turns)
+    upright = imageio.imread(frames_of(tmp_path / "a.mp4", tmp_path / "photos")[0])
+    assert np.abs(upright.astype(int) - np.rot90(picture, turns)).mean() < 5
+
+
+def test_frames_are_kept_beside_their_video(tmp_path: Path, monkeypatch, caplog):
+    video = tmp_path / "wall.mp4"
+    write_video(video, pan(SHIFTS[:12]))
+    folder = kept_frames(video)
+    assert folder == tmp_path / "wall_frames" and len(list(folder.glob("*.jpg"))) == 4
+    next(folder.glob("*.jpg")).unlink()
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "measure", None)  # whoever deletes a frame does not get it back
+        assert len(list(kept_frames(video).glob("*.jpg"))) == 3
+    write_video(video, pan(SHIFTS[:15]))
+    with caplog.at_level(logging.INFO):
+        assert len(list(kept_frames(video).glob("*.jpg"))) == 5
+    assert "made of other files" in caplog.text
+    (folder / "made_of.json").unlink()
+    with pytest.raises(InputError, match="wall_frames: found a folder without made_of.json"):
+        kept_frames(video)
+
+
+def of_sound(file: Path) -> None:
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("aac", rate=16000)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        sound.rate = 16000
+        container.mux(stream.encode(sound))
+        container.mux(stream.encode(None))
+
+
+def cut(file: Path) -> None:
+    write_video(file, pan(SHIFTS[:9]))
+    file.write_bytes(file.read_bytes()[:4000])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda file: None, "found nothing there"),
+        (Path.mkdir, "found a folder"),
+        (Path.touch, "found something unreadable"),
+        (lambda file: file.write_bytes(np.random.default_rng(0).bytes(5000)), "found something unreadable"),
+        (cut, "found something unreadable"),
+        (of_sound, "found only audio, expected a video with pictures"),
+        (lambda file: write_video(file, pan(SHIFTS[:1])), "found 1 frame, expected at least 3"),
+    ],
+)
+def test_a_broken_video_is_told_in_a_line(make, message: str, tmp_path: Path):
+    video = tmp_path / "broken.mp4"
+    make(video)
+    for attempt in (kept_frames, lambda video: frames_of(video, tmp_path / "photos")):
+        with pytest.raises(InputError, match=message) as raised:
+            attempt(video)
+        assert str(video) in str(raised.value) and "\n" not in str(raised.value)
+    assert [path for path in tmp_path.iterdir() if path != video] == []
+
+
+def test_a_damaged_frame_is_passed_over(video: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(decoding, "tracked", lambda decoded, *_: [SimpleNamespace(is_corrupt=i == 2) for i in range(5)])
+    assert len(list(decoding.frames(video, ""))) == 4

@@ -1,0 +1,53 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset.exif import tags
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from nerf_lightning.dataset.placing.lenses import Shot, focal_pixels, shot
+
+CANON = {"make": "Canon", "model": "Canon EOS 5D Mark II"}
+
+
+def photo(folder: Path, exif: bytes) -> Path:
+    Image.new("RGB", (60, 40)).save(folder / "a.jpg", exif=exif)
+    return folder / "a.jpg"
+
+
+@pytest.mark.parametrize(
+    ("exif", "known", "pixels"),
+    [
+        ({}, {}, None),
+        ({"focal_35mm": 26}, {"focal_35mm": 26.0}, 26 / np.hypot(36, 24) * np.hypot(600, 400)),
+        ({"focal": 50.0, **CANON}, {"focal": 50.0, **CANON}, 600 * 50 / 36),  # a sensor as wide as film
+        ({"focal": 50.0, "make": "Nobody", "model": "X"}, {"focal": 50.0, "make": "Nobody", "model": "X"}, None),
+        ({"focal": 50.0}, {"focal": 50.0}, None),
+        ({"focal_35mm": 1}, {"focal_35mm": 1.0}, None),
+        ({"focal_35mm": 3000}, {"focal_35mm": 3000.0}, None),
+        ({"focal": IFDRational(50, 0), "make": " A\0  B "}, {"make": "A B"}, None),
+    ],
+)
+def test_a_photo_tells_its_focal_length(exif: dict, known: dict, pixels: float | None, tmp_path: Path):
+    found = shot(photo(tmp_path, tags(**exif)), 600, 400)
+    assert found == Shot(600, 400, **known)
+    assert focal_pixels(found) == (None if pixels is None else pytest.approx(pixels, rel=1e-3))
+
+
+def test_zooming_makes_another_lens(tmp_path: Path):
+    wide, far = (shot(photo(tmp_path, tags(focal_35mm=focal, **CANON)), 600, 400) for focal in (26, 52))
+    assert wide != far and wide == shot(photo(tmp_path, tags(focal_35mm=26, **CANON)), 600, 400)
+    assert wide != shot(photo(tmp_path, tags(focal_35mm=26, **CANON)), 400, 600)
+
+
+@pytest.mark.parametrize("start", range(6, 60, 9))
+def test_broken_tags_are_no_tags(start: int, tmp_path: Path):
+    exif = bytearray(tags(focal=50.0, focal_35mm=26, **CANON))
+    exif[start : start + 9] = b"\xff" * 9
+    assert shot(photo(tmp_path, bytes(exif)), 600, 400).width == 600
+
+
+def test_a_file_that_is_no_picture_has_no_tags(tmp_path: Path):
+    (tmp_path / "a.jpg").write_bytes(b"x" * 100)
+    assert shot(tmp_path / "a.jpg", 4, 3) == Shot(4, 3)

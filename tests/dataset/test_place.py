@@ -1,0 +1,177 @@
+import logging
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from dataset.exif import tags
+from PIL import Image
+
+from benchmarks.synthetic.photos import Truth
+from benchmarks.video import aligned
+from nerf_lightning.capture.poses.geometry import inverse
+from nerf_lightning.dataset.formats.decode import read_pixels
+from nerf_lightning.dataset.placing import place as module
+from nerf_lightning.dataset.placing import structure
+from nerf_lightning.dataset.placing.kept import RECORD
+from nerf_lightning.dataset.placing.photos import find_photos
+from nerf_lightning.dataset.placing.place import place
+from nerf_lightning.errors import InputError
+
+SMALLER = ("3.jpg", "4.jpg")
+"""Taken by a second camera."""
+TURNED = ("5.jpg", "6.jpg")
+"""Stored lying, with a tag that says so."""
+
+
+@pytest.fixture(scope="module")
+def photos(made: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A third of the way around an object: two cameras, and two photos with an EXIF rotation; read only."""
+    folder = tmp_path_factory.mktemp("photos")
+    for number, path in enumerate(sorted((made[0] / "photos").iterdir())):
+        pixels = read_pixels(path)
+        name = f"{number}.jpg"
+        if name in SMALLER:
+            pixels = cv2.resize(pixels, (380, 285), interpolation=cv2.INTER_AREA)
+        stored = np.rot90(pixels) if name in TURNED else pixels
+        # 350 pixels of 400x300 are 30 mm of a film; the smaller photos do not tell.
+        exif = tags(6 if name in TURNED else 1, focal_35mm=0 if name in SMALLER else 30)
+        Image.fromarray(np.ascontiguousarray(stored)).save(folder / name, quality=97, exif=exif)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def placed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[pycolmap.Reconstruction, Path]:
+    """What COLMAP makes of copies that are smaller than the photos, and where it worked."""
+    workspace = tmp_path_factory.mktemp("workspace")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(structure, "SIDE", 390)
+        model = structure.reconstruct(find_photos(photos, ""), workspace)
+    assert model is not None
+    return model, workspace
+
+
+@pytest.fixture
+def own(photos: Path, placed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, list[int]]:
+    """A copy of the photos that COLMAP places at once; and how many it placed in each call."""
+    folder, calls = tmp_path / "photos", []
+    shutil.copytree(photos, folder)
+
+    def reconstruct(photos: list[Path], workspace: Path) -> pycolmap.Reconstruction:
+        calls.append(len(photos))
+        return placed[0]
+
+    monkeypatch.setattr(module, "reconstruct", reconstruct)
+    return folder, calls
+
+
+def test_photos_of_two_cameras_are_placed_upright_and_in_full_size(placed, made: tuple[Path, Truth], tmp_path: Path):
+    placed[0].write_binary(tmp_path)
+    model = pycolmap.Reconstruction(tmp_path)
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    assert len(images) >= 7 and set(images) <= {f"{number}.jpg" for number in range(8)}
+    sizes = {
+        name: (model.cameras[image.camera_id].width, model.cameras[image.camera_id].height)
+        for name, image in images.items()
+    }
+    assert sizes == {name: (380, 285) if name in SMALLER else (400, 300) for name in images}
+    kinds = {image.camera_id: model.cameras[image.camera_id].model_name for image in images.values()}
+    assert sorted(kinds.values()) == ["OPENCV", "SIMPLE_RADIAL"]
+    for image in images.values():
+        camera = model.cameras[image.camera_id]
+        assert camera.mean_focal_length() == pytest.approx(350 * camera.width / 400, rel=0.15)
+    error = model.compute_mean_reprojection_error()
+    model.update_point_3d_errors()
+    assert error == pytest.approx(model.compute_mean_reprojection_error()) and 0.05 < error < 1.5
+    last = [[0.0, 0.0, 0.0, 1.0]]
+    found = np.stack([inverse(np.concatenate([i.cam_from_world().matrix(), last])) for i in images.values()])
+    truth = np.stack([made[1].photos[f"{int(Path(name).stem):03d}.png"] for name in images])
+    off = np.linalg.norm(aligned(found, truth)[:, :3, 3] - truth[:, :3, 3], axis=-1)
+    assert np.median(off / np.linalg.norm(truth[:, :3, 3], axis=-1)) < 0.05
+
+
+def test_cameras_start_from_the_focal_length_that_photos_tell(placed):
+    with pycolmap.Database.open(placed[1] / "database.db") as content:
+        cameras = {camera.width: camera for camera in content.read_all_cameras()}
+        counts = [image.camera_id for image in content.read_all_images()]
+    assert sorted(cameras) == [380, 390] and sorted(map(counts.count, set(counts))) == [2, 6]
+    assert cameras[390].has_prior_focal_length and not cameras[380].has_prior_focal_length
+    assert cameras[390].mean_focal_length() == pytest.approx(30 / np.hypot(36, 24) * 500 * 390 / 400)
+    assert cameras[380].mean_focal_length() == pytest.approx(1.2 * 380)
+
+
+def test_the_same_photos_are_placed_once(own, caplog: pytest.LogCaptureFixture):
+    folder, calls = own
+    caplog.set_level(logging.INFO)
+    assert place(folder) == folder / "placed" / "sparse" / "0" == place(folder) and calls == [8]
+    assert "as an earlier run placed them" in caplog.text and "of 8 photos placed" in caplog.text
+    assert pycolmap.Reconstruction(place(folder)).num_reg_images() >= 7
+    caplog.clear()
+    shutil.copy(folder / "7.jpg", folder / "8.jpg")
+    place(folder)
+    assert "made of other files" in caplog.text and "not placed" in caplog.text and "8.jpg" in caplog.text
+    (folder / "8.jpg").touch()
+    place(folder)
+    (folder / "placed" / RECORD).write_text("[" * 100_000)
+    place(folder)
+    (folder / "placed" / "sparse" / "0" / "images.bin").unlink()
+    place(folder)
+    place(folder)
+    assert calls == [8, 9, 9, 9, 9]
+    assert sorted(path.name for path in folder.iterdir()) == [*(f"{number}.jpg" for number in range(9)), "placed"]
+
+
+def refusing(*folders: Path) -> Callable[..., str]:
+    real = tempfile.mkdtemp
+
+    def mkdtemp(suffix: str | None = None, prefix: str | None = None, dir: Path | None = None) -> str:
+        if dir in folders:
+            raise PermissionError(13, "Permission denied", str(dir))
+        return real(suffix, prefix, dir)
+
+    return mkdtemp
+
+
+def test_a_folder_that_cannot_be_written_is_placed_in_the_cache(own, tmp_path, monkeypatch, caplog):
+    folder, calls = own
+    monkeypatch.setenv("NERF_LIGHTNING_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(tempfile, "mkdtemp", refusing(folder))
+    model = place(folder)
+    assert tmp_path / "cache" in model.parents and not (folder / "placed").exists()
+    assert f"{folder / 'placed'} cannot be written (Permission denied)" in caplog.text
+    assert place(folder) == model and calls == [8]
+    shutil.rmtree(tmp_path / "cache")
+    monkeypatch.setattr(tempfile, "mkdtemp", refusing(folder, model.parents[2]))
+    with pytest.raises(InputError, match="found Permission denied, expected a folder that can be written; set NERF_"):
+        place(folder)
+
+
+def test_a_folder_of_that_name_that_is_the_users_own_stays(own):
+    folder, calls = own
+    (folder / "placed").mkdir()
+    (folder / "placed" / "mine.txt").write_text("a", encoding="utf-8")
+    with pytest.raises(InputError, match="placed: found a folder without made_of.json, which was not made here"):
+        place(folder)
+    assert (folder / "placed" / "mine.txt").exists() and calls == []
+
+
+def test_photos_that_do_not_hang_together(own, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "reconstruct", lambda photos, workspace: None)
+    with pytest.raises(InputError, match="0 of 8 photos that hang together, expected at least 3; take more photos"):
+        place(own[0])
+    assert not (own[0] / "placed").exists()
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[colmap\]'"):
+        place(own[0])
+
+
+def test_many_photos_are_compared_with_their_neighbours_and_across():
+    assert len(structure.pairs(150)) == 150 * 149 // 2
+    some = structure.pairs(1000)
+    assert len(some) == len(set(some)) < 25_000 and all(0 <= i < j < 1000 for i, j in some)
+    assert {(i, i + 20) for i in range(980)} <= set(some) and (0, 999) in some
