@@ -5,18 +5,22 @@ from pathlib import Path
 
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.blender import load_blender
-from nerf_lightning.dataset.formats.colmap import find_models, load_colmap
+from nerf_lightning.dataset.formats.colmap import MODEL_FOLDERS, PHOTO_FOLDERS, find_models, load_colmap
 from nerf_lightning.dataset.formats.llff import POSES, load_llff
 from nerf_lightning.dataset.formats.nerfstudio import load_nerfstudio
 from nerf_lightning.dataset.formats.npz import load_npz
+from nerf_lightning.dataset.placing.frames import kept_frames
+from nerf_lightning.dataset.placing.photos import has_photos
+from nerf_lightning.dataset.placing.place import place as place_photos
+from nerf_lightning.dataset.placing.video import VIDEOS
 from nerf_lightning.dataset.resize import resize_scene
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import Reading
 from nerf_lightning.errors import InputError
 
 SUPPORTED = (
-    "an .npz file, a COLMAP folder (sparse/0), poses_bounds.npy beside images, a Blender folder (transforms_train.json),"
-    " or transforms.json or its folder"
+    "photos or a video, an .npz file, a COLMAP folder (sparse/0), poses_bounds.npy beside images, a Blender folder"
+    " (transforms_train.json), or transforms.json or its folder"
 )
 
 
@@ -35,7 +39,8 @@ def open_scene(
 
     Args:
         path: an .npz file; a folder of a Blender scene (transforms_train.json), of a nerfstudio or instant-ngp capture
-            (transforms.json, or that file), of LLFF (poses_bounds.npy), or of COLMAP (or its model's folder).
+            (transforms.json, or that file), of LLFF (poses_bounds.npy), or of COLMAP (or its model's folder); else a folder
+            of photos, or a video, which COLMAP places once.
         name: what to call it; defaults to the file's or folder's name.
         near, far: distances along the rays, in the scene's unit, that override the bounds'.
         resize, holdout, masked, invert_masks, undistort: see `Reading`; of an .npz file and a Blender folder only `resize`
@@ -70,7 +75,18 @@ def _open(place: Path, name: str | None, reading: Reading) -> Scene:
         return load_colmap(place, name, reading)
     if (place / POSES).is_file():
         return load_llff(place, name, reading)
+    if place.suffix.lower() in VIDEOS and place.is_file():
+        return _placed(kept_frames(place), name or place.stem, reading)
+    placed_already = any((place / below).is_dir() for below in MODEL_FOLDERS if below)
+    for below in () if placed_already else ("", *PHOTO_FOLDERS):  # a damaged model is not made again in silence
+        if has_photos(place / below):
+            return _placed(place / below, name or place.resolve().name, reading)
     raise InputError(place, "", _description(place), SUPPORTED)
+
+
+def _placed(photos: Path, name: str, reading: Reading) -> Scene:
+    """Photos whose cameras COLMAP finds, unless it has found them before."""
+    return load_colmap(place_photos(photos), name, reading, photos, upright=True)
 
 
 def _description(place: Path) -> str:

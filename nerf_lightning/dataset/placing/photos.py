@@ -16,6 +16,11 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(number), "") if number else (1, 0, text) for number, text in parts]
 
 
+def has_photos(folder: Path) -> bool:
+    """Whether a folder holds photos itself."""
+    return folder.is_dir() and any(file.suffix.lower() in EXTENSIONS and file.is_file() for file in folder.iterdir())
+
+
 def find_photos(folder: Path, key: str) -> list[Path]:
     """The photos in a folder in natural order, without those in folders below it.
 
