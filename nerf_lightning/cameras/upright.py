@@ -4,8 +4,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-LEVEL = 0.005
-"""Weight of the photos' mean up direction against their level axes: decides only where all cameras look the same way."""
+LEVEL, TINY = 2.0, 1e-6
+"""Weight of the mean up direction of photos, as a multiple of how far from level they were held, and at least: it decides where all
+cameras look the same way."""
 CLEARLY = 0.1
 """By how much the photos' rows must be less flat (see `flatness`) than their columns for them to lie on their side."""
 
@@ -44,8 +45,9 @@ def held(c2w: Float[Tensor, "V 4 4"]) -> tuple[Float[Tensor, "3"], Int[Tensor, "
         mean = torch.nn.functional.normalize(axes[pick, side].mean(0), dim=0)
         level = axes[pick, (side + 1) % 4]
         eye = torch.eye(3, dtype=axes.dtype, device=axes.device)
-        spread = level.mT @ level / len(level) + LEVEL * (eye - mean[:, None] * mean)
-        found = torch.linalg.eigh(spread).eigenvectors[:, 0]
+        spread = level.mT @ level / len(level)
+        weight = LEVEL * torch.linalg.eigvalsh(spread)[0].clamp_min(0) + TINY
+        found = torch.linalg.eigh(spread + weight * (eye - mean[:, None] * mean)).eigenvectors[:, 0]
         up = found if float(found @ mean) >= 0 else -found
     return up.to(c2w.dtype), side
 

@@ -7,36 +7,15 @@ import numpy as np
 import pycolmap
 import pytest
 import yaml
-from capture.views import SIX, SMALL, camera
+from capture.views import SIX, SMALL
 
 from benchmarks.synthetic.photos import Flaws, render_photo
 from benchmarks.synthetic.viewpoints import object_cameras
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.poses import structure
-from nerf_lightning.capture.poses.geometry import to_matrix
-from nerf_lightning.capture.poses.structure import capture_without_tags, upright
+from nerf_lightning.capture.poses.structure import capture_without_tags
 from nerf_lightning.dataset import open_scene
 from nerf_lightning.errors import InputError
-
-
-def ring(count: int = 12, height: float = 0.5) -> np.ndarray:
-    """Cameras all around the origin, level, z up."""
-    turn = to_matrix(np.array([np.pi / 2, 0, 0, 0, 0, 0]))  # `camera` takes y as up
-    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    return np.stack([turn @ camera([np.cos(a), height, np.sin(a)], [0, 0, 0]) for a in angles])
-
-
-@pytest.mark.parametrize("some", [slice(None), slice(0, 4)])
-def test_any_frame_is_turned_upright(some: slice):
-    c2w = ring()[some]
-    moved = to_matrix(np.array([0.7, -1.1, 0.4, 5.0, -3.0, 2.0])) @ c2w
-    moved[:, :3, 3] *= 7.0
-    found = upright(moved)
-    distance = np.linalg.norm(c2w[0, :3, 3])
-    np.testing.assert_allclose(found[:, 2, 3], c2w[:, 2, 3] / distance, atol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(found[:, :3, 3], axis=1), 1, atol=1e-5)
-    np.testing.assert_allclose(found[:, 2, 2], c2w[:, 2, 2], atol=1e-5)  # they look down as before
-    np.testing.assert_allclose(np.linalg.det(found[:, :3, :3]), 1)
 
 
 def test_photos_without_tags_give_the_same_outputs(tmp_path: Path):

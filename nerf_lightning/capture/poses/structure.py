@@ -6,16 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
-from nerf_lightning.cameras import focus_point
 from nerf_lightning.capture.outputs import Packing, Placed, write_scene
 from nerf_lightning.capture.photos import of_one_size
 from nerf_lightning.capture.poses.geometry import inverse
-from nerf_lightning.dataset.extent import viewing_distance
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.dataset.placing.place import FEWEST, OVERLAP, place
+from nerf_lightning.dataset.posed import framed
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
 
@@ -48,7 +46,8 @@ def capture_without_tags(folder: Path, packing: Packing) -> tuple[list[Placed], 
     lens = _lens(model.cameras[images[names[0]].camera_id])
     last = [[0.0, 0.0, 0.0, 1.0]]
     raw = np.stack([inverse(np.concatenate([images[name].cam_from_world().matrix(), last])) for name in names])
-    poses = dict(zip(names, upright(raw), strict=True))
+    placed, _ = framed(torch.from_numpy(raw), torch.arange(len(raw)))
+    poses = dict(zip(names, placed.numpy(), strict=True))
     photos = []
     for path in paths:
         if path.name in poses:
@@ -100,22 +99,3 @@ def _error(image: "pycolmap.Image", model: "pycolmap.Reconstruction") -> float:
             if seen is not None:
                 squares.append(float(((seen - point.xy) ** 2).sum()))
     return float(np.sqrt(np.mean(squares))) if squares else 0.0
-
-
-def upright(c2w: Float[np.ndarray, "V 4 4"]) -> Float[np.ndarray, "V 4 4"]:
-    """Poses in a frame with its origin where the cameras look, z up, at a median distance of 1.
-
-    Up is the direction most nearly perpendicular to the photos' rows: people hold cameras level.
-    """
-    rows, downs = c2w[:, :3, 0], c2w[:, :3, 1]
-    up = np.linalg.svd(rows)[2][2]
-    up = -up if float(up @ downs.mean(0)) > 0 else up
-    helper = np.eye(3)[np.abs(up).argmin()]
-    x = np.cross(helper, up) / np.linalg.norm(np.cross(helper, up))
-    turn = np.stack([x, np.cross(up, x), up])
-    poses = torch.from_numpy(c2w)
-    centre = focus_point(poses)
-    out = c2w.copy()
-    out[:, :3, :3] = turn @ c2w[:, :3, :3]
-    out[:, :3, 3] = (c2w[:, :3, 3] - centre.numpy()) @ turn.T / viewing_distance(poses, centre)
-    return out

@@ -1,0 +1,36 @@
+"""Posed photos in one frame, whatever frame they came in."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from nerf_lightning.cameras import focus_point, orbit_around
+from nerf_lightning.dataset.posed import framed
+
+UP = torch.tensor([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("some", [slice(None), slice(0, 4)])
+def test_any_frame_is_turned_upright(some: slice):
+    c2w = orbit_around(torch.zeros(3), UP, 2.0, 0.4, 12)[some].double()
+    moved = torch.eye(4).double()
+    moved[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.7, -1.1, 0.4]).as_matrix())
+    moved[:3, 3] = torch.tensor([5.0, -3.0, 2.0])
+    elsewhere = moved @ c2w
+    elsewhere[:, :3, 3] *= 7
+    found, to_source = framed(elsewhere, torch.arange(len(c2w)))
+    torch.testing.assert_close(found[:, 2, 3], c2w[:, 2, 3] / 2, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found[:, :3, 3].norm(dim=1), torch.ones(len(c2w)).double(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(found[:, 2, 2], c2w[:, 2, 2], atol=1e-5, rtol=0)  # they look down as before
+    back = to_source.double() @ found
+    np.testing.assert_allclose(back[:, :3, 3], elsewhere[:, :3, 3], atol=1e-4)
+
+
+def test_held_out_photos_do_not_move_the_frame():
+    c2w = orbit_around(torch.zeros(3), UP, 2.0, 0.4, 12).double()
+    far = c2w.clone()
+    far[::4, :3, 3] += 30
+    train = torch.tensor([i for i in range(12) if i % 4])
+    torch.testing.assert_close(framed(far, train)[1], framed(c2w, train)[1])
+    torch.testing.assert_close(focus_point(framed(far, train)[0][train]), torch.zeros(3).double(), atol=1e-6, rtol=0)
