@@ -5,8 +5,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 LEVEL, TINY = 2.0, 1e-6
-"""Weight of the mean up direction of all photos: a multiple of how far from level they were held, and the least. It decides where
-all cameras look the same way."""
+"""Weight of the mean up direction of all photos: a multiple of how far from level they were held, and the least. It decides
+where all cameras look the same way."""
 CLEARLY = 0.1
 """By how much the photos' rows must be less flat (see `flatness`) than their columns for them to lie on their side."""
 
