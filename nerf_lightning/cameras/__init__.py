@@ -3,7 +3,15 @@
 from nerf_lightning.cameras.bounds import Bounds, InBounds
 from nerf_lightning.cameras.cameras import Cameras, Rays
 from nerf_lightning.cameras.lenses import Distortion, Lenses
-from nerf_lightning.cameras.orbit import focus_point, look_at, orbit_around, orbit_like, spiral_like, typical_view
+from nerf_lightning.cameras.orbit import (
+    axes_meet,
+    focus_point,
+    look_at,
+    orbit_around,
+    orbit_like,
+    spiral_like,
+    typical_view,
+)
 from nerf_lightning.cameras.transforms import pixel_to_camera, pixel_to_ray, transform, transform_directions
 from nerf_lightning.cameras.upright import held, turn_upright
 
@@ -14,6 +22,7 @@ __all__ = [
     "InBounds",
     "Lenses",
     "Rays",
+    "axes_meet",
     "focus_point",
     "held",
     "look_at",

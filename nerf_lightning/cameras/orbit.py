@@ -11,6 +11,8 @@ from nerf_lightning.cameras.upright import held
 
 ONE_SIDED = 0.35
 """Length of the mean viewing direction's horizontal part above which the cameras are all on one side of the subject."""
+MEETING = 0.25
+"""See `axes_meet`."""
 MOSTLY = 0.7
 """Share of the views that lie within a loop before the subject."""
 STEEPEST = 1.4
@@ -50,6 +52,17 @@ def focus_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
     A = projectors.mean(0) + 1e-8 * eye
     b = (projectors @ (centres - mean)[:, :, None]).mean(0)[:, 0]
     return (mean + torch.linalg.solve(A, b)).to(c2w.dtype)
+
+
+def axes_meet(c2w: Float[Tensor, "V 4 4"]) -> bool:
+    """Whether the optical axes meet in `focus_point`: they pass it, on average, within a share of the cameras' distance to it.
+
+    They do not in a panorama or a fly-through.
+    """
+    offset = focus_point(c2w) - c2w[:, :3, 3]
+    axes = torch.nn.functional.normalize(c2w[:, :3, 2], dim=1)
+    beside = (offset - (offset * axes).sum(1, keepdim=True) * axes).norm(dim=1)
+    return float(beside.mean()) <= MEETING * float(offset.norm(dim=1).mean())
 
 
 def orbit_around(

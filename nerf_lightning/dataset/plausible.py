@@ -8,13 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, focus_point
+from nerf_lightning.cameras import Bounds, Cameras, axes_meet, focus_point
 from nerf_lightning.dataset.extent import MAX_VIEWS, border_colour, sightings, silhouettes, visible_cube, visual_hull
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
 
-MEETING = 0.25
-"""Optical axes meet in a point where they pass it, on average, within this share of the cameras' distance to it."""
 SAME_PLACE, SAME_WAY = 1e-6, 1e-6
 """Cameras nearer than these (of the scene's size, and entry by entry of the rotation) stand in one pose."""
 OTHER_COLOUR = 8 / 255
@@ -62,15 +60,9 @@ def looking_away(scene: Scene) -> Iterator[Doubt]:
     c2w = scene.train.cameras.c2w
     if len(c2w) < 3:
         return
-    focus = focus_point(c2w)
-    offset = focus - c2w[:, :3, 3]
-    axes = torch.nn.functional.normalize(c2w[:, :3, 2], dim=1)
-    along = (offset * axes).sum(1)
-    distance = offset.norm(dim=1)
-    beside = (offset - along[:, None] * axes).norm(dim=1)
-    if float(beside.mean()) > MEETING * float(distance.mean()):
-        return  # the axes do not meet: a panorama, a fly-through
-    behind = float((along < 0).float().mean())
+    if not axes_meet(c2w):
+        return  # a panorama, a fly-through
+    behind = float((((focus_point(c2w) - c2w[:, :3, 3]) * c2w[:, :3, 2]).sum(1) < 0).float().mean())
     if behind > 0.5:
         text = f"{behind:.0%} of the cameras with their backs to the point where their axes meet; their z axis points backward"
         yield Doubt(text, hopeless=True)

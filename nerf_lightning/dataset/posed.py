@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, focus_point, held, orbit_like, transform, turn_upright
+from nerf_lightning.cameras import Bounds, axes_meet, focus_point, held, orbit_like, transform, turn_upright
 from nerf_lightning.dataset.extent import border_colour, estimate_bounds, viewing_distance
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.scene import Scene
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 BLACK = (0.0, 0.0, 0.0)
 NEAR = 0.25
-"""Sampling starts at this share of the nearest camera's distance to what all look at: nothing is photographed nearer by."""
+"""Sampling starts at this share of the nearest camera's distance to what all look at, where they look at one thing."""
 CLEAR = 0.7
 """Or at this share of the nearest known content's distance, if that is less."""
 POINTS, STRAY = 4096, 0.01
@@ -72,7 +72,10 @@ def scene_of(
         known.append(
             nearest_point(transform(torch.linalg.inv(to_source), torch.from_numpy(points).float()), train_views)
         )
-    near = min([NEAR * nearest_camera(train_views), *(CLEAR * distance for distance in known)])
+    starts = [CLEAR * distance for distance in known]
+    if axes_meet(train_views.cameras.c2w):
+        starts.append(NEAR * nearest_camera(train_views))
+    near = min(starts, default=None)
     bounds = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), unbounded=True, near=near)
     if views.channels == 4:
         bounds = estimate_bounds(train_views, BLACK)

@@ -1,12 +1,16 @@
 """Posed photos in one frame, whatever frame they came in."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nerf_lightning.cameras import focus_point, orbit_around
+from nerf_lightning.cameras import Cameras, focus_point, orbit_around
+from nerf_lightning.dataset import Views, open_scene
 from nerf_lightning.dataset.posed import framed
+from tests.dataset.colmap_files import photos, write_transforms
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 
@@ -34,3 +38,17 @@ def test_held_out_photos_do_not_move_the_frame():
     train = torch.tensor([i for i in range(12) if i % 4])
     torch.testing.assert_close(framed(far, train)[1], framed(c2w, train)[1])
     torch.testing.assert_close(focus_point(framed(far, train)[0][train]), torch.zeros(3).double(), atol=1e-6, rtol=0)
+
+
+def test_a_walk_along_a_wall_is_sampled_from_the_lens_on(tmp_path: Path):
+    """Only where all cameras look at one thing is it known that nothing is near."""
+    walk = torch.eye(4).repeat(9, 1, 1)
+    walk[:, 0, 3] = torch.linspace(-4, 4, 9)
+    ring = orbit_around(torch.zeros(3), UP, 2.0, 0.4, 9)
+    noise = torch.randint(0, 255, (9, 12, 16, 3), generator=torch.manual_seed(0)).to(torch.uint8)
+    K = torch.tensor([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]]).repeat(9, 1, 1)
+    for name, c2w, near in (("walk", walk, None), ("ring", ring, 0.25)):
+        views = Views.of(noise, Cameras.of_size(K, c2w, 16, 12))
+        names = photos(tmp_path / name, views)
+        write_transforms(tmp_path / name / "transforms.json", views, names, w=16, h=12)
+        assert open_scene(str(tmp_path / name)).bounds.near == (near if near is None else pytest.approx(near))
