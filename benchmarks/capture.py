@@ -32,6 +32,8 @@ SHEETS = {
 FLAWS = Flaws(blur=0.5, noise=2.0)
 PHOTOS, VIEWS = 30, 40
 """Of the sheet, and of the object."""
+HIDDEN_VIEWS = 30
+"""Of the object, where the tag is hidden in a third of them."""
 STEPS = 4500
 """Of both fields alike: seconds would let a busy machine decide."""
 WALKS = ((15.0, 40, False), (10.0, 40, False), (15.0, 20, False), (15.0, 40, True))
@@ -67,6 +69,27 @@ def accuracy(folder: Path, seed: int) -> tuple[list[dict[str, Any]], dict[str, t
         )
         done[name] = found, truth
     return rows, done
+
+
+def hidden_tags(folder: Path, seed: int, views: int = HIDDEN_VIEWS) -> list[dict[str, Any]]:
+    """The same of one tag that is hidden in a third of the photos, which are placed by their texture."""
+    layout = SHEETS["one tag"]
+    truth = write_capture(folder, layout, LENS, PHOTOS, views, FLAWS, seed, hide=3)
+    found = capture(folder / "calibration", folder / "photos", SIZE, Packing(folder / "scene.npz"))
+    rows = []
+    for by in ("", "texture"):
+        placed = {photo.name: photo.c2w for photo in found.photos if photo.c2w is not None and photo.by == by}
+        exact = [truth.photos[name] for name in placed]
+        rows.append(
+            {
+                "placed by": by or "tags",
+                "placed": len(placed),
+                "of": views // 3 if by else views - views // 3,
+                "focal_percent": 100 * abs(found.calibration.lens.fx / LENS.fx - 1),
+                **(_errors("photos", home(found.solved, layout), list(placed.values()), exact) if placed else {}),
+            }
+        )
+    return rows
 
 
 def home(solved: Solved, layout: TagLayout) -> np.ndarray:
@@ -171,5 +194,6 @@ def measure(seeds: list[int], folder: Path) -> dict[str, list[dict[str, Any]]]:
     return {
         "capture": rows,
         "flips": flips(seeds),
+        "hidden tags": hidden_tags(folder / "hidden_tags", seeds[0]),
         "capture fields": fields(folder / "capture", *done["six tags"], seeds[0]),
     }
