@@ -32,8 +32,12 @@ SHEETS = {
 FLAWS = Flaws(blur=0.5, noise=2.0)
 PHOTOS, VIEWS = 30, 40
 """Of the sheet, and of the object."""
+HIDDEN_VIEWS = 30
+"""Of the object, where the tag is hidden in a third of them."""
 STEPS = 4500
 """Of both fields alike: seconds would let a busy machine decide."""
+WALKS = ((15.0, 40, False), (10.0, 40, False), (15.0, 20, False), (15.0, 40, True))
+"""Tilt in degrees, photos a turn, and whether their order is random."""
 FLIPPED = np.radians(5)
 """A pose that is farther off than the other solution by more than this counts as flipped."""
 
@@ -65,6 +69,27 @@ def accuracy(folder: Path, seed: int) -> tuple[list[dict[str, Any]], dict[str, t
         )
         done[name] = found, truth
     return rows, done
+
+
+def hidden_tags(folder: Path, seed: int, views: int = HIDDEN_VIEWS) -> list[dict[str, Any]]:
+    """The same of one tag that is hidden in a third of the photos, which are placed by their texture."""
+    layout = SHEETS["one tag"]
+    truth = write_capture(folder, layout, LENS, PHOTOS, views, FLAWS, seed, hide=3)
+    found = capture(folder / "calibration", folder / "photos", SIZE, Packing(folder / "scene.npz"))
+    rows = []
+    for by in ("", "texture"):
+        placed = {photo.name: photo.c2w for photo in found.photos if photo.c2w is not None and photo.by == by}
+        exact = [truth.photos[name] for name in placed]
+        rows.append(
+            {
+                "placed by": by or "tags",
+                "placed": len(placed),
+                "of": views // 3 if by else views - views // 3,
+                "focal_percent": 100 * abs(found.calibration.lens.fx / LENS.fx - 1),
+                **(_errors("photos", home(found.solved, layout), list(placed.values()), exact) if placed else {}),
+            }
+        )
+    return rows
 
 
 def home(solved: Solved, layout: TagLayout) -> np.ndarray:
@@ -115,21 +140,25 @@ def flips(seeds: list[int], count: int = 500) -> list[dict[str, Any]]:
     """Flipped poses among photos of a single tag, of PnP alone and with the photos' order."""
     return [
         {
-            "walk": f"{tilt:g} degrees, {pace} photos a turn",
+            "walk": f"{tilt:g} degrees, {pace} photos a turn{', shuffled' if shuffled else ''}",
             "seed": seed,
             "photos": count,
-            **flips_of_walk(seed, count, tilt, pace),
+            **flips_of_walk(seed, count, tilt, pace, shuffled=shuffled),
         }
-        for tilt, pace in ((15.0, 40), (10.0, 40), (15.0, 20))
+        for tilt, pace, shuffled in WALKS
         for seed in seeds
     ]
 
 
-def flips_of_walk(seed: int, count: int, tilt: float, pace: int, noise: float = 0.5) -> dict[str, int]:
-    """The same of one walk, see `stroll`; `noise` in pixels."""
+def flips_of_walk(
+    seed: int, count: int, tilt: float, pace: int, noise: float = 0.5, shuffled: bool = False
+) -> dict[str, int]:
+    """The same of one walk, see `stroll`; `noise` in pixels; `shuffled`: the photos are in random order."""
     lens = Lens(1024, 768, 900.0, 900.0, 512.0, 384.0)
     points = SHEETS["one tag"].corners(0)
     truth, rng = stroll(count, seed, tilt, pace), np.random.default_rng(seed + 100)
+    if shuffled:
+        truth = [truth[i] for i in rng.permutation(count)]
     seen = [(points, project(lens, pose, points) + noise * rng.standard_normal((4, 2))) for pose in truth]
     options = [mark_poses(lens, Mark(*pair)) for pair in seen]
     errors = [[angle_between(pose, h.pose) for h in found] for pose, found in zip(truth, options, strict=True)]
@@ -165,5 +194,6 @@ def measure(seeds: list[int], folder: Path) -> dict[str, list[dict[str, Any]]]:
     return {
         "capture": rows,
         "flips": flips(seeds),
+        "hidden tags": hidden_tags(folder / "hidden_tags", seeds[0]),
         "capture fields": fields(folder / "capture", *done["six tags"], seeds[0]),
     }

@@ -52,6 +52,7 @@ def render_photo(
     flaws: Flaws,
     seed: int,
     samples: int = 3,
+    hidden: bool = False,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """A photo of the tabletop, sRGB.
 
@@ -67,8 +68,9 @@ def render_photo(
         flaws: what is added to the exact picture.
         seed: of the noise.
         samples: rays a pixel, along each side.
+        hidden: whether a blank sheet lies on the tags.
     """
-    tabletop = Tabletop(layout)
+    tabletop = Tabletop(layout, hidden)
     exact = np.empty((lens.height, lens.width, 3), np.float32)
     grid = _tangents(lens, samples)
     for top in range(0, lens.height, BLOCK):
@@ -110,6 +112,7 @@ def write_capture(
     seed: int = 0,
     steps: int | None = None,
     samples: int = 3,
+    hide: int | None = None,
 ) -> Truth:
     """Writes `calibration/000.png ...`, photos of the sheet alone, and `photos/000.png ...`, photos with the object.
 
@@ -121,6 +124,7 @@ def write_capture(
         seed: of cameras and noise; the same one gives the same bytes.
         steps: of the photos of the object around a full turn; None spreads them evenly.
         samples: see `render_photo`.
+        hide: in every N-th photo of the object, from the second on, the tags are hidden; None: in none.
     """
     _tangents(lens, samples)  # made once, before the threads ask for it, and so is the shadow
     shadow()
@@ -132,7 +136,9 @@ def write_capture(
     named = {kind: {f"{i:03d}.png": c2w for i, c2w in enumerate(c2ws)} for kind, c2ws in poses.items()}
 
     def write(kind: str, name: str, photo_seed: int) -> None:
-        photo = render_photo(layout, lens, named[kind][name], kind == "photos", flaws, photo_seed, samples)
+        of_object = kind == "photos"
+        hidden = of_object and hide is not None and int(Path(name).stem) % hide == 1
+        photo = render_photo(layout, lens, named[kind][name], of_object, flaws, photo_seed, samples, hidden)
         imageio.imwrite(folder / kind / name, photo)
 
     jobs = [(kind, name, next(seeds)) for kind, photos in named.items() for name in photos]

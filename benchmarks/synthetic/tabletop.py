@@ -28,10 +28,11 @@ SHADE = 0.65
 class Tabletop:
     """The world z >= 0, in metres: z up, tags in the plane z = 0. Beyond the table's edge there is a grey wall, at infinity.
 
-    The bulldozer stands in the middle of the tags, or beside the paper if it would stand on more than half of them.
+    The bulldozer stands in the middle of the tags, or beside the paper if it would stand on more than half of them. `hidden`:
+    another sheet, blank, lies on the tags.
     """
 
-    def __init__(self, layout: TagLayout):
+    def __init__(self, layout: TagLayout, hidden: bool = False):
         if not all(np.allclose(pose[2], [0, 0, 1, 0]) for pose in layout.poses.values()):
             raise ValueError("tags must lie face up in the plane z = 0")
         self.layout = layout
@@ -44,7 +45,9 @@ class Tabletop:
         self.middle: Float[np.ndarray, "2"] = self.paper.mean(0)
         self.radius = float(np.linalg.norm(self.paper[1] - self.middle)) + RIM
         side = patterns.markerSize + 2
-        self._modules = {tag: cv2.aruco.generateImageMarker(patterns, tag, side) > 127 for tag in layout.poses}
+        self._modules = {
+            tag: cv2.aruco.generateImageMarker(patterns, tag, side) > 127 for tag in layout.poses if not hidden
+        }
 
         low, high = bulldozer().aabb
         self.scale = LENGTH / (high[1] - low[1])

@@ -1,7 +1,7 @@
 """The result for each photo of a capture: where its tags were seen and where they project to, or why it was left out."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +29,15 @@ class Outcome:
     """Root mean square of the residuals' lengths, pixels."""
     reason: str
     """Why it was left out; "" if it was used."""
+    by: str = ""
+    """"texture" if it was placed without tags."""
 
     @property
     def caption(self) -> str:
         if self.reason or self.error is None:
             return f"{self.number}: {self.path.name}, left out: {self.reason}"
-        return f"{self.number}: {self.path.name}, {self.error:.2f} px"
+        how = f", by its {self.by}" if self.by else ""
+        return f"{self.number}: {self.path.name}{how}, {self.error:.2f} px"
 
 
 def calibration_outcomes(capture: Capture) -> list[Outcome]:
@@ -49,7 +52,11 @@ def photo_outcomes(capture: Capture) -> list[Outcome]:
     """Outcomes of the photos to be placed, in the order of `capture.photos`."""
     folder = capture.sightings[0].path.parent
     reasons = {photo.name: photo.reason for photo in capture.photos}
-    return _outcomes([folder / photo.name for photo in capture.photos], capture.sightings, capture.solved, reasons)
+    outcomes = _outcomes([folder / p.name for p in capture.photos], capture.sightings, capture.solved, reasons)
+    return [
+        replace(outcome, error=photo.reprojection_px, by=photo.by) if photo.by else outcome
+        for outcome, photo in zip(outcomes, capture.photos, strict=True)
+    ]
 
 
 def _outcomes(

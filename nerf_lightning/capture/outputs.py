@@ -30,6 +30,8 @@ class Placed:
     c2w: Float[np.ndarray, "4 4"] | None = None
     """OpenCV frame, metres."""
     reprojection_px: float | None = None
+    by: str = ""
+    """"texture" if it shows no tag, and was placed against the photos that do; "" if as the others."""
 
     @property
     def status(self) -> str:
@@ -96,6 +98,7 @@ def write_scene(folder: Path, photos: list[Placed], lens: Lens, packing: Packing
             "K": None if photo.c2w is None else K,
             "c2w": None if photo.c2w is None else photo.c2w.tolist(),
             "reprojection_px": photo.reprojection_px,
+            **({"by": photo.by} if photo.by else {}),
         }
         for photo in photos
     ]

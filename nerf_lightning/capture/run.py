@@ -1,5 +1,6 @@
 """From two folders of photos to a scene file and the files beside it."""
 
+import importlib.util
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from nerf_lightning.capture.photos import of_one_size
 from nerf_lightning.capture.poses.calibrate import Calibration, calibrate, off_by, without
 from nerf_lightning.capture.poses.geometry import inverse
 from nerf_lightning.capture.poses.solve import Solved, misfits, solve
+from nerf_lightning.capture.poses.texture import HINT, place_by_texture
 from nerf_lightning.capture.tags.board import Board, board_detector
 from nerf_lightning.capture.tags.detect import Sighting, guess_family, sight, tag_detector
 from nerf_lightning.capture.tags.layout import read_layout
@@ -104,9 +106,22 @@ def capture(
         )
     errors = {usable[i].name: float(rms) for i, rms in zip(solved.placed, solved.refined.rms, strict=True)}
     c2w = {usable[i].name: inverse(w2c) for i, w2c in solved.w2c.items()}
+    named = {usable[i].name: w2c for i, w2c in solved.w2c.items()}
+    untagged = [s.name for s in usable if not s.marks]
+    by_texture: dict[str, Placed] = {}
+    if untagged and importlib.util.find_spec("pycolmap") is None:
+        reasons |= {name: reasons[name] + HINT for name in untagged}
+    elif untagged:
+        found, more = place_by_texture([s.path for s in usable], lens, named, untagged)
+        reasons |= more
+        by_texture = {name: Placed(name, "", inverse(f.w2c), f.reprojection_px, "texture") for name, f in found.items()}
     reasons |= turned
     results = [
-        Placed(s.name, "", c2w[s.name], errors[s.name]) if s.name in c2w else Placed(s.name, reasons[s.name])
+        by_texture[s.name]
+        if s.name in by_texture
+        else Placed(s.name, "", c2w[s.name], errors[s.name])
+        if s.name in c2w
+        else Placed(s.name, reasons[s.name])
         for s in sightings
     ]
     details = {

@@ -1,38 +1,36 @@
 """The photographer's walk: neighbouring photos show which of the two poses of a flat tag is right."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import block_diag, csr_matrix, diags, identity, kron
-from scipy.sparse.linalg import splu, spsolve
 
-from nerf_lightning.capture.poses.geometry import angle_between, inverse, to_vector
+from nerf_lightning.capture.poses.geometry import inverse, to_vector
 from nerf_lightning.capture.poses.pose import Hypothesis
+from nerf_lightning.capture.poses.smooth import KINDS, Walk, Windows
+from nerf_lightning.capture.poses.swing import UNLIKELY, places_around
 from nerf_lightning.dataset.lens import Lens
 
-STIFFNESS = np.radians([0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4])
-"""Typical bends to try: by how much a step from photo to photo differs from the one before, in radians and in shares of the
-distance to the tags. The bend of the largest evidence is taken."""
-WALK_ERROR = np.radians(4.0)
-"""Standard deviation of the poses of a smoothed walk: about half the angle between solutions that matter."""
-ROUNDS = 16
-"""Iterations of Gauss-Newton; in the first half all bends have the same weight, which pulls flipped first guesses along."""
-TAIL = 4.0
-"""Degrees of freedom of Student's t, the distribution of bends: jumps are rare but possible."""
+Seen = Sequence[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 2"]]]
+"""Points in the world and their pixels, by photo."""
+BLUR = 0.01
+"""Standard deviation by which each place is blurred, radians: what is known more exactly needs no neighbours."""
+SWEEPS, DAMPING = 24, 0.6
+"""Of expectation propagation: passes over all photos, and the share of the new in each."""
+FIRST_REACH = 6.0
+"""Of the search for the likeliest walk, photos."""
+WEAKEST = 1e-4
+"""Least precision of what a photo says, radians^-2."""
 
 
-def choose(
-    lens: Lens,
-    hypotheses: Sequence[Sequence[Hypothesis]],
-    seen: Sequence[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 2"]]],
-) -> list[int]:
-    """Chooses a hypothesis for each photo, by its error and its distance from the likeliest smooth walk through all photos.
+def choose(lens: Lens, hypotheses: Sequence[Sequence[Hypothesis]], seen: Seen) -> list[int]:
+    """Chooses a hypothesis for each photo: the one nearest to where the camera stood, by all photos together.
 
     A flat tag seen nearly from the front has two poses of about the same reprojection error, and noise decides between them.
-    But photos are taken one after the other, and the wrong poses do not make a smooth walk. If photos are far apart, every
-    walk bends at every step, and the reprojection error decides again.
+    But photos are taken one after the other, and the wrong poses do not make a smooth walk. How smooth the walk is, how far it
+    strays and how exact corners are is learned from the same photos, so that photos in no order say nothing of each other.
 
     Args:
         lens: of all photos.
@@ -42,96 +40,142 @@ def choose(
     Returns:
         The index chosen in each list.
     """
+    first = [0] * len(hypotheses)
     if len(hypotheses) < 4 or all(len(options) == 1 for options in hypotheses):
-        return [0] * len(hypotheses)
+        return first
     # Six numbers were fitted to each photo: the remaining residuals are the noise.
     spare = sum(max(2 * len(points) - 6, 1) for points, _ in seen)
     variance = max(sum(options[0].squares for options in hypotheses) / spare, 1e-4)
-    start = [inverse(options[0].pose) for options in hypotheses]
-    walks = [smoothed(lens, start, seen, variance, float(bend)) for bend in STIFFNESS]
-    walk, _ = max(walks, key=lambda found: found[1])
+    viable = [[h for h in o if h.squares <= o[0].squares + 2 * UNLIKELY * variance] for o in hypotheses]
+    if all(len(options) == 1 for options in viable):
+        return first
+    views = Views.of(lens, viable, seen, variance)
+    fits = [propagated(views, kind, variance) for kind in KINDS]
+    middle, _ = max(fits, key=lambda fit: fit[1])
 
-    def cost(hypothesis: Hypothesis, pose: Float[np.ndarray, "4 4"]) -> float:
-        off = angle_between(inverse(hypothesis.pose), pose) / WALK_ERROR
-        return hypothesis.squares / (2 * variance) + off**2 / 2
+    def off(hypothesis: Hypothesis, photo: int) -> float:
+        return float(np.linalg.norm(views.charted(inverse(hypothesis.pose)[:3, 3]) - middle[photo]))
 
-    return [
-        min(range(len(options)), key=lambda i: cost(options[i], pose))
-        for options, pose in zip(hypotheses, walk, strict=True)
-    ]
+    return [min(range(len(options)), key=lambda i: off(options[i], n)) for n, options in enumerate(viable)]
 
 
-def smoothed(
-    lens: Lens,
-    start: Sequence[Float[np.ndarray, "4 4"]],
-    seen: Sequence[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 2"]]],
-    variance: float,
-    bend: float,
-) -> tuple[list[Float[np.ndarray, "4 4"]], float]:
-    """The walk with the best balance of reprojection errors and bends, by iteratively reweighted least squares.
+@dataclass(frozen=True)
+class Views:
+    """From where each photo may have been taken, as directions from the middle of the tags."""
 
-    The unknowns are a small rotation and translation of each pose, in the world's frame. Bends follow Student's t: a jump
-    between two rounds of photos costs little.
+    origin: Float[np.ndarray, "3"]
+    axes: Float[np.ndarray, "3 3"]
+    """Rows: the last one is the pole of the chart."""
+    places: Float[np.ndarray, "N S 2"]
+    """Of each photo, on the chart."""
+    squares: Float[np.ndarray, "N S"]
+    """Sums of squared reprojection distances from there, pixels^2."""
+    spare: Float[np.ndarray, "N"]
+    """Coordinates of corners less the numbers fitted to them at each place."""
+
+    @classmethod
+    def of(cls, lens: Lens, options: Sequence[Sequence[Hypothesis]], seen: Seen, variance: float) -> "Views":
+        origin = np.median([points.mean(0) for points, _ in seen], axis=0)
+        directions = np.stack([inverse(found[0].pose)[:3, 3] - origin for found in options])
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        pole = np.linalg.svd(directions.mean(0)[None])[2]
+        axes = np.roll(pole if float(pole[0] @ directions.sum(0)) > 0 else -pole, -1, axis=0)
+        chart = cls(origin, axes, np.empty((0, 0, 2)), np.empty((0, 0)), np.empty(0))
+        all_places, all_squares = [], []
+        for found, (points, pixels) in zip(options, seen, strict=True):
+            if len(found) == 1 and _spread(lens, found[0], points, pixels, variance) < BLUR:
+                centres, squares = inverse(found[0].pose)[None, :3, 3], np.array([found[0].squares])
+            else:
+                around = places_around(lens, np.stack([h.pose for h in found]), points, pixels, variance)
+                centres, squares = around.centres, around.squares
+            all_places.append(chart.charted(centres))
+            all_squares.append(squares)
+        most = max(map(len, all_places))
+        # A photo that is sure of its place has it many times.
+        grid = np.stack([np.resize(places, (most, 2)) for places in all_places])
+        squares = np.stack([np.resize(squares, most) for squares in all_squares])
+        return cls(origin, axes, grid, squares, np.array([2.0 * len(points) - 4 for points, _ in seen]))
+
+    def charted(self, centres: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s 2"]:
+        """Directions to camera centres on a plane: the stereographic projection, true to scale at its pole, radians."""
+        local = (centres - self.origin) @ self.axes.T
+        local /= np.linalg.norm(local, axis=-1, keepdims=True)
+        return 2 * local[..., :2] / (1 + local[..., 2:]).clip(1e-3)
+
+
+def _spread(lens: Lens, hypothesis: Hypothesis, points: np.ndarray, pixels: np.ndarray, variance: float) -> float:
+    """Standard deviation of the direction to a camera in which it is least known, radians."""
+    vector = to_vector(hypothesis.pose)
+    _, jacobian = cv2.projectPoints(points[:, None], vector[:3], vector[3:], lens.K, np.array(lens.distortion))
+    J = jacobian[:, :6]
+    turns = np.linalg.inv(J.T @ J + 1e-9 * np.eye(6))[:3, :3] * variance
+    return float(np.sqrt(np.linalg.eigvalsh(turns)[-1]))
+
+
+def propagated(views: Views, kind: float, variance: float) -> tuple[Float[np.ndarray, "N 2"], float]:
+    """Where each photo was taken, by the likeliest walk of one kind: expectation propagation (Minka 2001).
+
+    What each photo says is replaced by a Gaussian that acts alike beside what all the others say. In between, the walk and the
+    variance of the corners move to more evidence.
 
     Args:
-        start: camera to world, by photo.
-        variance: of a corner's coordinate, pixels^2.
-        bend: typical change from one step to the next, radians (and shares of the distance).
+        kind: see `Walk`.
+        variance: of a corner's coordinate, to start from, pixels^2.
 
     Returns:
-        The poses, and the logarithm of the evidence for such a bend (Laplace's approximation, up to a constant).
+        The means, on the chart; and the logarithm of the evidence, up to what all kinds share.
     """
-    count = len(start)
-    poses = [pose.copy() for pose in start]
-    scale = float(np.median([np.linalg.norm(inverse(pose)[:3, 3]) for pose in start]))
-    unit = np.tile([1, 1, 1, scale, scale, scale], count)  # lengths in units of the distance
-    second = diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
-    D = csr_matrix(kron(second, identity(6)))
-    for round_ in range(ROUNDS):
-        blocks, slopes = zip(*(_pull(lens, p, *s) for p, s in zip(poses, seen, strict=True)), strict=True)
-        bends = _bends(poses, scale)
-        square = (bends**2).sum(1) / bend**2
-        heavy = (TAIL + 6) / (TAIL + square) if round_ >= ROUNDS // 2 else np.ones(len(bends))
-        weight = heavy / bend**2
-        W = diags(np.repeat(weight, 6))
-        H = diags(unit) @ (block_diag(blocks) / variance) @ diags(unit) + D.T @ W @ D + 1e-9 * diags(np.ones(6 * count))
-        g = unit * (np.concatenate(slopes) / variance) + D.T @ (W @ bends.reshape(-1))
-        step = (-spsolve(H.tocsc(), g) * unit).reshape(count, 6)
-        longest = float(np.abs(step[:, :3]).max())
-        step *= min(1.0, 0.3 / max(longest, 1e-12))
-        for pose, change in zip(poses, step, strict=True):
-            pose[:3, :3] = cv2.Rodrigues(change[:3])[0] @ pose[:3, :3]
-            pose[:3, 3] += change[3:]
-    squares = sum(float((_residual(lens, p, *s)[0] ** 2).sum()) for p, s in zip(poses, seen, strict=True))
-    square = (_bends(poses, scale) ** 2).sum(1) / bend**2
-    prior = ((TAIL + 6) / 2 * np.log1p(square / TAIL) + 6 * np.log(bend)).sum()
-    log_determinant = np.log(np.abs(splu(H.tocsc()).U.diagonal())).sum()
-    return poses, float(-squares / (2 * variance) - prior - log_determinant / 2)
+    count = len(views.places)
+    best = views.places[np.arange(count), views.squares.argmin(1)]
+    places = views.places - best.mean(0)
+    windows, walk = Windows.of(count), Walk(float(best.std()), FIRST_REACH, kind)
+    mean, covariance, _ = _moments(places, -views.squares / (2 * variance))
+    precision = np.linalg.inv(covariance)
+    pull = np.einsum("nij,nj->ni", precision, mean)
+    for sweep in range(SWEEPS):
+        # The walk first in large steps, then in small ones, then no more.
+        if sweep % 2 == 0 and sweep < SWEEPS - 6:
+            factor = 2**0.5 if sweep < SWEEPS // 2 else 2**0.25
+            walk = max(walk.near(factor), key=lambda changed: windows.evidence(changed, precision, pull))
+        middle, spread = windows.marginals(walk, precision, pull)
+        inverted = np.linalg.inv(spread)
+        others = _positive(inverted - precision, WEAKEST)
+        others_pull = np.einsum("nij,nj->ni", inverted, middle) - pull
+        centre = np.linalg.solve(others, others_pull[..., None])[..., 0]
+        away = places - centre[:, None]
+        logs = -views.squares / (2 * variance) - np.einsum("nsi,nij,nsj->ns", away, others, away) / 2
+        mean, covariance, weights = _moments(places, logs)
+        if sweep == SWEEPS - 1:
+            break
+        variance = (variance + max(float((weights * views.squares).sum() / views.spare.sum()), 1e-4)) / 2
+        fitted = _positive(np.linalg.inv(covariance) - others, WEAKEST)
+        fitted_pull = np.einsum("nij,nj->ni", fitted + others, mean) - others_pull
+        precision = (1 - DAMPING) * precision + DAMPING * fitted
+        pull = (1 - DAMPING) * pull + DAMPING * fitted_pull
+    top = logs.max(1)
+    said = top + np.log(np.exp(logs - top[:, None]).sum(1)) + np.linalg.slogdet(others + precision)[1] / 2
+    said += _peak(others, others_pull) - _peak(others + precision, others_pull + pull)
+    whole = windows.evidence(walk, precision, pull, each=True)
+    return mean + best.mean(0), float(said.sum() - views.spare.sum() / 2 * np.log(variance)) + whole
 
 
-def _bends(poses: Sequence[np.ndarray], scale: float) -> Float[np.ndarray, "B 6"]:
-    """How each step from photo to photo differs from the one before: rotation vectors, and shifts over the distance."""
-    turns = [cv2.Rodrigues(b[:3, :3] @ a[:3, :3].T)[0].reshape(3) for a, b in zip(poses, poses[1:], strict=False)]
-    centres = np.stack([pose[:3, 3] for pose in poses]) / scale
-    return np.concatenate([np.diff(np.stack(turns), axis=0), np.diff(centres, 2, axis=0)], axis=1)
+def _moments(
+    places: Float[np.ndarray, "N S 2"], logs: Float[np.ndarray, "N S"]
+) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2 2"], Float[np.ndarray, "N S"]]:
+    """Mean and covariance of weighted places, and the weights, whose logarithms are given up to a constant a photo."""
+    weights = np.exp(logs - logs.max(1, keepdims=True))
+    weights /= weights.sum(1, keepdims=True)
+    mean = np.einsum("ns,nsi->ni", weights, places)
+    away = places - mean[:, None]
+    return mean, np.einsum("ns,nsi,nsj->nij", weights, away, away) + BLUR**2 * np.eye(2), weights
 
 
-def _residual(
-    lens: Lens, pose: np.ndarray, points: np.ndarray, pixels: np.ndarray
-) -> tuple[Float[np.ndarray, "twoM"], Float[np.ndarray, "twoM 3"]]:
-    """Projected minus seen, and the derivative with respect to a shift of the points in the camera's frame."""
-    vector = to_vector(inverse(pose))
-    projected, jacobian = cv2.projectPoints(points[:, None], vector[:3], vector[3:], lens.K, np.array(lens.distortion))
-    return (projected.reshape(-1, 2) - pixels).reshape(-1), jacobian[:, 3:6]
+def _positive(matrices: Float[np.ndarray, "N 2 2"], least: float) -> Float[np.ndarray, "N 2 2"]:
+    """Symmetric matrices with their eigenvalues raised to at least this."""
+    values, vectors = np.linalg.eigh(matrices)
+    return (vectors * values.clip(least)[:, None]) @ vectors.swapaxes(1, 2)
 
 
-def _pull(
-    lens: Lens, pose: np.ndarray, points: np.ndarray, pixels: np.ndarray
-) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
-    """J^T J and J^T r of one photo, for a rotation and a translation of its pose in the world's frame."""
-    residual, by_camera = _residual(lens, pose, points, pixels)
-    by_world = (by_camera @ pose[:3, :3].T).reshape(-1, 2, 3)
-    # Turning the camera by w moves a point, as the camera sees it, by -w x (p - c); shifting the camera by s, by -s.
-    arms = points - pose[:3, 3]
-    J = np.concatenate([np.cross(by_world, arms[:, None]), -by_world], axis=2).reshape(-1, 6)
-    return J.T @ J, J.T @ residual
+def _peak(precision: Float[np.ndarray, "N 2 2"], pull: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N"]:
+    """The largest value of -x P x / 2 + p x."""
+    return np.einsum("ni,ni->n", pull, np.linalg.solve(precision, pull[..., None])[..., 0]) / 2
