@@ -25,8 +25,10 @@ def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
         content: of the run's scene.json.
     """
     frame, _, to_source = frame_from(dict(content)) if "aabb" in content else (None, None, None)
-    if to_source is None or not isinstance(frame, SceneFrame) or torch.allclose(to_source, scene.to_source, atol=1e-5):
+    if to_source is None or not isinstance(frame, SceneFrame):
         return scene
+    if torch.allclose(to_source, scene.to_source, atol=1e-5):
+        return replace(scene, bounds=frame.bounds, to_source=to_source)
     moved = torch.linalg.solve(to_source.double(), scene.to_source.double())
     scale = torch.linalg.det(moved[:3, :3]) ** (1 / 3)
 
