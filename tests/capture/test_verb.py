@@ -24,7 +24,9 @@ def test_one_command_makes_a_scene_with_its_report(verb, packed: tuple[Path, Cap
     packing = Packing(Path("mine/scene.npz"), longest=120)
     assert given == [(Path("sheet"), Path("object"), SIZE, packing, "auto", "auto", None)]
     assert reports == [(packed[1], Path("mine/scene_report"))]
-    assert "8 of 8 photos placed" in out and "+experiment=capture dataset.path=mine/scene.npz" in out
+    placed = sum(photo.status == "placed" for photo in packed[1].photos)
+    assert placed >= 7  # detectors find one more or less on other processors
+    assert f"{placed} of 8 photos placed" in out and "+experiment=capture dataset.path=mine/scene.npz" in out
 
 
 @pytest.mark.parametrize(
