@@ -12,13 +12,12 @@ from nerf_lightning.cameras import Bounds, Cameras, focus_point, orbit_around
 from nerf_lightning.dataset.extent import viewing_distance, visible_cube
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.dataset.lens import Lens, Rectification, rectify
+from nerf_lightning.dataset.posed import NEAR
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
-NEAR = 0.25
-"""Sampling starts at this share of the nearest camera's distance to the subject."""
 SUBJECT = 0.5
 """The box's share of the width that photos show at the subject. The tags around an object may lie outside the box, where a
 field has less detail the farther out."""
