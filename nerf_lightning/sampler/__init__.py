@@ -2,6 +2,7 @@
 
 from nerf_lightning.sampler.importance import ImportanceSampler
 from nerf_lightning.sampler.occupancy import OccupancySampler
+from nerf_lightning.sampler.proposal import ProposalSampler
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack, split
 from nerf_lightning.sampler.uniform import UniformSampler
 
@@ -9,6 +10,7 @@ __all__ = [
     "DensityFn",
     "ImportanceSampler",
     "OccupancySampler",
+    "ProposalSampler",
     "Sampler",
     "Samples",
     "UniformSampler",
