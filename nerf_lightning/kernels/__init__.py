@@ -23,7 +23,7 @@ from nerf_lightning.kernels.planes import (
     plane_line_sum,
     plane_line_sum_and_products,
 )
-from nerf_lightning.kernels.proposals import along, resample
+from nerf_lightning.kernels.proposals import along, inverse_cdf, resample
 from nerf_lightning.kernels.switch import fast, use_kernels
 from nerf_lightning.kernels.voxels import (
     interpolate_rows,
@@ -41,6 +41,7 @@ __all__ = [
     "fast",
     "hash_interpolate",
     "interpolate_rows",
+    "inverse_cdf",
     "keep_visible",
     "locate",
     "march",

@@ -1,11 +1,15 @@
 """Intervals along rays in warped distances, and how they move to where the weight is."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels.switch import fast
+
+FLOOR = 1e-5
+"""Added to all weights: rays without any are divided evenly."""
 
 Along = tuple[Float[Tensor, "N 3"], Float[Tensor, "R S"], Float[Tensor, "R S"]]
 """Places of the midpoints in the unit cube, N = R S of them; their distances, and the intervals' lengths, world units."""
@@ -43,16 +47,24 @@ def along(
     return unit.T, t, dt
 
 
+def inverse_cdf(
+    edges: Float[Tensor, "R S_plus_1"], weights: Float[Tensor, "R S"], u: Float[Tensor, "R K"]
+) -> Float[Tensor, "R K"]:
+    """Maps u in [0, 1] to distances distributed as the piecewise-constant density given by `weights` (NeRF, section 5.2)."""
+    pdf = weights + FLOOR
+    cdf = torch.cumsum(pdf / pdf.sum(1, keepdim=True), dim=1)
+    cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=1)
+    upper = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, edges.shape[1] - 1)
+    low, high = cdf.gather(1, upper - 1), cdf.gather(1, upper)
+    share = ((u - low) / (high - low).clamp_min(1e-9)).clamp(0, 1)
+    start, end = edges.gather(1, upper - 1), edges.gather(1, upper)
+    return start + share * (end - start)
+
+
 def resample_reference(s: Tensor, share: Tensor, shift: Tensor, count: int) -> Tensor:
     """`resample` in plain PyTorch, for every device."""
-    sums = torch.cat([torch.zeros_like(share[:, :1]), share.cumsum(1)], dim=1)
-    steps = torch.arange(count + 1, device=s.device)
-    u = ((steps + shift[:, None]) / count).clamp(0, 1) * sums[:, -1:]
-    above = torch.searchsorted(sums, u, right=True).clamp(1, share.shape[1])
-    low, high = sums.gather(1, above - 1), sums.gather(1, above)
-    part = ((u - low) / (high - low)).clamp(0, 1)
-    start, end = s.gather(1, above - 1), s.gather(1, above)
-    return start + part * (end - start)
+    u = (torch.arange(count + 1, device=s.device) + shift[:, None]) / count
+    return inverse_cdf(s, share, u.clamp(0, 1))
 
 
 def resample(
@@ -62,7 +74,7 @@ def resample(
 
     Args:
         s: edges of the old intervals, ascending.
-        share: of each old interval, above 0; any scale.
+        share: of each old interval; about 1 in total.
         shift: of each ray's edges, in shares of a new interval.
     """
     if not fast(s, share, shift):
@@ -70,5 +82,6 @@ def resample(
     from nerf_lightning.kernels.cpu import proposals, workers
 
     out = torch.empty(len(s), count + 1)
-    proposals.resample(*(x.detach().contiguous().numpy() for x in (s, share, shift)), out.numpy(), workers())
+    arrays = (x.detach().contiguous().numpy() for x in (s, share, shift))
+    proposals.resample(*arrays, np.float32(FLOOR), out.numpy(), workers())
     return out

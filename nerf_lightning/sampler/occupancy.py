@@ -11,13 +11,19 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import keep_visible, march, mark_cells
 from nerf_lightning.kernels.march import Packed
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
-from nerf_lightning.sampler.visibility import seen_cells
 from nerf_lightning.utils.options import Count
 
 ASKED, LOOKED_AT = 4, 32
 """How many positions are evaluated at a time, and how many steps are tested at a time, as multiples of `Sampler.chunk`."""
+MOST_CAMERAS = 128
+"""Most cameras, evenly chosen, that decide which cells are in view."""
 ROOM = 1.25
 """Room for steps that are not counted, as a multiple of the last count."""
+
+
+def in_view(camera: Cameras, points: Float[Tensor, "N 3"], near: float) -> Bool[Tensor, "N"]:
+    """Which world points one camera sees, farther from it than `near`."""
+    return camera.project(points, 0)[2] & ((points - camera.centres).norm(dim=1) > near)
 
 
 class OccupancySampler(Sampler):
@@ -141,7 +147,19 @@ class OccupancySampler(Sampler):
     @torch.no_grad()
     def look_through(self, cameras: Cameras) -> None:
         """Empties for good the cells whose middle fewer than `seen_by` cameras see."""
-        self.allowed.copy_(seen_cells(self.bounds, cameras, self.seen_by, self.resolution))
+        chosen = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS)).round().long()
+        n = self.resolution
+        cells = torch.arange(n**3)
+        unit = (torch.stack([cells // (n * n), cells // n % n, cells % n], dim=1) + 0.5) / n
+        bounds = self.bounds.to("cpu")
+        centres, near = bounds.to_world(unit), self.bounds.near or 0.0
+        count = torch.zeros(len(cells), dtype=torch.int32)
+        wanted = min(self.seen_by, len(chosen))
+        for camera in chosen:
+            open_ones = (count < wanted).nonzero()[:, 0]  # the others have enough views already
+            count[open_ones] += in_view(cameras[camera : camera + 1].to("cpu"), centres[open_ones], near).int()
+        allowed = count >= wanted
+        self.allowed.copy_(allowed if allowed.any() else torch.ones_like(allowed))
         self.occupied &= self.allowed
         self.lit &= self.allowed
 

@@ -1,15 +1,14 @@
 """Proposals: a small field of density alone learns where the large one's samples are worth their time."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, Rays
+from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import along, cell_index, resample
+from nerf_lightning.kernels import along, resample
 from nerf_lightning.model.hashgrid import HashGrid
 from nerf_lightning.sampler.samples import DensityFn, Histogram, Proposals, Sampler, Samples
-from nerf_lightning.sampler.visibility import RESOLUTION, seen_cells
 from nerf_lightning.utils.options import Count
 
 START = -1.0
@@ -33,19 +32,15 @@ class ProposalSampler(Sampler):
         anneal: steps until proposals count in full; before, samples are spread more evenly.
         padding: share of the samples that are spread evenly all the same.
         levels, coarsest, finest, log2_entries: of the small field, see `HashGrid`.
-        seen_by: places that fewer training cameras see hold nothing: what only one camera sees can be anything, such as fog in
-            front of its lens.
 
     Raises:
         InputError: padding that is not above 0 and below 1.
     """
 
-    allowed: Tensor
-
     def __init__(
         self,
         bounds: Bounds,
-        samples: Count = 24,
+        samples: Count = 16,
         first: Count = 48,
         second: Count = 32,
         anneal: int = 500,
@@ -54,7 +49,6 @@ class ProposalSampler(Sampler):
         coarsest: Count = 32,
         finest: Count = 128,
         log2_entries: Count = 18,
-        seen_by: int = 3,
     ):
         super().__init__(bounds)
         if not 0 < padding < 1:
@@ -63,10 +57,8 @@ class ProposalSampler(Sampler):
         self.first, self.second = first, second
         self.anneal = anneal
         self.padding = padding
-        self.seen_by = seen_by
         self.grid = HashGrid(levels, log2_entries, 1, coarsest, finest)
         self.unit_length = bounds.longest
-        self.register_buffer("allowed", torch.ones(RESOLUTION**3, dtype=torch.bool))
         self.first_step = 0
         """The step at which training began."""
         self.step = 0
@@ -85,10 +77,9 @@ class ProposalSampler(Sampler):
             if generator is not None:
                 share = share**self.trust
             s = resample(s, share, self._shift(rays, generator)[:, 0], wanted)
-        unit, t, dt = along(rays, self.bounds, near, far, s)
-        dt = dt * self._allowed(unit).view(dt.shape)
+        _, t, dt = along(rays, self.bounds, near, far, s)
         ray = torch.arange(count, device=device).repeat_interleave(self.samples)
-        offsets = torch.arange(0, count * self.samples + 1, self.samples, device=device)
+        offsets = torch.arange(count + 1, device=device) * self.samples
         proposals = None if generator is None else Proposals(tuple(histograms), s)
         return Samples(t.flatten(), dt.flatten(), ray, offsets, proposals=proposals)
 
@@ -104,15 +95,12 @@ class ProposalSampler(Sampler):
         share = min(1.0, (self.step - self.first_step + 1) / max(self.anneal, 1))
         return SLOPE * share / ((SLOPE - 1) * share + 1)
 
-    def _allowed(self, unit: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
-        return self.allowed[cell_index(unit, RESOLUTION)]
-
     def weights(
         self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "R S_plus_1"]
     ) -> Float[Tensor, "R S"]:
         """How much the small field thinks that each interval contributes to its ray's pixel, see `volume_weights`."""
         unit, t, dt = along(rays, self.bounds, near, far, s)
-        density = torch.exp(self.grid(unit).sum(1) + START) * self._allowed(unit)
+        density = torch.exp(self.grid(unit).sum(1) + START)
         optical = density.view(t.shape) * (dt / self.unit_length)
         return torch.exp(optical - optical.cumsum(1)) * -torch.expm1(-optical)
 
@@ -123,19 +111,13 @@ class ProposalSampler(Sampler):
         found = weights.view(len(edges), -1)
         return torch.stack([interlevel_loss(edges, found, histogram) for histogram in histograms]).sum()
 
-    @torch.no_grad()
-    def look_through(self, cameras: Cameras) -> None:
-        """Keeps samples out of cells whose middle fewer than `seen_by` cameras see."""
-        self.allowed.copy_(seen_cells(self.bounds, cameras, self.seen_by, RESOLUTION))
-
     def export_state(self) -> dict[str, Tensor]:
-        return {"tables": self.grid.tables.detach(), "allowed": self.allowed}
+        return {"tables": self.grid.tables.detach()}
 
     def import_state(self, state: dict[str, Tensor]) -> None:
         if state["tables"].shape != self.grid.tables.shape:
             raise RuntimeError(f"a proposal of {len(state['tables'])} entries, not {len(self.grid.tables)}")
         self.grid.tables.data.copy_(state["tables"])
-        self.allowed.copy_(state["allowed"])
 
     @torch.no_grad()
     def restart(self, step: int) -> None:

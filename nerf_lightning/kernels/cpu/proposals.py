@@ -34,19 +34,19 @@ def along(origins, directions, near, far, inside, s, centre, half, unbounded, un
 
 
 @kernel
-def resample(s, share, shift, out, workers):
+def resample(s, share, shift, floor, out, workers):
     """Fills out [R, K + 1] from s [R, S + 1] and share [R, S]: see `nerf_lightning.kernels.proposals.resample`."""
     rays, steps, count = len(s), share.shape[1], out.shape[1] - 1
     for worker in prange(workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
             total = float32(0)
             for k in range(steps):
-                total += share[ray, k]
+                total += share[ray, k] + floor
             k, passed = 0, float32(0)
             for j in range(count + 1):
                 u = min(max((float32(j) + shift[ray]) / float32(count), float32(0)), float32(1)) * total
-                while k < steps - 1 and passed + share[ray, k] <= u:
-                    passed += share[ray, k]
+                while k < steps - 1 and passed + (share[ray, k] + floor) <= u:
+                    passed += share[ray, k] + floor
                     k += 1
-                part = min(max((u - passed) / share[ray, k], float32(0)), float32(1))
+                part = min(max((u - passed) / (share[ray, k] + floor), float32(0)), float32(1))
                 out[ray, j] = s[ray, k] + part * (s[ray, k + 1] - s[ray, k])
