@@ -31,6 +31,11 @@ class Room:
     bodies: list[tuple[Body, float]]
     subject: int
 
+    @property
+    def floor(self) -> int:
+        """The number of the floor: `walls` come last, four of the sides, then the floor and the ceiling."""
+        return len(self.bodies) - 2
+
     def see(self, rays: Rays) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]:
         """Colour, distance and number of the body that each ray meets."""
         met = [body.meet(rays) for body, _ in self.bodies]
