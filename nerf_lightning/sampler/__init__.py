@@ -4,6 +4,7 @@ from nerf_lightning.sampler.importance import ImportanceSampler
 from nerf_lightning.sampler.occupancy import OccupancySampler
 from nerf_lightning.sampler.proposal import ProposalSampler
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack, split
+from nerf_lightning.sampler.suited import suited_sampler
 from nerf_lightning.sampler.uniform import UniformSampler
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "UniformSampler",
     "pack",
     "split",
+    "suited_sampler",
 ]

@@ -8,7 +8,7 @@ from torch import Generator
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import along, resample, volume_weights
-from nerf_lightning.sampler import ProposalSampler, Samples
+from nerf_lightning.sampler import OccupancySampler, ProposalSampler, Samples, suited_sampler
 from nerf_lightning.sampler.proposal import interlevel_loss
 from nerf_lightning.sampler.samples import Histogram
 
@@ -144,3 +144,8 @@ def test_fast_and_plain_resampling_agree():
     agree(lambda *given: resample(*given, 20), [s, share, shift], constants=(0, 1, 2), rtol=1e-4, atol=1e-4)
     even = resample(torch.linspace(0, 1, 5)[None], torch.zeros(1, 4), torch.zeros(1), 8)
     torch.testing.assert_close(even, torch.linspace(0, 1, 9)[None])
+
+
+def test_a_background_asks_for_proposals_and_empty_space_for_a_grid():
+    assert isinstance(suited_sampler(AROUND), ProposalSampler)
+    assert isinstance(suited_sampler(replace(AROUND, unbounded=False, near=None)), OccupancySampler)
