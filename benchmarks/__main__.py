@@ -14,13 +14,38 @@ from typing import Any
 import torch
 
 import nerf_lightning
-from benchmarks import capture, device, growth, kernels, methods, overhead, photos, pictures, shapes, sizes, video
+from benchmarks import (
+    capture,
+    captures,
+    device,
+    growth,
+    kernels,
+    methods,
+    overhead,
+    photos,
+    pictures,
+    shapes,
+    sizes,
+    video,
+)
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.device import the_device
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.machine import describe_machine
 
-PARTS = ("methods", "kernels", "growth", "overhead", "capture", "photos", "pictures", "sizes", "shapes", "video")
+PARTS = (
+    "methods",
+    "kernels",
+    "growth",
+    "overhead",
+    "capture",
+    "captures",
+    "photos",
+    "pictures",
+    "sizes",
+    "shapes",
+    "video",
+)
 ALONE = ("device",)
 """Runs only when it is named."""
 
@@ -49,6 +74,9 @@ def main() -> None:
     parser.add_argument("--experiments", default="lego,lego_hashgrid,lego_voxels", help="experiments to train")
     parser.add_argument("--budgets", default="60", help="seconds of training, separated by commas")
     parser.add_argument("--seeds", default="0,1,2")
+    parser.add_argument(
+        "--scenes", type=Path, nargs="*", default=[], help="of the part captures: further folders of photos"
+    )
     parser.add_argument("--device", default="auto", help="of the part device: auto, cpu, cuda or mps")
     parser.add_argument("--output", type=Path, default=Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S"))
     arguments = parser.parse_intermixed_args()  # overrides may stand behind options
@@ -63,6 +91,7 @@ def main() -> None:
         parser.error(str(error))
     budgets, seeds = [float(x) for x in arguments.budgets.split(",")], [int(x) for x in arguments.seeds.split(",")]
     experiments = arguments.experiments.split(",")
+    scenes = [Path(scene) for scene in arguments.scenes.split(",") if scene]
     report: dict[str, Any] = {
         "machine": {
             "processor": platform.processor() or platform.machine(),
@@ -88,6 +117,8 @@ def main() -> None:
             tables, unequal = device.measure(chosen_device, overrides, budgets[0], seeds[0], arguments.output)
         elif part == "capture":
             tables = capture.measure(seeds, arguments.output)
+        elif part == "captures":
+            tables = captures.measure(overrides, budgets[0], seeds, scenes, arguments.output)
         elif part == "photos":
             tables = photos.measure(seeds, arguments.output)
         elif part == "pictures":

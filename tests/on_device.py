@@ -18,6 +18,7 @@ SAMPLERS = {
     "uniform": ["sampler=uniform", "sampler.samples=16"],
     "stratified": ["sampler=stratified", "sampler.samples=16"],
     "importance": ["sampler=importance", "sampler.samples=8", "sampler.fine=8"],
+    "proposal": ["sampler=proposal", "sampler.samples=8", "sampler.first=8", "sampler.second=8"],
 }
 
 

@@ -23,6 +23,7 @@ from nerf_lightning.kernels.planes import (
     plane_line_sum,
     plane_line_sum_and_products,
 )
+from nerf_lightning.kernels.proposals import along, inverse_cdf, resample
 from nerf_lightning.kernels.switch import fast, use_kernels
 from nerf_lightning.kernels.voxels import (
     interpolate_rows,
@@ -34,11 +35,13 @@ from nerf_lightning.kernels.voxels import (
 )
 
 __all__ = [
+    "along",
     "cell_index",
     "composite",
     "fast",
     "hash_interpolate",
     "interpolate_rows",
+    "inverse_cdf",
     "keep_visible",
     "locate",
     "march",
@@ -52,6 +55,7 @@ __all__ = [
     "plane_line_sum_and_products",
     "points",
     "read_voxels",
+    "resample",
     "roughness",
     "spherical_harmonics",
     "use_kernels",

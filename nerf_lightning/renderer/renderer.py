@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Rays
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import composite
+from nerf_lightning.kernels import composite, volume_weights
 from nerf_lightning.renderer.distortion import distortion_loss
 from nerf_lightning.sampler import Samples
 
@@ -30,6 +30,8 @@ class Rendered:
     distance: Float[Tensor, "R"]
     """Along the ray to what covers it, in the scene's unit, times opacity."""
     penalty: Float[Tensor, ""] | None = None
+    weights: Float[Tensor, "N"] | None = None
+    """How much each sample contributed, where the sampler learns from that; without gradient."""
     """What training adds to its loss, where the renderer asks for that."""
 
     @property
@@ -111,4 +113,7 @@ class VolumeRenderer(torch.nn.Module):
         penalty = None
         if self.distortion_loss_weight and density.requires_grad:
             penalty = self.distortion_loss_weight * distortion_loss(density, samples, self.half_size)
-        return Rendered(colour, opacity, distance, penalty)
+        weights = None
+        if samples.proposals is not None:
+            weights = volume_weights(density.detach(), samples.dt, samples.ray, samples.offsets)
+        return Rendered(colour, opacity, distance, penalty, weights)

@@ -1,6 +1,7 @@
 """Climbing a ladder: one training that starts small and grows, keeping what was learned."""
 
 import copy
+import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,15 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks import Budget
-from nerf_lightning.config.build import budget_options, build_system, build_trainer, device_of, frame_of, resolved
+from nerf_lightning.config.build import (
+    budget_options,
+    build_system,
+    build_trainer,
+    device_of,
+    frame_of,
+    resolved,
+    target_of,
+)
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.export.reach import confined_to, seen_cells
 from nerf_lightning.export.smallest import held_out_psnr, some_cameras
@@ -154,8 +163,10 @@ def coarsest_sampler(cfg: DictConfig, data: Data, system: System, samplers: list
         cfg: with whose sampler the field was trained.
         data: whose held-out views measure it.
         system: the field.
-        samplers: options, coarsest first.
+        samplers: options, coarsest first; those that its sampler does not have are left out.
     """
+    known = inspect.signature(target_of(cfg, "sampler")).parameters if isinstance(system, NeRF3D) else {}
+    samplers = [options for options in samplers if options.keys() <= known.keys()]
     if not samplers or not isinstance(system, NeRF3D) or not isinstance(data, RayDataModule):
         return {}
     scores = []

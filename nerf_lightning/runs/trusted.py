@@ -24,7 +24,10 @@ TARGETS = {
         "VoxelField",
     ),
     "nerf_lightning.renderer": ("VolumeRenderer",),
-    "nerf_lightning.sampler": ("ImportanceSampler", "OccupancySampler", "UniformSampler"),
+    "nerf_lightning.sampler": (
+        *("ImportanceSampler", "OccupancySampler", "ProposalSampler", "UniformSampler"),
+        "suited_sampler",
+    ),
     "nerf_lightning.system": ("constant", "cosine", "exponential"),
     "torch.optim": ("Adam", "AdamW"),
 }

@@ -2,16 +2,20 @@
 
 from nerf_lightning.sampler.importance import ImportanceSampler
 from nerf_lightning.sampler.occupancy import OccupancySampler
+from nerf_lightning.sampler.proposal import ProposalSampler
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack, split
+from nerf_lightning.sampler.suited import suited_sampler
 from nerf_lightning.sampler.uniform import UniformSampler
 
 __all__ = [
     "DensityFn",
     "ImportanceSampler",
     "OccupancySampler",
+    "ProposalSampler",
     "Sampler",
     "Samples",
     "UniformSampler",
     "pack",
     "split",
+    "suited_sampler",
 ]

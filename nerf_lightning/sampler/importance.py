@@ -1,27 +1,13 @@
 """Coarse to fine: sample evenly first, then again where the weight is."""
 
 import torch
-from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Generator
 
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.kernels import inverse_cdf
 from nerf_lightning.sampler.samples import DensityFn, Samples, pack
 from nerf_lightning.sampler.uniform import UniformSampler
 from nerf_lightning.utils.options import Count
-
-
-def inverse_cdf(
-    edges: Float[Tensor, "R S_plus_1"], weights: Float[Tensor, "R S"], u: Float[Tensor, "R K"]
-) -> Float[Tensor, "R K"]:
-    """Maps u in [0, 1] to distances distributed as the piecewise-constant density given by `weights` (NeRF, section 5.2)."""
-    pdf = weights + 1e-5  # rays without weight fall back to uniform
-    cdf = torch.cumsum(pdf / pdf.sum(1, keepdim=True), dim=1)
-    cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=1)
-    upper = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, edges.shape[1] - 1)
-    low, high = cdf.gather(1, upper - 1), cdf.gather(1, upper)
-    share = ((u - low) / (high - low).clamp_min(1e-9)).clamp(0, 1)
-    start, end = edges.gather(1, upper - 1), edges.gather(1, upper)
-    return start + share * (end - start)
 
 
 class ImportanceSampler(UniformSampler):

@@ -3,6 +3,7 @@
 import bisect
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,6 +14,23 @@ from nerf_lightning.kernels import pack_intervals, points
 
 DensityFn = Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N"]]
 """World positions -> density (1 / world unit); all that samplers know of a field."""
+
+
+class Histogram(NamedTuple):
+    """Weights of intervals along rays."""
+
+    edges: Float[Tensor, "R S_plus_1"]
+    """In [0, 1], see `Bounds.distances`."""
+    weights: Float[Tensor, "R S"]
+
+
+class Proposals(NamedTuple):
+    """How a sampler came to as many samples on every ray."""
+
+    histograms: tuple[Histogram, ...]
+    """What it expected, with gradient."""
+    edges: Float[Tensor, "R K_plus_1"]
+    """Of the samples, likewise in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +50,8 @@ class Samples:
     some, or intervals of length 0 fill the end. None: all rays have all."""
     places: Float[Tensor, "N 3"] | None = None
     """World positions of the midpoints, if already known."""
+    proposals: Proposals | None = None
+    """What the sampler learns from in training, see `Sampler.loss`."""
 
     def __len__(self) -> int:
         return self.t.shape[0]
@@ -103,6 +123,15 @@ class Sampler(InBounds):
 
     def restart(self, step: int) -> None:
         """Called when training starts again at a step, with a fresh field."""
+
+    def loss(self, samples: Samples, weights: Float[Tensor, "N"]) -> Tensor | None:
+        """What training adds to the squared error so that the sampler learns, or None.
+
+        Args:
+            samples: that it gave.
+            weights: how much each contributed to its ray's pixel.
+        """
+        return None
 
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         """Called before each training step, for samplers that learn where the content is."""

@@ -74,7 +74,9 @@ class Block:
 Body = Ball | Block
 
 
-def pattern(points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grain: float = 1.0) -> Float[Tensor, "N 3"]:
+def pattern(
+    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], grain: float | Float[Tensor, "N 1"] = 1.0
+) -> Float[Tensor, "N 3"]:
     """The colour of a surface: three waves, lit from one side; finer with larger `grain`, plain for 0."""
     waves = torch.tensor([[5.0, 2.0, 1.0], [-2.0, 6.0, 3.0], [1.0, -3.0, 7.0]])
     colour = 0.5 + 0.35 * torch.sin(grain * points @ waves.T + torch.tensor([0.0, 1.0, 2.0]))

@@ -96,7 +96,8 @@ class NeRF3D(System):
         stats = StepStats(
             loss.detach(), len(batch.rays), len(samples), samples.whole is None, rendered.opacity.detach()
         )
-        for penalty in (self.field.penalty(), rendered.penalty):
+        learned = None if rendered.weights is None else self.sampler.loss(samples, rendered.weights)
+        for penalty in (self.field.penalty(), rendered.penalty, learned):
             loss = loss if penalty is None else loss + penalty
         return loss, stats
 

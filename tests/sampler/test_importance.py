@@ -6,8 +6,8 @@ import torch
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.kernels import inverse_cdf
 from nerf_lightning.sampler import ImportanceSampler, UniformSampler
-from nerf_lightning.sampler.importance import inverse_cdf
 
 
 @pytest.mark.parametrize("kind", ["random", "one", "none", "sparse"])

@@ -1,0 +1,91 @@
+"""Photos with a background: what each method gives in its time, and where it leaves fog; made rooms know their true depth."""
+
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+import nerf_lightning as nl
+from benchmarks.methods import train
+from benchmarks.synthetic.rooms import ROOMS, Room, true_view, write_room
+from nerf_lightning.cameras import Rays
+from nerf_lightning.dataset import Scene
+from nerf_lightning.kernels import volume_weights
+from nerf_lightning.system import NeRF3D
+
+RECIPES = ("hashgrid_capture", "tensorf_medium", "voxels_medium")
+NEARER = 0.95
+"""Opacity nearer than this share of the true distance floats in free space."""
+VIEWS, PIXELS = 4, 6000
+"""Held-out views that are compared with the truth, and pixels of each."""
+
+
+def surface(system: NeRF3D, rays: Rays, distance: Float[Tensor, "R"]) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
+    """Distance at which each ray has half of its opacity, and the opacity that lies well before a known distance."""
+    with torch.no_grad():
+        samples = system.sampler(rays, system.field.density)
+        density = system.field.density(samples.positions(rays))
+        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
+
+    def summed(values: Tensor) -> Tensor:
+        return torch.zeros(len(rays)).index_add(0, samples.ray, values)
+
+    before = torch.cat([torch.zeros(1), weights.double().cumsum(0).float()])
+    passed = before[1:] - before[samples.offsets[:-1]][samples.ray]
+    beyond = passed >= 0.5 * summed(weights)[samples.ray]
+    found = torch.full((len(rays),), torch.inf)
+    found = found.scatter_reduce(0, samples.ray, torch.where(beyond, samples.t, torch.inf), "amin")
+    end = samples.t + samples.dt / 2
+    return found, summed(weights * (end < NEARER * distance[samples.ray]))
+
+
+def against_truth(run: nl.Run, scene: Scene, room: Room) -> dict[str, float]:
+    """Percent: median error of the distance, of all and of the floor alone, and opacity in free space. The subject's PSNR."""
+    errors, floors, fog, squares = [], [], [], []
+    for view in range(min(len(scene.val), VIEWS)):
+        camera = scene.val.cameras[view]
+        rays, (distance, body) = camera.view_rays(0), true_view(room, scene, view)
+        some = torch.arange(0, len(rays), max(1, len(rays) // PIXELS))
+        found, before = surface(run.system, rays[some], distance[some])
+        off = (found - distance[some]).abs() / distance[some]
+        errors.append(off)
+        floors.append(off[body[some] == room.floor])
+        fog.append(before)
+        seen, truth = run.render(camera).rgb.view(-1, 3), scene.val.image(view).view(-1, 3) / 255
+        squares.append((seen - truth)[body < room.subject] ** 2)
+    return {
+        "subject_db": -10 * float(torch.cat(squares).mean().log10()),
+        "depth_percent": 100 * float(torch.cat(errors).median()),
+        "floor_percent": 100 * float(torch.cat(floors).median()),
+        "fog_percent": 100 * float(torch.cat(fog).mean()),
+    }
+
+
+def measure(overrides: list[str], budget: float, seeds: list[int], scenes: list[Path], output: Path) -> dict[str, Any]:
+    """One line for each scene and recipe: medians over seeds."""
+    folders: dict[str, tuple[Path, Room | None]] = {path.name: (path, None) for path in scenes}
+    for name, made in ROOMS.items():
+        folder = output / "rooms" / name.replace(" ", "_")
+        if not folder.exists():
+            write_room(made, folder)
+        folders[name] = folder, made
+    rows = []
+    for name, (path, room) in folders.items():
+        for recipe in RECIPES:
+            found = []
+            for seed in seeds:
+                print(f"captures: {name}, {recipe}, seed {seed}", flush=True)
+                place = output / "captures" / f"{name}_{recipe}_{seed}".replace(" ", "_")
+                given = [f"dataset.path='{path}'", f"recipe={recipe}", f"budget.seconds={budget}", *overrides]
+                figures = train("capture", given, seed, place)
+                row = {key: figures[key] for key in ("psnr", "ssim", "psnr_worst_view", "render_seconds_per_view")}
+                row["peak_memory_bytes"] = figures["peak_memory_bytes"]
+                if room is not None:
+                    row |= against_truth(nl.load_run(place, "cpu"), nl.load_scene(path), room)
+                found.append(row)
+            middle = {key: median(row[key] for row in found) for key in found[0]}
+            rows.append({"capture": name, "recipe": recipe, **middle})
+    return {"captures": rows}

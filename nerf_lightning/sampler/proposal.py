@@ -1,0 +1,146 @@
+"""Proposals: a small field of density alone learns where the large one's samples are worth their time."""
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import along, resample
+from nerf_lightning.model.hashgrid import HashGrid
+from nerf_lightning.sampler.samples import DensityFn, Histogram, Proposals, Sampler, Samples
+from nerf_lightning.utils.options import Count
+
+START = -1.0
+"""Logarithm of the density that proposals begin with, 1 / half-size: thin fog."""
+SLOPE = 10.0
+"""How quickly proposals come to count in full."""
+
+
+class ProposalSampler(Sampler):
+    """As many samples on every ray, most of them where a small field expects surfaces.
+
+    A ray is cut into even intervals (see `Bounds.distances`), the small field gives each a weight, and new intervals of equal
+    weight are cut; after the last cut they go to the large field. Its weights then teach the small one: wherever they are
+    larger than proposed, the proposal grows (mip-NeRF 360, Barron et al. 2022, sections 3.1 and 3.2). The small field is a
+    grid of logarithms of densities, on several levels that add up.
+
+    Args:
+        bounds: where the content is.
+        samples: on each ray, for the large field.
+        first, second: intervals of the cuts before.
+        anneal: steps until proposals count in full; before, samples are spread more evenly.
+        padding: share of the samples that are spread evenly all the same.
+        levels, coarsest, finest, log2_entries: of the small field, see `HashGrid`.
+
+    Raises:
+        InputError: padding that is not above 0 and below 1.
+    """
+
+    def __init__(
+        self,
+        bounds: Bounds,
+        samples: Count = 16,
+        first: Count = 48,
+        second: Count = 32,
+        anneal: int = 500,
+        padding: float = 0.01,
+        levels: Count = 3,
+        coarsest: Count = 32,
+        finest: Count = 128,
+        log2_entries: Count = 18,
+    ):
+        super().__init__(bounds)
+        if not 0 < padding < 1:
+            raise InputError("sampler.padding", "", str(padding), "above 0, below 1")
+        self.samples = samples
+        self.first, self.second = first, second
+        self.anneal = anneal
+        self.padding = padding
+        self.grid = HashGrid(levels, log2_entries, 1, coarsest, finest)
+        self.unit_length = bounds.longest
+        self.first_step = 0
+        """The step at which training began."""
+        self.step = 0
+
+    def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
+        near, far = self.bounds.near_far(rays)
+        count, device = len(rays), near.device
+        s = torch.linspace(0, 1, self.first + 1, device=device).expand(count, -1)
+        if generator is not None:
+            s = torch.cat([s[:, :1], s[:, 1:-1] + self._shift(rays, generator) / self.first, s[:, -1:]], dim=1)
+        histograms: list[Histogram] = []
+        for wanted in (self.second, self.samples):
+            with torch.set_grad_enabled(generator is not None):
+                histograms.append(Histogram(s, self.weights(rays, near, far, s)))
+            share = histograms[-1].weights.detach() + self.padding / s.shape[1]
+            if generator is not None:
+                share = share**self.trust
+            s = resample(s, share, self._shift(rays, generator)[:, 0], wanted)
+        _, t, dt = along(rays, self.bounds, near, far, s)
+        ray = torch.arange(count, device=device).repeat_interleave(self.samples)
+        offsets = torch.arange(count + 1, device=device) * self.samples
+        proposals = None if generator is None else Proposals(tuple(histograms), s)
+        return Samples(t.flatten(), dt.flatten(), ray, offsets, proposals=proposals)
+
+    def _shift(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "R 1"]:
+        """By how much of an interval edges move, in -1/2 ... 1/2; not at all without a generator."""
+        if generator is None:
+            return torch.zeros(len(rays), 1, device=rays.origins.device)
+        return torch.rand(len(rays), 1, generator=generator, device=rays.origins.device) - 0.5
+
+    @property
+    def trust(self) -> float:
+        """The power of the proposals: 0 spreads samples evenly, 1 follows them (mip-NeRF 360, section 3.2)."""
+        share = min(1.0, (self.step - self.first_step + 1) / max(self.anneal, 1))
+        return SLOPE * share / ((SLOPE - 1) * share + 1)
+
+    def weights(
+        self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "R S_plus_1"]
+    ) -> Float[Tensor, "R S"]:
+        """How much the small field thinks that each interval contributes to its ray's pixel, see `volume_weights`."""
+        unit, t, dt = along(rays, self.bounds, near, far, s)
+        density = torch.exp(self.grid(unit).sum(1) + START)
+        optical = density.view(t.shape) * (dt / self.unit_length)
+        return torch.exp(optical - optical.cumsum(1)) * -torch.expm1(-optical)
+
+    def loss(self, samples: Samples, weights: Float[Tensor, "N"]) -> Tensor | None:
+        if samples.proposals is None:
+            return None
+        histograms, edges = samples.proposals
+        found = weights.view(len(edges), -1)
+        return torch.stack([interlevel_loss(edges, found, histogram) for histogram in histograms]).sum()
+
+    def export_state(self) -> dict[str, Tensor]:
+        return {"tables": self.grid.tables.detach()}
+
+    def import_state(self, state: dict[str, Tensor]) -> None:
+        if state["tables"].shape != self.grid.tables.shape:
+            raise RuntimeError(f"a proposal of {len(state['tables'])} entries, not {len(self.grid.tables)}")
+        self.grid.tables.data.copy_(state["tables"])
+
+    @torch.no_grad()
+    def restart(self, step: int) -> None:
+        self.first_step = step
+        self.grid.tables.zero_()
+
+    def update(self, step: int, density: DensityFn, generator: Generator) -> None:
+        self.step = step
+
+
+def interlevel_loss(
+    edges: Float[Tensor, "R K_plus_1"], weights: Float[Tensor, "R K"], proposed: Histogram
+) -> Float[Tensor, ""]:
+    """How much weight was found where less was proposed: mip-NeRF 360, eq. 12 and 13, a mean over rays.
+
+    Args:
+        edges, weights: of the intervals of the large field.
+        proposed: of the small one, with gradient.
+    """
+    last = proposed.weights.shape[1]
+    sums = torch.nn.functional.pad(proposed.weights.cumsum(1), (1, 0))
+    before = proposed.edges.contiguous()
+    low = (torch.searchsorted(before, edges[:, :-1].contiguous(), right=True) - 1).clamp(0, last)
+    high = torch.searchsorted(before, edges[:, 1:].contiguous()).clamp(0, last)
+    bound = sums.gather(1, high) - sums.gather(1, low)
+    return ((weights - bound).clamp_min(0) ** 2 / (weights + 1e-5)).sum(1).mean()

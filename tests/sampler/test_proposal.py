@@ -1,0 +1,151 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from agreement import agree
+from torch import Generator
+
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import along, resample, volume_weights
+from nerf_lightning.sampler import OccupancySampler, ProposalSampler, Samples, suited_sampler
+from nerf_lightning.sampler.proposal import interlevel_loss
+from nerf_lightning.sampler.samples import Histogram
+
+AROUND = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True, near=0.1)
+
+
+def nothing(places: torch.Tensor) -> torch.Tensor:
+    return torch.zeros(len(places))
+
+
+def rays(count: int, seed: int = 0) -> Rays:
+    """From a ring around the origin towards places near it."""
+    generator = Generator().manual_seed(seed)
+    turn = 6.28 * torch.rand(count, generator=generator)
+    origins = torch.stack([2 * turn.cos(), 2 * turn.sin(), 0.5 * torch.ones(count)], dim=1)
+    targets = 0.2 * torch.randn(count, 3, generator=generator)
+    return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=1))
+
+
+def ball(places: torch.Tensor) -> torch.Tensor:
+    """Density of a ball around the origin, and of a shell far away."""
+    far = places.norm(dim=1)
+    return 30.0 * ((far < 0.3) | (far > 4)).float()
+
+
+def taught(sampler: ProposalSampler, steps: int) -> ProposalSampler:
+    """After some steps beside a field that does not change."""
+    optimizer = torch.optim.Adam(sampler.parameters(), lr=0.05)
+    for step in range(steps):
+        generator = Generator().manual_seed(step)
+        some = rays(256, step)
+        sampler.update(step, ball, generator)
+        samples = sampler(some, ball, generator)
+        weights = volume_weights(ball(samples.positions(some)), samples.dt, samples.ray, samples.offsets)
+        loss = sampler.loss(samples, weights)
+        assert loss is not None
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return sampler
+
+
+def share_on_surfaces(samples: Samples, some: Rays) -> float:
+    """Share of the samples within 0.1 of where the ball or the shell begins."""
+    far = samples.positions(some).norm(dim=1)
+    return float((((far - 0.3).abs() < 0.1) | ((far - 4).abs() < 0.4)).float().mean())
+
+
+def test_samples_move_to_where_the_field_has_surfaces():
+    small = ProposalSampler(AROUND, anneal=20)
+    some = rays(200, 99)
+    before = share_on_surfaces(small(some, ball), some)
+    after = share_on_surfaces(taught(small, 60)(some, ball), some)
+    assert before < 0.25 and after > 0.5
+
+
+def test_first_proposals_hardly_count_and_then_in_full():
+    sampler = ProposalSampler(AROUND, anneal=100)
+    trusts = []
+    for step in (0, 10, 50, 99, 5000):
+        sampler.update(step, nothing, Generator())
+        trusts.append(sampler.trust)
+    assert trusts == sorted(trusts) and trusts[0] < 0.1 and trusts[-2] == trusts[-1] == 1
+    sampler.restart(5000)
+    assert sampler.trust < 0.1 and not sampler.grid.tables.any()
+
+
+def test_every_ray_has_its_samples_in_order_without_gaps():
+    sampler, some = ProposalSampler(AROUND, samples=10), rays(30)
+    samples = sampler(some, nothing, Generator().manual_seed(1))
+    t, dt = samples.t.view(30, 10), samples.dt.view(30, 10)
+    assert samples.offsets.tolist() == list(range(0, 301, 10))
+    assert torch.equal(samples.ray, torch.arange(30).repeat_interleave(10))
+    assert (dt >= 0).all()
+    torch.testing.assert_close(t[:, 1:] - dt[:, 1:] / 2, t[:, :-1] + dt[:, :-1] / 2, rtol=1e-4, atol=1e-4)
+
+
+def test_a_picture_does_not_depend_on_chance_or_on_how_its_rays_are_split():
+    sampler, some = taught(ProposalSampler(AROUND), 10), rays(40)
+    whole, again = sampler(some, ball), sampler(some, ball)
+    parts = [sampler(some[first : first + 7], ball) for first in range(0, 40, 7)]
+    assert torch.equal(whole.t, again.t) and torch.equal(whole.t, torch.cat([part.t for part in parts]))
+    assert whole.proposals is None and sampler.loss(whole, whole.t) is None
+
+
+def test_training_draws_from_its_generator_alone():
+    sampler, some = ProposalSampler(AROUND), rays(40)
+    one, two, other = (sampler(some, nothing, Generator().manual_seed(seed)) for seed in (3, 3, 4))
+    assert torch.equal(one.t, two.t) and not torch.equal(one.t, other.t)
+
+
+def test_only_weight_that_nobody_expected_costs():
+    edges = torch.linspace(0, 1, 5)[None]
+    found = torch.tensor([[0.0, 0.2, 0.5, 0.0]])
+
+    def cost(*proposed: float) -> torch.Tensor:
+        weights = torch.tensor([proposed], requires_grad=True)
+        loss = interlevel_loss(edges, found, Histogram(torch.linspace(0, 1, len(proposed) + 1)[None], weights))
+        loss.backward()
+        return torch.cat([loss.detach()[None], weights.grad[0]])
+
+    assert not cost(0.3, 0.6).any(), "more than enough in either half"
+    assert not cost(0.0, 0.2, 0.5, 0.0).any()
+    too_little = cost(0.3, 0.4)
+    assert too_little[0] == pytest.approx(0.1**2 / 0.5, rel=1e-3)
+    assert too_little[1] == 0 and too_little[2] < 0
+
+
+def test_what_rendering_needs_comes_back():
+    sampler, other, some = taught(ProposalSampler(AROUND), 20), ProposalSampler(AROUND), rays(20)
+    other.import_state(sampler.export_state())
+    assert torch.equal(sampler(some, ball).t, other(some, ball).t)
+    with pytest.raises(RuntimeError, match="entries, not"):
+        ProposalSampler(AROUND, finest=64).import_state(sampler.export_state())
+
+
+def test_no_padding_would_let_places_starve():
+    with pytest.raises(InputError, match="sampler.padding"):
+        ProposalSampler(AROUND, padding=0.0)
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_fast_and_plain_intervals_agree(unbounded: bool):
+    bounds, some = replace(AROUND, unbounded=unbounded), rays(50)
+    near, far = bounds.near_far(some)
+    s = torch.rand(50, 13).sort(1).values
+    agree(lambda *given: along(some, bounds, *given), [near, far, s], constants=(0, 1, 2), rtol=0, atol=0)
+
+
+def test_fast_and_plain_resampling_agree():
+    s, share, shift = torch.rand(50, 13).sort(1).values, torch.rand(50, 12), torch.rand(50) - 0.5
+    share[::5] = 0
+    agree(lambda *given: resample(*given, 20), [s, share, shift], constants=(0, 1, 2), rtol=1e-4, atol=1e-4)
+    even = resample(torch.linspace(0, 1, 5)[None], torch.zeros(1, 4), torch.zeros(1), 8)
+    torch.testing.assert_close(even, torch.linspace(0, 1, 9)[None])
+
+
+def test_a_background_asks_for_proposals_and_empty_space_for_a_grid():
+    assert isinstance(suited_sampler(AROUND), ProposalSampler)
+    assert isinstance(suited_sampler(replace(AROUND, unbounded=False, near=None)), OccupancySampler)
