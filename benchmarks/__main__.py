@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("--budgets", default="60", help="seconds of training, separated by commas")
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument(
-        "--scenes", type=Path, nargs="*", default=[], help="of the part captures: further folders of photos"
+        "--scenes", default="", help="of the part captures: more folders of photos, separated by commas"
     )
     parser.add_argument("--device", default="auto", help="of the part device: auto, cpu, cuda or mps")
     parser.add_argument("--output", type=Path, default=Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S"))

@@ -8,7 +8,8 @@ ORDER = (
     ("errors",),
     ("utils", "cameras"),
     ("kernels",),
-    ("dataset", "model", "sampler"),
+    ("dataset", "model"),
+    ("sampler",),  # some have a small field of their own
     ("renderer",),
     ("system",),
     ("drawing",),
