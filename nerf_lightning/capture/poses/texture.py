@@ -7,23 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import imageio.v3 as imageio
 import numpy as np
 from jaxtyping import Float
 
 from nerf_lightning.capture.poses.geometry import move, normalised, to_matrix
 from nerf_lightning.capture.poses.tracks import Keypoint, linked, triangulated
-from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.placing.structure import SIDE, find_features, match_photos, write_copies
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.utils.extras import require
-from nerf_lightning.utils.progress import tracked
 
 log = logging.getLogger(__name__)
 
 Pose = Float[np.ndarray, "4 4"]
-SIDE = 1600
-"""Longest side in pixels of the copies in which COLMAP looks for features."""
 REACH = 0.004
 """Reprojection distance up to which a match holds, in longest sides: 4 pixels at 1000."""
 FEWEST = 15
@@ -153,27 +149,22 @@ def _matched(
     pycolmap.set_random_seed(0)
     width, height = fit_size(lens.width, lens.height, SIDE)
     x, y = width / lens.width, height / lens.height
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "FULL_OPENCV"
-    parameters = (lens.fx * x, lens.fy * y, lens.cx * x, lens.cy * y, *lens.distortion, 0.0, 0.0, 0.0)
-    reader.camera_params = ",".join(map(str, parameters))
+    parameters = [lens.fx * x, lens.fy * y, lens.cx * x, lens.cy * y, *lens.distortion, 0.0, 0.0, 0.0]
     with tempfile.TemporaryDirectory() as workspace:
         folder, database = Path(workspace) / "photos", Path(workspace) / "database.db"
-        folder.mkdir()
-        for number, path in tracked(enumerate(paths), len(paths), "reading photos"):
-            photo = np.ascontiguousarray(read_pixels(path, upright=True)[..., :3])
-            imageio.imwrite(
-                folder / f"{number:06d}.png", cv2.resize(photo, (width, height), None, 0, 0, cv2.INTER_AREA)
-            )
         copies = [f"{number:06d}.png" for number in range(len(paths))]
-        pycolmap.extract_features(database, folder, copies, pycolmap.CameraMode.SINGLE, reader)
-        log.info("matching their features")
-        pycolmap.match_exhaustive(database)
+        write_copies(paths, [folder / name for name in copies])
+        with pycolmap.Database.open(database) as content:
+            camera = pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=parameters)
+            camera.has_prior_focal_length = True
+            number = content.write_camera(camera)
+        find_features(database, folder, {number: copies})
+        match_photos(database, copies, Path(workspace) / "pairs.txt")
         matches: list[tuple[Keypoint, Keypoint]] = []
         with pycolmap.Database.open(database) as opened:
             ids = {image.name: image.image_id for image in opened.read_all_images()}
             pixels = [np.asarray(opened.read_keypoints(ids[name]), np.float64)[:, :2] for name in copies]
-            numbers = {ids[name]: number for number, name in enumerate(copies)}
+            numbers = {ids[name]: place for place, name in enumerate(copies)}
             for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
                 i, j = (numbers[image] for image in pycolmap.pair_id_to_image_pair(pair))
                 matches += [((i, int(a)), (j, int(b))) for a, b in np.asarray(geometry.inlier_matches)]

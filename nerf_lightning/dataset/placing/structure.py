@@ -2,7 +2,7 @@
 
 import itertools
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,9 +57,10 @@ def reconstruct(photos: Sequence[Path], workspace: Path) -> "pycolmap.Reconstruc
     pycolmap.set_random_seed(0)
     database, copies = workspace / "database.db", workspace / "photos"
     names = [f"{number:06d}.png" for number in range(len(photos))]  # no file name matters to COLMAP
-    shots = _copy(photos, [copies / name for name in names])
-    _features(database, copies, names, shots)
-    _match(database, names, workspace / "pairs.txt")
+    sizes = write_copies(photos, [copies / name for name in names])
+    shots = [shot(photo, *size) for photo, size in zip(photos, sizes, strict=True)]
+    find_features(database, copies, _lenses(database, names, shots))
+    match_photos(database, names, workspace / "pairs.txt")
     models = _map(database, copies, workspace / "models", len(photos))
     model = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     if model is not None:
@@ -76,8 +77,15 @@ def pairs(count: int) -> list[tuple[int, int]]:
     return sorted(near | set(itertools.combinations(landmarks, 2)))
 
 
-def _copy(photos: Sequence[Path], copies: Sequence[Path]) -> list[Shot]:
-    """Writes upright copies of at most SIDE pixels."""
+def write_copies(photos: Sequence[Path], copies: Sequence[Path]) -> list[tuple[int, int]]:
+    """Writes upright copies of at most SIDE pixels, in a folder that is not there yet.
+
+    Returns:
+        Widths and heights of the upright photos.
+
+    Raises:
+        InputError: a photo cannot be read.
+    """
     copies[0].parent.mkdir()
 
     def copy(photo: Path, file: Path) -> tuple[int, int]:
@@ -88,17 +96,17 @@ def _copy(photos: Sequence[Path], copies: Sequence[Path]) -> list[Shot]:
         return width, height
 
     with ThreadPoolExecutor(THREADS) as pool:
-        sizes = list(tracked(pool.map(copy, photos, copies), len(photos), "reading photos"))
-    return [shot(photo, *size) for photo, size in zip(photos, sizes, strict=True)]
+        return list(tracked(pool.map(copy, photos, copies), len(photos), "reading photos"))
 
 
-def _features(database: Path, copies: Path, names: Sequence[str], shots: Sequence[Shot]) -> None:
+def _lenses(database: Path, names: Sequence[str], shots: Sequence[Shot]) -> dict[int, list[str]]:
+    """Writes what is known of the lenses; their numbers, and the copies that share each."""
     import pycolmap
 
     groups: dict[Shot, list[str]] = {}
     for name, taken in zip(names, shots, strict=True):
         groups.setdefault(taken, []).append(name)
-    calls = []
+    members_of = {}
     with pycolmap.Database.open(database) as content:
         for taken, members in groups.items():
             width, height = fit_size(taken.width, taken.height, SIDE)
@@ -107,11 +115,27 @@ def _features(database: Path, copies: Path, names: Sequence[str], shots: Sequenc
             kind = "OPENCV" if len(members) >= FREE else "SIMPLE_RADIAL"
             camera = pycolmap.Camera.create_from_model_name(0, kind, focal, width, height)
             camera.has_prior_focal_length = told is not None
-            number = content.write_camera(camera)
+            members_of[content.write_camera(camera)] = members
             log.info("%d photos of %s, focal length %s", len(members), _described(taken), _pixels(told))
-            calls += [(number, members[i : i + FEATURED]) for i in range(0, len(members), FEATURED)]
+    return members_of
+
+
+def find_features(database: Path, copies: Path, members_of: Mapping[int, Sequence[str]]) -> None:
+    """Writes the features of copies into a database.
+
+    Args:
+        copies: their folder.
+        members_of: their names, by the number of their lens in the database.
+    """
+    import pycolmap
+
+    calls = [
+        (number, members[i : i + FEATURED])
+        for number, members in members_of.items()
+        for i in range(0, len(members), FEATURED)
+    ]
     log.info("looking for features in them")
-    with counted(len(names), "looking for features") as step:
+    with counted(sum(map(len, members_of.values())), "looking for features") as step:
         for number, members in calls:
             reader = pycolmap.ImageReaderOptions()
             reader.existing_camera_id = number
@@ -128,7 +152,14 @@ def _pixels(focal: float | None) -> str:
     return "unknown" if focal is None else f"about {focal:.0f} pixels"
 
 
-def _match(database: Path, names: Sequence[str], file: Path) -> None:
+def match_photos(database: Path, names: Sequence[str], file: Path) -> None:
+    """Matches the features of `pairs` of copies.
+
+    Args:
+        database: with their features.
+        names: of the copies, in the order in which they were taken.
+        file: to write; which pairs COLMAP is to match.
+    """
     import pycolmap
 
     # Sorted by blocks, a call needs the features of few photos.
