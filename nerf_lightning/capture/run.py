@@ -105,25 +105,17 @@ def capture(
             "give the side of the black square in metres: 6 cm are 0.06",
         )
     errors = {usable[i].name: float(rms) for i, rms in zip(solved.placed, solved.refined.rms, strict=True)}
-    c2w = {usable[i].name: inverse(w2c) for i, w2c in solved.w2c.items()}
-    named = {usable[i].name: w2c for i, w2c in solved.w2c.items()}
+    w2c = {usable[i].name: pose for i, pose in solved.w2c.items()}
+    placed = {name: Placed(name, "", inverse(pose), errors[name]) for name, pose in w2c.items()}
     untagged = [s.name for s in usable if not s.marks]
-    by_texture: dict[str, Placed] = {}
     if untagged and importlib.util.find_spec("pycolmap") is None:
         reasons |= {name: reasons[name] + HINT for name in untagged}
     elif untagged:
-        found, more = place_by_texture([s.path for s in usable], lens, named, untagged)
+        found, more = place_by_texture([s.path for s in usable], lens, w2c, untagged)
         reasons |= more
-        by_texture = {name: Placed(name, "", inverse(f.w2c), f.reprojection_px, "texture") for name, f in found.items()}
+        placed |= {name: Placed(name, "", inverse(f.w2c), f.reprojection_px, "texture") for name, f in found.items()}
     reasons |= turned
-    results = [
-        by_texture[s.name]
-        if s.name in by_texture
-        else Placed(s.name, "", c2w[s.name], errors[s.name])
-        if s.name in c2w
-        else Placed(s.name, reasons[s.name])
-        for s in sightings
-    ]
+    results = [placed[s.name] if s.name in placed else Placed(s.name, reasons[s.name]) for s in sightings]
     details = {
         "standard_deviations": lens_found.deviations,
         "reprojection_px": lens_found.rms,

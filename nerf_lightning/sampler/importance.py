@@ -5,7 +5,7 @@ from torch import Generator
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import inverse_cdf
-from nerf_lightning.sampler.samples import DensityFn, Samples, pack
+from nerf_lightning.sampler.samples import DensityFn, Samples, interval_weights, pack
 from nerf_lightning.sampler.uniform import UniformSampler
 from nerf_lightning.utils.options import Count
 
@@ -33,8 +33,7 @@ class ImportanceSampler(UniformSampler):
         with torch.no_grad():
             optical = torch.zeros(hit.shape[0], self.samples, device=edges.device)
             optical[hit[:, 0]] = (density(coarse.positions(rays)) * coarse.dt).view(-1, self.samples)
-            # w_i = T_i (1 - exp(-sigma_i dt_i)), T_i = exp(-sum_{j<i} sigma_j dt_j)  (NeRF, eq. 3)
-            weights = torch.exp(optical - optical.cumsum(1)) * -torch.expm1(-optical)
+            weights = interval_weights(optical)
         u = (torch.arange(self.fine, device=edges.device) + 0.5).expand(len(rays), -1) / self.fine
         if self.stratified and generator is not None:
             u = u + (torch.rand(u.shape, generator=generator, device=u.device) - 0.5) / self.fine

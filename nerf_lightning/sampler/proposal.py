@@ -8,7 +8,7 @@ from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import along, resample
 from nerf_lightning.model.hashgrid import HashGrid
-from nerf_lightning.sampler.samples import DensityFn, Histogram, Proposals, Sampler, Samples
+from nerf_lightning.sampler.samples import DensityFn, Histogram, Proposals, Sampler, Samples, interval_weights
 from nerf_lightning.utils.options import Count
 
 START = -1.0
@@ -101,8 +101,7 @@ class ProposalSampler(Sampler):
         """How much the small field thinks that each interval contributes to its ray's pixel, see `volume_weights`."""
         unit, t, dt = along(rays, self.bounds, near, far, s)
         density = torch.exp(self.grid(unit).sum(1) + START)
-        optical = density.view(t.shape) * (dt / self.unit_length)
-        return torch.exp(optical - optical.cumsum(1)) * -torch.expm1(-optical)
+        return interval_weights(density.view(t.shape) * (dt / self.unit_length))
 
     def loss(self, samples: Samples, weights: Float[Tensor, "N"]) -> Tensor | None:
         if samples.proposals is None:

@@ -73,6 +73,11 @@ class Samples:
         return Samples(self.t[keep], self.dt[keep], self.ray[keep], before[self.offsets].to(self.offsets.dtype))
 
 
+def interval_weights(thickness: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+    """How much each interval contributes to its ray's pixel, from its density times its length: see `volume_weights`."""
+    return torch.exp(thickness - thickness.cumsum(1)) * -torch.expm1(-thickness)
+
+
 def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Samples:
     """Packs the kept intervals between consecutive edges of each ray."""
     return Samples(*pack_intervals(edges, keep))
