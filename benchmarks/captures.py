@@ -10,10 +10,11 @@ from torch import Tensor
 
 import nerf_lightning as nl
 from benchmarks.methods import train
-from benchmarks.synthetic.rooms import ROOMS, Room, true_view, write_room
+from benchmarks.synthetic.rooms import true_view, write_room
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import Scene
 from nerf_lightning.kernels import volume_weights
+from nerf_lightning.stability.rooms import ROOMS, Room
 from nerf_lightning.system import NeRF3D
 
 RECIPES = ("hashgrid_capture", "tensorf_medium", "voxels_medium")

@@ -11,12 +11,13 @@ from benchmarks.synthetic import rooms
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.dataset import open_scene
 from nerf_lightning.sampler import UniformSampler
+from nerf_lightning.stability.rooms import ROOMS
 
 
 def test_a_scene_of_a_room_knows_what_its_rays_meet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name, value in (("WIDTH", 48), ("HEIGHT", 36), ("VIEWS", 16)):
         monkeypatch.setattr(rooms, name, value)
-    room = rooms.ROOMS["filling subject"]
+    room = ROOMS["filling subject"]
     rooms.write_room(room, tmp_path / "room")
     scene = open_scene(str(tmp_path / "room"))
     assert scene.bounds.unbounded and len(scene.val) == 2

@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import composite, volume_weights
-from nerf_lightning.renderer.distortion import distortion_loss
+from nerf_lightning.renderer.penalties import NEAR_UNTIL, distortion_loss, near_loss
 from nerf_lightning.sampler import Samples
 
 FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]]
@@ -30,9 +30,9 @@ class Rendered:
     distance: Float[Tensor, "R"]
     """Along the ray to what covers it, in the scene's unit, times opacity."""
     penalty: Float[Tensor, ""] | None = None
+    """What training adds to its loss, where the renderer asks for that."""
     weights: Float[Tensor, "N"] | None = None
     """How much each sample contributed, where the sampler learns from that; without gradient."""
-    """What training adds to its loss, where the renderer asks for that."""
 
     @property
     def depth(self) -> Float[Tensor, "R"]:
@@ -56,6 +56,7 @@ class VolumeRenderer(torch.nn.Module):
             own in evaluation; wants images with alpha), or three numbers in [0, 1].
         scene_background: the colour "scene" stands for.
         distortion_loss_weight: of the penalty on fog in training, see `distortion_loss`; 0 does without.
+        near_loss_weight: of the penalty on what stands near the cameras, see `near_loss`, when training begins; it fades out.
         half_size: of the scene's box, world units.
 
     Raises:
@@ -63,18 +64,22 @@ class VolumeRenderer(torch.nn.Module):
     """
 
     colour: Tensor
+    near_weight: Tensor
 
     def __init__(
         self,
         background: str | list[float] = "scene",
         scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         distortion_loss_weight: float = 0.0,
+        near_loss_weight: float = 0.0,
         half_size: float = 1.0,
     ):
         super().__init__()
-        if distortion_loss_weight < 0:
-            raise InputError("renderer.distortion_loss_weight", "", str(distortion_loss_weight), "0 or more")
+        for name, weight in (("distortion", distortion_loss_weight), ("near", near_loss_weight)):
+            if weight < 0:
+                raise InputError(f"renderer.{name}_loss_weight", "", str(weight), "0 or more")
         self.distortion_loss_weight = distortion_loss_weight
+        self.near_loss_weight = near_loss_weight
         self.half_size = half_size
         self.random = background == "random"
         colour: Sequence[float]
@@ -94,6 +99,12 @@ class VolumeRenderer(torch.nn.Module):
             if len(colour) != 3 or not all(0 <= c <= 1 for c in colour):
                 raise InputError("renderer.background", "", str(list(colour)), "three numbers in [0, 1]")
         self.register_buffer("colour", torch.tensor(colour), persistent=False)
+        # A tensor, since compiled steps are compiled again for every new number.
+        self.register_buffer("near_weight", torch.tensor(float(near_loss_weight)), persistent=False)
+
+    def fade(self, progress: float) -> None:
+        """Called before each training step with the fraction of the budget done."""
+        self.near_weight.fill_(self.near_loss_weight * max(0.0, 1 - progress / NEAR_UNTIL))
 
     def backgrounds(self, rays: int, generator: Generator | None = None) -> Float[Tensor, "R 3"]:
         """The colour behind each ray; random only in training, when a generator is given."""
@@ -110,10 +121,20 @@ class VolumeRenderer(torch.nn.Module):
         density, rgb = field(samples.positions(rays), samples.directions(rays))
         summed, opacity, distance = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
         colour = torch.addcmul(summed, (1 - opacity)[:, None], backgrounds)
-        penalty = None
-        if self.distortion_loss_weight and density.requires_grad:
-            penalty = self.distortion_loss_weight * distortion_loss(density, samples, self.half_size)
-        weights = None
-        if samples.proposals is not None:
+        penalty, weights = None, None
+        if density.requires_grad and (self.distortion_loss_weight or self.near_loss_weight):
+            weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
+            penalty = self.penalty(weights, samples)
+        elif samples.proposals is not None:
             weights = volume_weights(density.detach(), samples.dt, samples.ray, samples.offsets)
-        return Rendered(colour, opacity, distance, penalty, weights)
+        learned = None if samples.proposals is None or weights is None else weights.detach()
+        return Rendered(colour, opacity, distance, penalty, learned)
+
+    def penalty(self, weights: Float[Tensor, "N"], samples: Samples) -> Float[Tensor, ""]:
+        """What training adds to its loss for where the weight is."""
+        parts = []
+        if self.distortion_loss_weight:
+            parts.append(self.distortion_loss_weight * distortion_loss(weights, samples, self.half_size))
+        if self.near_loss_weight:
+            parts.append(self.near_weight * near_loss(weights, samples, self.half_size))
+        return torch.stack(parts).sum()

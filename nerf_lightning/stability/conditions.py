@@ -11,6 +11,7 @@ from nerf_lightning.dataset.pixels import Picture
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.stability import damage
+from nerf_lightning.stability.rooms import ROOMS, indoors
 from nerf_lightning.stability.toys import MARBLE, PILE, ROD, around, photograph, toy
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
@@ -85,9 +86,15 @@ def _seen_from_nearer(seed: int) -> Scene:
     return replace(scene, val=Views.of(photograph(PILE, cameras, BLACK), cameras))
 
 
+def _room(name: str) -> MakeScene:
+    return lambda seed: indoors(ROOMS[name], seed)
+
+
 SURVIVES, TOLD = "no collapse", "refused, or an alarm"
 NETWORKS = ("mlp", "hashgrid", "tensorf")
 GRIDS = ("hashgrid", "voxels", "tensorf")
+CAPTURE = ("sampler=proposal", "renderer.distortion_loss_weight=0.001", "renderer.near_loss_weight=0.01")
+"""How photos with a background are trained."""
 
 CONDITIONS = (
     Condition("clean", "the yardstick of all others", _pile),
@@ -138,6 +145,8 @@ CONDITIONS = (
     Condition("grid too fine", SURVIVES, _pile, by_method=tuple((m, "model.finest=256") for m in GRIDS)),
     Condition("tiny hash table", SURVIVES, _pile, by_method=(("hashgrid", "model.log2_entries=8"),)),
     Condition("seen from nearer", SURVIVES, _seen_from_nearer),
+    Condition("small subject in a room", SURVIVES, _room("small subject"), CAPTURE),
+    Condition("plain floor", SURVIVES, _room("plain floor"), CAPTURE),
     Condition("half precision", SURVIVES, _pile, ("trainer.precision=bf16-mixed",)),
     Condition("2D: clean", "the yardstick of all others in 2D", _waves, flat=True),
     Condition("2D: one colour", SURVIVES, _one_colour, flat=True),

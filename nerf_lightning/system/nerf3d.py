@@ -64,6 +64,7 @@ class NeRF3D(System):
 
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
+        self.renderer.fade(self.progress)
         replaced = self.field.grow(self.progress)
         if replaced:
             optimizer = self.optimizers(use_pl_optimizer=False)

@@ -110,3 +110,26 @@ def test_gradients_of_everything_seen():
         return seen.rgb, seen.opacity, seen.depth
 
     assert torch.autograd.gradcheck(look, (density, rgb))
+
+
+def test_the_penalty_on_nearness_fades_out():
+    samples, rays = ragged([4]), Rays(torch.zeros(1, 3), torch.eye(3)[:1])
+    density = torch.ones(4, requires_grad=True)
+
+    def field(positions: Tensor, directions: Tensor):
+        return density, torch.ones(4, 3)
+
+    renderer, penalties = VolumeRenderer(near_loss_weight=0.01), []
+    for progress in (0.0, 0.35, 0.7, 1.0):
+        renderer.fade(progress)
+        penalty = renderer(rays, samples, field).penalty
+        assert penalty is not None
+        penalties.append(float(penalty.detach()))
+    assert penalties[0] > 0
+    assert penalties[1:] == pytest.approx([penalties[0] / 2, 0, 0])
+
+
+@pytest.mark.parametrize("name", ["distortion_loss_weight", "near_loss_weight"])
+def test_negative_penalties_are_refused(name: str):
+    with pytest.raises(InputError, match=rf"renderer\.{name}: found -1"):
+        VolumeRenderer(**{name: -1})

@@ -8,6 +8,7 @@ import torch
 from nerf_lightning.cameras import Rays
 from nerf_lightning.stability import damage
 from nerf_lightning.stability.conditions import picture
+from nerf_lightning.stability.rooms import ROOMS, indoors
 from nerf_lightning.stability.toys import DISTANCE, MARBLE, PILE, Ball, Block, around, enclosing, in_sight, toy, trace
 
 CUBE, BALL = Block((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), Ball((0.0, 0.0, 0.0), 0.5)
@@ -116,3 +117,16 @@ def test_the_picture_holds_all_frequencies_down_to_six_pixels_of_training():
     spectrum = torch.fft.rfft(image[0, :, 0].float() - 127.5).abs()
     assert (spectrum[1:16] > 100).float().mean() > 0.8
     assert spectrum[20:].max() < 0.2 * spectrum.max(), "nothing that the smaller picture cannot show"
+
+
+def test_a_room_is_photographed_from_a_ring_around_its_subject():
+    room = ROOMS["small subject"]
+    scene = indoors(room, 0, size=16, views=8, held_out=2)
+    eyes = torch.cat([scene.train.cameras.c2w[:, :3, 3], scene.val.cameras.c2w[:, :3, 3]])
+    assert ((eyes.norm(dim=1) - 1).abs() < 0.4).all()
+    assert (eyes[:, 2] > 0).all()
+    assert scene.bounds.unbounded
+    _, distance, body = room.see(scene.train.cameras.view_rays(0))
+    assert distance.isfinite().all()
+    assert 0 < float((body < room.subject).float().mean()) < 0.1
+    assert not torch.equal(scene.train.cameras.c2w, indoors(room, 1, size=16, views=8).train.cameras.c2w)

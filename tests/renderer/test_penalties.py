@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from nerf_lightning.renderer.distortion import distortion_loss
+from nerf_lightning.kernels import volume_weights
+from nerf_lightning.renderer.penalties import distortion_loss, near_loss
 from nerf_lightning.sampler import Samples
 
 
@@ -14,6 +15,10 @@ def packed(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, Samples]:
     ray = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
     offsets = torch.tensor([0, *counts]).cumsum(0)
     return torch.rand(len(t), generator=generator, dtype=torch.float64), Samples(t, dt, ray, offsets)
+
+
+def weights(density: torch.Tensor, samples: Samples) -> torch.Tensor:
+    return volume_weights(density, samples.dt, samples.ray, samples.offsets)
 
 
 def by_pairs(density: torch.Tensor, samples: Samples, scale: float) -> torch.Tensor:
@@ -31,7 +36,7 @@ def by_pairs(density: torch.Tensor, samples: Samples, scale: float) -> torch.Ten
 def test_the_fast_sum_is_the_sum_over_pairs(counts: list[int]):
     density, samples = packed(counts)
     density.requires_grad_()
-    fast, slow = distortion_loss(density, samples, 0.7), by_pairs(density, samples, 0.7)
+    fast, slow = distortion_loss(weights(density, samples), samples, 0.7), by_pairs(density, samples, 0.7)
     torch.testing.assert_close(fast, slow)
     torch.testing.assert_close(torch.autograd.grad(fast, density), torch.autograd.grad(slow, density))
 
@@ -40,9 +45,22 @@ def test_gathered_weight_costs_less_than_fog():
     _, samples = packed([40])
     fog, wall = torch.full((40,), 0.1, dtype=torch.float64), torch.zeros(40, dtype=torch.float64)
     wall[20] = 100.0
-    assert distortion_loss(wall, samples, 1.0) < 0.1 * distortion_loss(fog, samples, 1.0)
+    assert distortion_loss(weights(wall, samples), samples, 1.0) < 0.1 * distortion_loss(
+        weights(fog, samples), samples, 1.0
+    )
 
 
 def test_no_samples_cost_nothing():
     density, samples = packed([0, 0])
-    assert distortion_loss(density, samples, 1.0) == 0
+    for loss in (distortion_loss, near_loss):
+        assert loss(weights(density, samples), samples, 1.0) == 0
+
+
+def test_the_same_wall_costs_less_from_farther():
+    density, samples = packed([6, 6], seed=1)
+    nearness = 0.5 / (samples.t + 0.5)
+    w = weights(density, samples)
+    torch.testing.assert_close(near_loss(w, samples, 0.5), (w * nearness**4).view(2, 6).sum(1).mean())
+    walls = torch.eye(6, dtype=torch.float64)
+    costs = [near_loss(torch.cat([wall, wall]), samples, 0.5) for wall in walls]
+    assert costs == sorted(costs, reverse=True)
