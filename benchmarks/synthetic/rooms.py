@@ -5,7 +5,7 @@ from pathlib import Path
 
 import imageio.v3 as imageio
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
@@ -29,7 +29,7 @@ def write_room(room: Room, folder: Path, seed: int = 0) -> None:
     (folder / "transforms.json").write_text(json.dumps({**lens, "w": WIDTH, "h": HEIGHT, "frames": frames}))
 
 
-def true_view(room: Room, scene: Scene, view: int) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
+def true_view(room: Room, scene: Scene, view: int) -> tuple[Float[Tensor, "R"], Int[Tensor, "R"]]:
     """Distance of what the rays of a held-out view meet, scene's unit, and the body's number."""
     rays = scene.val.cameras.view_rays(view)
     scale = float(torch.linalg.det(scene.to_source[:3, :3])) ** (1 / 3)

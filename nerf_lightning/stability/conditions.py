@@ -93,7 +93,7 @@ def _room(name: str) -> MakeScene:
 SURVIVES, TOLD = "no collapse", "refused, or an alarm"
 NETWORKS = ("mlp", "hashgrid", "tensorf")
 GRIDS = ("hashgrid", "voxels", "tensorf")
-CAPTURE = ("sampler=proposal", "renderer.distortion_loss_weight=0.001", "renderer.near_loss_weight=0.01")
+CAPTURE = ("renderer.distortion_loss_weight=0.001", "renderer.near_loss_weight=0.01")
 """How photos with a background are trained."""
 
 CONDITIONS = (
@@ -145,8 +145,10 @@ CONDITIONS = (
     Condition("grid too fine", SURVIVES, _pile, by_method=tuple((m, "model.finest=256") for m in GRIDS)),
     Condition("tiny hash table", SURVIVES, _pile, by_method=(("hashgrid", "model.log2_entries=8"),)),
     Condition("seen from nearer", SURVIVES, _seen_from_nearer),
-    Condition("small subject in a room", SURVIVES, _room("small subject"), CAPTURE),
-    Condition("plain floor", SURVIVES, _room("plain floor"), CAPTURE),
+    *(
+        Condition(name, SURVIVES, _room(room), CAPTURE, tuple((m, "sampler=proposal") for m in GRIDS))
+        for name, room in (("small subject in a room", "small subject"), ("plain floor", "plain floor"))
+    ),
     Condition("half precision", SURVIVES, _pile, ("trainer.precision=bf16-mixed",)),
     Condition("2D: clean", "the yardstick of all others in 2D", _waves, flat=True),
     Condition("2D: one colour", SURVIVES, _one_colour, flat=True),

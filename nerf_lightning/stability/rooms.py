@@ -4,13 +4,13 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.stability.toys import Ball, Block, Body, around, pattern
+from nerf_lightning.stability.toys import Ball, Block, Body, pattern
 
 FIELD_OF_VIEW = 1.0
 """The horizontal angle in radians."""
@@ -33,7 +33,7 @@ class Room:
         """The number of the floor: `walls` come last, four of the sides, then the floor and the ceiling."""
         return len(self.bodies) - 2
 
-    def see(self, rays: Rays) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]:
+    def see(self, rays: Rays) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Int[Tensor, "R"]]:
         """Colour, distance and number of the body that each ray meets."""
         met = [body.meet(rays) for body, _ in self.bodies]
         distance, which = torch.stack([t for t, _ in met]).min(0)
@@ -106,6 +106,6 @@ def indoors(room: Room, seed: int, size: int = 40, views: int = 28, held_out: in
         source=BUILT_IN,
         train=Views.of(pictures[0], train),
         val=Views.of(pictures[1], val),
-        orbit=around(8, size, phase=0.3, distance=1.0),
+        orbit=handheld(8, size, size, seed + 2),
         bounds=Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True),
     )
