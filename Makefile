@@ -3,7 +3,7 @@ VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 
-.PHONY: run test quick lint format clean
+.PHONY: run test long quick lint format clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -26,6 +26,9 @@ lint: $(VENV)/.test
 
 test: lint                  ## install, check style and types, run the tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
+
+long: $(VENV)/.test         ## what a test run leaves out: launchers of sweeps, a compiler's kernels
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m long
 
 QUICK := tests/test_rooms.py $(addprefix tests/, cameras dataset sampler model renderer system) \
 	$(addprefix tests/runs/test_, before.py folder.py) $(addprefix tests/config/test_, defaults.py rates.py renames.py resolvers.py)

@@ -1,7 +1,8 @@
 """What torch.compile makes of fields and trainings, beside what they are without it: a process of its own, where no types are
 checked, as the checks would be compiled too. Prints what it found as JSON.
 
-python compiling.py FOLDER
+python compiling.py FOLDER        without the compiler's kernels, which take most of the time
+python compiling.py whole         one field as users have it
 """
 
 import copy
@@ -27,8 +28,6 @@ from nerf_lightning.system.compiled import BACKEND, part
 from nerf_lightning.training import train as training
 
 TRACED, DIFFERENTIATED = "eager", "aot_eager"  # as inductor has it up to its kernels, in a tenth of the time
-WHOLE = "voxels"
-"""The field that is compiled as users have it."""
 BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 FIELDS = {
     "mlp": lambda: MLPField(BOX, depth=2, width=8, skip=1, position_frequencies=2, density="exp"),
@@ -55,10 +54,10 @@ def outcome(field: Field, renderer: VolumeRenderer | None, rays: Rays, samples: 
     return [density, *(value.detach() for value in values), *gradients]
 
 
-def check_field(name: str) -> dict[str, float]:
+def check_field(name: str, backend: str | None = None) -> dict[str, float]:
     """The largest difference, of the largest value in its tensor, and how many graphs were made at first, and anew."""
     field, renderer = FIELDS[name](), VolumeRenderer() if name == "mlp" else None  # the same for all
-    backend = BACKEND if name == WHOLE else TRACED if renderer is None else DIFFERENTIATED
+    backend = backend or (TRACED if renderer is None and name != "voxels" else DIFFERENTIATED)
     keys, worst, before, graphs = list(field.state_dict()), 0.0, counters["stats"]["unique_graphs"], []
     for rays, count, progress in SIZES:
         field.grow(progress)
@@ -90,6 +89,9 @@ if __name__ == "__main__":
     warnings.filterwarnings("error", category=UserWarning)
     torch.manual_seed(0)
     use_kernels("reference")
+    if sys.argv[1] == "whole":
+        print(json.dumps(check_field("voxels", BACKEND)))
+        sys.exit()
     found: dict[str, object] = {name: check_field(name) for name in FIELDS}
     training.BACKEND = DIFFERENTIATED
     folder = Path(sys.argv[1])

@@ -20,24 +20,30 @@ FIELDS = ("mlp", "hashgrid", "tensorf", "voxels")
 RUN = ("+experiment=smoke_2d", "device=cpu")
 
 
+def compiling(what: Path | str, cache: Path) -> dict:
+    """What compiling.py found."""
+    line = [sys.executable, str(ROOT / "tests" / "compiling.py"), str(what)]
+    paths = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(cache)}
+    done = subprocess.run(line, env={**os.environ, **paths}, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 @pytest.fixture(scope="session")
 def found(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> dict:
-    """What compiling.py found."""
-
-    def make(folder: Path) -> dict:
-        line = [sys.executable, str(ROOT / "tests" / "compiling.py"), str(folder)]
-        paths = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(folder / "kernels")}
-        done = subprocess.run(line, env={**os.environ, **paths}, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-        return json.loads(done.stdout.splitlines()[-1])
-
-    return once(tmp_path_factory, "compiled", make)
+    return once(tmp_path_factory, "compiled", lambda folder: compiling(folder, folder / "kernels"))
 
 
 @pytest.mark.parametrize("name", FIELDS)
 def test_a_compiled_field_gives_the_same_values_and_gradients_also_after_growing(name: str, found: dict):
     assert found[name]["worst"] < 1e-4 and found[name]["compiled"] >= 2
     assert found[name]["again"] == 0, "a copy of it, or a batch of another size, was compiled anew"
+
+
+@pytest.mark.long
+def test_the_compilers_kernels_give_the_same_values_and_gradients(tmp_path: Path):
+    voxels = compiling("whole", tmp_path)
+    assert voxels["worst"] < 1e-4 and voxels["compiled"] >= 2 and voxels["again"] == 0
 
 
 def test_a_compiled_training_is_as_good(found: dict):

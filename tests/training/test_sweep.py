@@ -113,6 +113,7 @@ def test_optuna_proposes_the_same_trials_again_and_failing_ones_are_recorded(ins
     assert {len(table(path)) for path in (tmp_path / "outputs" / "tune_picture").iterdir()} == {2}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_other_launchers(launcher: str, tmp_path: Path):
     """In processes of their own, whose way back to this package must work."""
