@@ -37,8 +37,8 @@ def near_loss(weight: Float[Tensor, "N"], samples: Samples, scale: float) -> Flo
     """Mean over rays of sum_i w_i n_i^4, where n = scale / (t + scale) is 1 at the camera and falls with the distance.
 
     Where photos alone do not tell how far a plain surface is, a place nearer to a camera explains its pixels as well, and
-    training starts there. A small price on nearness tips the balance. Yang et al. 2023, "FreeNeRF", section 3.4, penalises
-    density within a fixed number of samples; this one needs no such number.
+    training starts there. A small price on nearness tips the balance. Yang et al. 2023, "FreeNeRF", penalise density
+    within a fixed number of samples of the camera (occlusion regularization); this one needs no such number.
 
     Args:
         weight: of the samples, see `volume_weights`.
