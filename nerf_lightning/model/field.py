@@ -118,6 +118,12 @@ class Field(InBounds, AnyField):
         density, features = self.features(positions)
         return density / self.unit_length, self.colour(features, directions)
 
+    def with_view_part(
+        self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"], Float[Tensor, "N 3"] | None]:
+        """As `forward`, and what the direction adds to the logits of the colour; None where the field cannot tell."""
+        return *self(positions, directions), None
+
 
 class PictureField(AnyField):
     """A picture as a function of position: subclasses define `forward`.

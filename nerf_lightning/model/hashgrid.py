@@ -115,6 +115,8 @@ class HashGridField(Field):
         levels, log2_entries, features, coarsest, finest: see `HashGrid`.
         width: neurons of the hidden layers (one for density, two for colour).
         degree: see `TensoRFField`.
+        split_colour: whether a place has a colour of its own, to which the colour network adds what the direction changes
+            (as in SNeRG, Hedman et al. 2021); otherwise the network makes all of the colour.
         density: "relu", "softplus" or "exp".
         size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
 
@@ -136,6 +138,7 @@ class HashGridField(Field):
         finest: Count = 256,
         width: Count = 64,
         degree: int = 3,
+        split_colour: bool = False,
         density: str = "exp",
         size: str = "auto",
     ):
@@ -144,6 +147,7 @@ class HashGridField(Field):
         self.activation = density_activation(density)
         self.density_net = layers(self.grid.width, width, 1 + self.GEOMETRY)
         self.terms = harmonics_up_to(degree)
+        self.split_colour = split_colour
         self.colour_net = layers(self.GEOMETRY + self.terms, width, width, 3)
         self.starts_thin = density == "exp"
         self.reset_parameters()
@@ -156,10 +160,10 @@ class HashGridField(Field):
 
     @torch.no_grad()
     def warm_start_from(self, smaller: Field) -> None:
-        """Copies the levels that both grids have, and both networks if no level is missing here."""
+        """Copies the levels that both grids have, and both networks if no level is missing here and colours are made alike."""
         assert isinstance(smaller, HashGridField)
         columns = self.grid.warm_start_from(smaller.grid)
-        if (columns >= 0).all():
+        if (columns >= 0).all() and self.split_colour == smaller.split_colour:
             widen_all(self.density_net, smaller.density_net, columns)
             widen_all(self.colour_net, smaller.colour_net, torch.arange(self.GEOMETRY + smaller.terms))
 
@@ -172,4 +176,18 @@ class HashGridField(Field):
         return self.activation(raw.squeeze(1)), geometry
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(mlp(features, weights(self.colour_net), seen_from(directions, self.terms)))
+        return torch.sigmoid(self.logits(features, directions)[0])
+
+    def logits(
+        self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]
+    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"] | None]:
+        """Of the colour, and what the direction adds to them."""
+        seen = mlp(features, weights(self.colour_net), seen_from(directions, self.terms))
+        return (features[:, :3] + seen, seen) if self.split_colour else (seen, None)
+
+    def with_view_part(
+        self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"], Float[Tensor, "N 3"] | None]:
+        density, features = self.features(positions)
+        logits, view_part = self.logits(features, directions)
+        return density / self.unit_length, torch.sigmoid(logits), view_part

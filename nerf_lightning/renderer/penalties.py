@@ -1,4 +1,4 @@
-"""Penalties on where the weight along a ray is: fog, floaters, and walls right before the cameras."""
+"""Penalties on fog, floaters, walls right before the cameras, and colours that differ from every side."""
 
 import torch
 from jaxtyping import Float
@@ -47,3 +47,17 @@ def near_loss(weight: Float[Tensor, "N"], samples: Samples, scale: float) -> Flo
     """
     nearness = scale / (samples.t + scale)
     return (weight * nearness**NEAR_POWER).sum() / (len(samples.offsets) - 1)
+
+
+def view_loss(weight: Float[Tensor, "N"], view_part: Float[Tensor, "N 3"], samples: Samples) -> Float[Tensor, ""]:
+    """Mean over rays of sum_i w_i |v_i|^2, where v is what the direction adds to the logits of the colour.
+
+    A place that may look different from every side can show each photo what it wants to see, wherever it stands. A price on
+    that keeps surfaces where all photos agree; a highlight that explains many pixels still pays.
+
+    Args:
+        weight: of the samples, see `volume_weights`; no gradient goes there.
+        view_part: see `Field.with_view_part`.
+        samples: along R rays.
+    """
+    return (weight.detach() * view_part.square().sum(1)).sum() / (len(samples.offsets) - 1)

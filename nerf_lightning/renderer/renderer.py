@@ -10,11 +10,16 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import composite, volume_weights
-from nerf_lightning.renderer.penalties import NEAR_UNTIL, distortion_loss, near_loss
+from nerf_lightning.renderer.penalties import NEAR_UNTIL, distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
 
-FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]]
-"""World positions and unit directions -> density (1 / world unit) and rgb in [0, 1]."""
+FieldFn = Callable[
+    [Float[Tensor, "N 3"], Float[Tensor, "N 3"]],
+    tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]
+    | tuple[Float[Tensor, "N"], Float[Tensor, "N 3"], Float[Tensor, "N 3"] | None],
+]
+"""World positions and unit directions -> density (1 / world unit) and rgb in [0, 1]; a third value is the view part of
+`Field.with_view_part`."""
 
 NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -57,6 +62,7 @@ class VolumeRenderer(torch.nn.Module):
         scene_background: the colour "scene" stands for.
         distortion_loss_weight: of the penalty on fog in training, see `distortion_loss`; 0 does without.
         near_loss_weight: of the penalty on what stands near the cameras, see `near_loss`, when training begins; it fades out.
+        view_loss_weight: of the penalty on what the direction adds to colours, see `view_loss`.
         half_size: of the scene's box, world units.
 
     Raises:
@@ -72,14 +78,18 @@ class VolumeRenderer(torch.nn.Module):
         scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         distortion_loss_weight: float = 0.0,
         near_loss_weight: float = 0.0,
+        view_loss_weight: float = 0.0,
         half_size: float = 1.0,
     ):
         super().__init__()
-        for name, weight in (("distortion", distortion_loss_weight), ("near", near_loss_weight)):
+        penalties = {"distortion": distortion_loss_weight, "near": near_loss_weight, "view": view_loss_weight}
+        for name, weight in penalties.items():
             if weight < 0:
                 raise InputError(f"renderer.{name}_loss_weight", "", str(weight), "0 or more")
         self.distortion_loss_weight = distortion_loss_weight
         self.near_loss_weight = near_loss_weight
+        self.view_loss_weight = view_loss_weight
+        self.penalises = any(penalties.values())
         self.half_size = half_size
         self.random = background == "random"
         colour: Sequence[float]
@@ -118,23 +128,27 @@ class VolumeRenderer(torch.nn.Module):
         """Renders one colour a ray; `backgrounds` defaults to the renderer's own."""
         if backgrounds is None:
             backgrounds = self.backgrounds(len(rays))
-        density, rgb = field(samples.positions(rays), samples.directions(rays))
+        density, rgb, *view_part = field(samples.positions(rays), samples.directions(rays))
         summed, opacity, distance = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
         colour = torch.addcmul(summed, (1 - opacity)[:, None], backgrounds)
         penalty, weights = None, None
-        if density.requires_grad and (self.distortion_loss_weight or self.near_loss_weight):
+        if density.requires_grad and self.penalises:
             weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
-            penalty = self.penalty(weights, samples)
+            penalty = self.penalty(weights, samples, view_part[0] if view_part else None)
         elif samples.proposals is not None:
             weights = volume_weights(density.detach(), samples.dt, samples.ray, samples.offsets)
         learned = None if samples.proposals is None or weights is None else weights.detach()
         return Rendered(colour, opacity, distance, penalty, learned)
 
-    def penalty(self, weights: Float[Tensor, "N"], samples: Samples) -> Float[Tensor, ""]:
-        """What training adds to its loss for where the weight is."""
-        parts = []
+    def penalty(
+        self, weights: Float[Tensor, "N"], samples: Samples, view_part: Float[Tensor, "N 3"] | None
+    ) -> Float[Tensor, ""]:
+        """What training adds to its loss for where the weight is, and for what the direction adds there."""
+        total = weights.new_zeros(())
         if self.distortion_loss_weight:
-            parts.append(self.distortion_loss_weight * distortion_loss(weights, samples, self.half_size))
+            total = total + self.distortion_loss_weight * distortion_loss(weights, samples, self.half_size)
         if self.near_loss_weight:
-            parts.append(self.near_weight * near_loss(weights, samples, self.half_size))
-        return torch.stack(parts).sum()
+            total = total + self.near_weight * near_loss(weights, samples, self.half_size)
+        if self.view_loss_weight and view_part is not None:
+            total = total + self.view_loss_weight * view_loss(weights, view_part, samples)
+        return total

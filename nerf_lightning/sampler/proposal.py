@@ -45,7 +45,7 @@ class ProposalSampler(Sampler):
         second: Count = 32,
         anneal: int = 500,
         padding: float = 0.01,
-        levels: Count = 3,
+        levels: Count = 2,
         coarsest: Count = 32,
         finest: Count = 128,
         log2_entries: Count = 18,

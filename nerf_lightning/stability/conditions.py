@@ -93,8 +93,11 @@ def _room(name: str) -> MakeScene:
 SURVIVES, TOLD = "no collapse", "refused, or an alarm"
 NETWORKS = ("mlp", "hashgrid", "tensorf")
 GRIDS = ("hashgrid", "voxels", "tensorf")
-CAPTURE = ("renderer.distortion_loss_weight=0.001", "renderer.near_loss_weight=0.01")
+CAPTURE = tuple(
+    f"renderer.{name}_loss_weight={weight}" for name, weight in (("distortion", 0.001), ("near", 0.01), ("view", 0.001))
+)
 """How photos with a background are trained."""
+CAPTURED = (*((method, "sampler=proposal") for method in GRIDS), ("hashgrid", "model.split_colour=true"))
 
 CONDITIONS = (
     Condition("clean", "the yardstick of all others", _pile),
@@ -146,7 +149,7 @@ CONDITIONS = (
     Condition("tiny hash table", SURVIVES, _pile, by_method=(("hashgrid", "model.log2_entries=8"),)),
     Condition("seen from nearer", SURVIVES, _seen_from_nearer),
     *(
-        Condition(name, SURVIVES, _room(room), CAPTURE, tuple((m, "sampler=proposal") for m in GRIDS))
+        Condition(name, SURVIVES, _room(room), CAPTURE, CAPTURED)
         for name, room in (("small subject in a room", "small subject"), ("plain floor", "plain floor"))
     ),
     Condition("half precision", SURVIVES, _pile, ("trainer.precision=bf16-mixed",)),

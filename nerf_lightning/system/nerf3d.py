@@ -89,7 +89,8 @@ class NeRF3D(System):
             self.sampler.update(step, density, generator)
             samples = self.sampler(batch.rays, density, generator)
         backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
-        rendered = part(self.renderer.forward, self.backend)(batch.rays, samples, self.field, backgrounds)
+        field = self.field.with_view_part if self.renderer.view_loss_weight else self.field
+        rendered = part(self.renderer.forward, self.backend)(batch.rays, samples, field, backgrounds)
         truth = over(batch.pixels, backgrounds)
         # A ray without all of its samples must not be learned from.
         rgb = rendered.rgb if samples.whole is None else torch.where(samples.whole[:, None], rendered.rgb, truth)

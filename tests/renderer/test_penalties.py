@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from nerf_lightning.kernels import volume_weights
-from nerf_lightning.renderer.penalties import distortion_loss, near_loss
+from nerf_lightning.renderer.penalties import distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
 
 
@@ -64,3 +64,15 @@ def test_the_same_wall_costs_less_from_farther():
     walls = torch.eye(6, dtype=torch.float64)
     costs = [near_loss(torch.cat([wall, wall]), samples, 0.5) for wall in walls]
     assert costs == sorted(costs, reverse=True)
+
+
+def test_what_the_direction_adds_costs_by_its_weight_which_it_does_not_move():
+    density, samples = packed([6, 0, 3], seed=2)
+    view_part = torch.rand(9, 3, dtype=torch.float64, requires_grad=True)
+    w = weights(density.requires_grad_(), samples)
+    loss = view_loss(w, view_part, samples)
+    rays = [(w[a:b, None] * view_part[a:b] ** 2).sum() for a, b in ((0, 6), (6, 6), (6, 9))]
+    torch.testing.assert_close(loss, torch.stack(rays).mean())
+    loss.backward()
+    assert density.grad is None and view_part.grad is not None
+    assert view_loss(w, torch.zeros(9, 3), samples) == 0

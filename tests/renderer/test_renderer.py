@@ -129,7 +129,7 @@ def test_the_penalty_on_nearness_fades_out():
     assert penalties[1:] == pytest.approx([penalties[0] / 2, 0, 0])
 
 
-@pytest.mark.parametrize("name", ["distortion_loss_weight", "near_loss_weight"])
+@pytest.mark.parametrize("name", ["distortion_loss_weight", "near_loss_weight", "view_loss_weight"])
 def test_negative_penalties_are_refused(name: str):
     with pytest.raises(InputError, match=rf"renderer\.{name}: found -1"):
         VolumeRenderer(**{name: -1})

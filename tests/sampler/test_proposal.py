@@ -122,7 +122,7 @@ def test_what_rendering_needs_comes_back():
     other.import_state(sampler.export_state())
     assert torch.equal(sampler(some, ball).t, other(some, ball).t)
     with pytest.raises(RuntimeError, match="entries, not"):
-        ProposalSampler(AROUND, finest=64).import_state(sampler.export_state())
+        ProposalSampler(AROUND, finest=48).import_state(sampler.export_state())
 
 
 def test_no_padding_would_let_places_starve():

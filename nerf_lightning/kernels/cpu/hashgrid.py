@@ -93,19 +93,22 @@ def scatter_level(grad, unit, cells, above, axes, features):
 
 @kernel
 def interpolate(tables, unit, resolutions, sizes, out, axes, features, workers):
-    """out [LF, N] from tables [T, F], unit [D, N] and resolutions [L, D]. A level belongs to few workers: its table then
-    stays in their cache."""
+    """out [LF, N] from tables [T, F], unit [D, N] and resolutions [L, D]. A level belongs to one worker, so that its table
+    stays in that core's cache; levels that do not go round are shared in equal stretches."""
     samples, levels, width = unit.shape[1], len(resolutions), len(features)
-    parts = max(1, workers // levels)
+    whole = levels - levels % workers
     for worker in prange(workers):
-        start = 0
+        stretch = samples * (levels - whole)
+        begin, end, start = stretch * worker // workers, stretch * (worker + 1) // workers, 0
         for level in range(levels):
-            table, cells = tables[start : start + sizes[level]], cells_of(resolutions, level, axes)
-            rows = out[level * width : (level + 1) * width]
-            for part in range(parts):
-                if (level * parts + part) % workers == worker:
-                    first, last = samples * part // parts, samples * (part + 1) // parts
-                    interpolate_level(table, unit, first, last, cells, rows, axes, features)
+            passed = samples * (level - whole)
+            first, last = max(begin - passed, 0), min(end - passed, samples)
+            if level < whole:
+                first, last = 0, samples if level % workers == worker else 0
+            if first < last:
+                table, cells = tables[start : start + sizes[level]], cells_of(resolutions, level, axes)
+                rows = out[level * width : (level + 1) * width]
+                interpolate_level(table, unit, first, last, cells, rows, axes, features)
             start += sizes[level]
 
 
