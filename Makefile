@@ -27,7 +27,7 @@ lint: $(VENV)/.test
 test: lint                  ## install, check style and types, run the tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
 
-long: $(VENV)/.test         ## what a test run leaves out: launchers of sweeps, a compiler's kernels
+long: $(VENV)/.test         ## what a test run leaves out: launchers of sweeps, kernels of a compiler, whole runs on a pretended device
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m long
 
 QUICK := tests/test_rooms.py $(addprefix tests/, cameras dataset sampler model renderer system) \

@@ -1,8 +1,9 @@
 """What torch.compile makes of fields and trainings, beside what they are without it: a process of its own, where no types are
 checked, as the checks would be compiled too. Prints what it found as JSON.
 
-python compiling.py FOLDER        without the compiler's kernels, which take most of the time
-python compiling.py whole         one field as users have it
+python compiling.py mlp voxels FOLDER     some fields, and a training where there is a folder for it; without the compiler's
+                                          kernels, which take most of the time
+python compiling.py whole                 one field as users have it
 """
 
 import copy
@@ -92,9 +93,10 @@ if __name__ == "__main__":
     if sys.argv[1] == "whole":
         print(json.dumps(check_field("voxels", BACKEND)))
         sys.exit()
-    found: dict[str, object] = {name: check_field(name) for name in FIELDS}
-    training.BACKEND = DIFFERENTIATED
-    folder = Path(sys.argv[1])
-    options = ("budget.steps=30", "model.depth=1", "callbacks.snapshots=null")
-    found["trained"] = [trained("siren", folder / on, f"compile={on}", *options) for on in ("true", "false")]
+    found: dict[str, object] = {name: check_field(name) for name in sys.argv[1:] if name in FIELDS}
+    if sys.argv[-1] not in FIELDS:
+        training.BACKEND = DIFFERENTIATED
+        folder = Path(sys.argv[-1])
+        options = ("budget.steps=30", "model.depth=1", "callbacks.snapshots=null")
+        found["trained"] = [trained("siren", folder / on, f"compile={on}", *options) for on in ("true", "false")]
     print(json.dumps(found))

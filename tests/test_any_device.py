@@ -73,6 +73,7 @@ def test_a_run_ends_as_it_should(name: str, without_doubles: torch.device, tmp_p
     assert Module.waited > 0, "clocks are read when the device has done its work"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["tensorf", "voxels", "hashgrid2d"])
 def test_a_run_goes_on_where_it_stopped(name: str, device: torch.device, tmp_path: Path):
     trained(name, tmp_path)
@@ -109,6 +110,7 @@ class Spoil(L.Callback):
                     pl_module.field.density_head.bias.fill_(-1.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "how", "more", "action"),
     [
@@ -173,6 +175,7 @@ def test_the_viewer_paints(device: torch.device, run: Path):
         assert picture.shape == (16, 24, 3) and picture.dtype == np.uint8 and picture.std() > 0
 
 
+@pytest.mark.long
 def test_a_search_finds_the_smallest_that_is_enough(device: torch.device, tmp_path: Path):
     save_npz(toy(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
     rungs = [{"density_components": 8, "colour_components": 8, "coarsest": 4, "finest": side} for side in (4, 8)]

@@ -59,7 +59,9 @@ MOST = {"tensorf": 250, "hashgrid": 250, "voxels": 250, "mlp": 220}
 """Operations a step between two updates of the sampler: forward, backward, optimiser. Each takes 5 to 10 microseconds."""
 
 
-@pytest.mark.parametrize("name", MOST)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "hashgrid" else pytest.mark.long) for name in MOST]
+)
 def test_a_step_asks_little_of_the_device(name: str, device: torch.device, tmp_path: Path):
     """As shipped, of a field that has its size; reading a result, or its size, makes the host wait."""
     small = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1"]

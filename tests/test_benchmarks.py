@@ -45,6 +45,7 @@ def test_the_table_has_a_column_for_every_key():
     assert lines[3].split() == ["x", "-", "2.5M"]
 
 
+@pytest.mark.long
 def test_one_command_writes_table_and_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     monkeypatch.setattr(cases, "RAYS", 16)
     monkeypatch.setattr(cases, "SAMPLES", 64)

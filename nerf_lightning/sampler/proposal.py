@@ -42,7 +42,7 @@ class ProposalSampler(Sampler):
         bounds: Bounds,
         samples: Count = 16,
         first: Count = 48,
-        second: Count = 32,
+        second: Count = 24,
         anneal: int = 500,
         padding: float = 0.01,
         levels: Count = 2,

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -166,8 +167,7 @@ def test_the_wheel_brings_its_configuration(tmp_path: Path):
     subprocess.run(build, check=True, capture_output=True, timeout=120)
     (wheel,) = tmp_path.glob("*.whl")
     site = tmp_path / "site"
-    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(site), str(wheel)]
-    subprocess.run(install, check=True, capture_output=True, timeout=120)
+    zipfile.ZipFile(wheel).extractall(site)  # what installing it does, in a tenth of the time
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     process = popen("+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=2", cwd=elsewhere, path=str(site))
