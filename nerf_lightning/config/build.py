@@ -122,8 +122,8 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
         return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
     field = build_field(cfg, Field, "three coordinates", bounds=frame.bounds)
     sampler = make(cfg, "sampler", bounds=frame.bounds)
-    half_size = float(frame.bounds.half_size.min())
-    renderer = make(cfg, "renderer", scene_background=frame.background, half_size=half_size)
+    seen = {"half_size": float(frame.bounds.half_size.min()), "unbounded": frame.bounds.unbounded}
+    renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
     return NeRF3D(field, sampler, renderer, **common)
 
 

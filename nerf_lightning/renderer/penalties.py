@@ -11,6 +11,9 @@ NEAR_POWER = 4
 """Power of the nearness that weight is penalised with: what stands at the box is hardly touched."""
 NEAR_UNTIL = 0.7
 """Share of the training in which the penalty on nearness fades out: surfaces that it pushed back then find their place."""
+SUITED_VIEW_WEIGHT = {False: 0.01, True: 0.001}
+"""Weight of the penalty on view parts, without and with a background. A subject that stands alone was often turned before
+the camera, so that its light did not turn with it; before a background, the direction also stands for a changing exposure."""
 
 
 def distortion_loss(weight: Float[Tensor, "N"], samples: Samples, scale: float) -> Float[Tensor, ""]:

@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import composite, volume_weights
-from nerf_lightning.renderer.penalties import NEAR_UNTIL, distortion_loss, near_loss, view_loss
+from nerf_lightning.renderer.penalties import NEAR_UNTIL, SUITED_VIEW_WEIGHT, distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
 
 FieldFn = Callable[
@@ -62,8 +62,10 @@ class VolumeRenderer(torch.nn.Module):
         scene_background: the colour "scene" stands for.
         distortion_loss_weight: of the penalty on fog in training, see `distortion_loss`; 0 does without.
         near_loss_weight: of the penalty on what stands near the cameras, see `near_loss`, when training begins; it fades out.
-        view_loss_weight: of the penalty on what the direction adds to colours, see `view_loss`.
+        view_loss_weight: of the penalty on what the direction adds to colours, see `view_loss`; "suited" takes
+            `SUITED_VIEW_WEIGHT`.
         half_size: of the scene's box, world units.
+        unbounded: whether the scene has a background, see `Bounds`.
 
     Raises:
         InputError: on any other background, or a negative weight.
@@ -78,10 +80,15 @@ class VolumeRenderer(torch.nn.Module):
         scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         distortion_loss_weight: float = 0.0,
         near_loss_weight: float = 0.0,
-        view_loss_weight: float = 0.0,
+        view_loss_weight: float | str = 0.0,
         half_size: float = 1.0,
+        unbounded: bool = False,
     ):
         super().__init__()
+        if isinstance(view_loss_weight, str):
+            if view_loss_weight != "suited":
+                raise InputError("renderer.view_loss_weight", "", repr(view_loss_weight), "suited, or 0 or more")
+            view_loss_weight = SUITED_VIEW_WEIGHT[unbounded]
         penalties = {"distortion": distortion_loss_weight, "near": near_loss_weight, "view": view_loss_weight}
         for name, weight in penalties.items():
             if weight < 0:

@@ -94,7 +94,8 @@ SURVIVES, TOLD = "no collapse", "refused, or an alarm"
 NETWORKS = ("mlp", "hashgrid", "tensorf")
 GRIDS = ("hashgrid", "voxels", "tensorf")
 CAPTURE = tuple(
-    f"renderer.{name}_loss_weight={weight}" for name, weight in (("distortion", 0.001), ("near", 0.01), ("view", 0.001))
+    f"renderer.{name}_loss_weight={weight}"
+    for name, weight in (("distortion", 0.001), ("near", 0.01), ("view", "suited"))
 )
 """How photos with a background are trained."""
 CAPTURED = (*((method, "sampler=proposal") for method in GRIDS), ("hashgrid", "model.split_colour=true"))

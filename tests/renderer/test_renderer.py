@@ -133,3 +133,10 @@ def test_the_penalty_on_nearness_fades_out():
 def test_negative_penalties_are_refused(name: str):
     with pytest.raises(InputError, match=rf"renderer\.{name}: found -1"):
         VolumeRenderer(**{name: -1})
+
+
+def test_a_weight_that_suits_the_scene():
+    alone, before = (VolumeRenderer(view_loss_weight="suited", unbounded=unbounded) for unbounded in (False, True))
+    assert alone.view_loss_weight > before.view_loss_weight > 0
+    with pytest.raises(InputError, match=r"renderer\.view_loss_weight: found 'cheap'"):
+        VolumeRenderer(view_loss_weight="cheap")
