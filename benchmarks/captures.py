@@ -13,7 +13,6 @@ from benchmarks.methods import train
 from benchmarks.synthetic.rooms import true_view, write_room
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import Scene
-from nerf_lightning.kernels import volume_weights
 from nerf_lightning.stability.rooms import ROOMS, Room
 from nerf_lightning.system import NeRF3D
 
@@ -24,23 +23,14 @@ VIEWS, PIXELS = 4, 6000
 """Held-out views that are compared with the truth, and pixels of each."""
 
 
-def surface(system: NeRF3D, rays: Rays, distance: Float[Tensor, "R"]) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
-    """Distance at which each ray has half of its opacity, and the opacity that lies well before a known distance."""
+def opacity_before(system: NeRF3D, rays: Rays, distance: Float[Tensor, "R"]) -> Float[Tensor, "R"]:
+    """How much of what lies behind each ray's first stretch, of that length, is covered by what floats in it."""
     with torch.no_grad():
         samples = system.sampler(rays, system.field.density)
         density = system.field.density(samples.positions(rays))
-        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
-
-    def summed(values: Tensor) -> Tensor:
-        return torch.zeros(len(rays)).index_add(0, samples.ray, values)
-
-    before = torch.cat([torch.zeros(1), weights.double().cumsum(0).float()])
-    passed = before[1:] - before[samples.offsets[:-1]][samples.ray]
-    beyond = passed >= 0.5 * summed(weights)[samples.ray]
-    found = torch.full((len(rays),), torch.inf)
-    found = found.scatter_reduce(0, samples.ray, torch.where(beyond, samples.t, torch.inf), "amin")
-    end = samples.t + samples.dt / 2
-    return found, summed(weights * (end < NEARER * distance[samples.ray]))
+    length = distance[samples.ray] - (samples.t - samples.dt / 2)
+    thickness = density * torch.minimum(length.clamp_min(0), samples.dt)
+    return 1 - torch.exp(-torch.zeros(len(rays)).index_add(0, samples.ray, thickness))
 
 
 def against_truth(run: nl.Run, scene: Scene, room: Room) -> dict[str, float]:
@@ -50,11 +40,10 @@ def against_truth(run: nl.Run, scene: Scene, room: Room) -> dict[str, float]:
         camera = scene.val.cameras[view]
         rays, (distance, body) = camera.view_rays(0), true_view(room, scene, view)
         some = torch.arange(0, len(rays), max(1, len(rays) // PIXELS))
-        found, before = surface(run.system, rays[some], distance[some])
-        off = (found - distance[some]).abs() / distance[some]
+        off = (run.system.render(rays[some]).depth - distance[some]).abs() / distance[some]
         errors.append(off)
         floors.append(off[body[some] == room.floor])
-        fog.append(before)
+        fog.append(opacity_before(run.system, rays[some], NEARER * distance[some]))
         seen, truth = run.render(camera).rgb.view(-1, 3), scene.val.image(view).view(-1, 3) / 255
         squares.append((seen - truth)[body < room.subject] ** 2)
     return {

@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import composite, volume_weights
+from nerf_lightning.renderer.depth import median_depth
 from nerf_lightning.renderer.penalties import NEAR_UNTIL, SUITED_VIEW_WEIGHT, distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
 
@@ -41,7 +42,8 @@ class Rendered:
 
     @property
     def depth(self) -> Float[Tensor, "R"]:
-        """Expected distance along the ray of what covers it, in the scene's unit; 0 where nothing does."""
+        """Distance along the ray of what covers it, in the scene's unit: the mean, and before a background the median; 0 where
+        nothing does."""
         return self.distance / self.opacity.clamp_min(1e-6)
 
 
@@ -98,6 +100,7 @@ class VolumeRenderer(torch.nn.Module):
         self.view_loss_weight = view_loss_weight
         self.penalises = any(penalties.values())
         self.half_size = half_size
+        self.unbounded = unbounded
         self.random = background == "random"
         colour: Sequence[float]
         if background in ("scene", "random"):
@@ -137,6 +140,9 @@ class VolumeRenderer(torch.nn.Module):
             backgrounds = self.backgrounds(len(rays))
         density, rgb, *view_part = field(samples.positions(rays), samples.directions(rays))
         summed, opacity, distance = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
+        if self.unbounded and not density.requires_grad:
+            # The mean says little: a hundredth of the weight, left over for the far end, would move it behind the wall.
+            distance = opacity * median_depth(density, opacity, samples)
         colour = torch.addcmul(summed, (1 - opacity)[:, None], backgrounds)
         penalty, weights = None, None
         if density.requires_grad and self.penalises:

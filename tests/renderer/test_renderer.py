@@ -66,6 +66,16 @@ def test_the_depth_of_a_thin_wall_is_its_distance(distance: float, kernels: str)
     torch.testing.assert_close(seen.opacity, torch.ones(2))
 
 
+def test_before_a_background_the_depth_is_that_of_the_wall_and_not_of_what_is_behind(kernels: str):
+    samples, rays = ragged([4]), along_z(1)
+    density = torch.tensor([0.0, 0.0, 50.0, 0.0])
+    density[3], samples.t[3], samples.dt[3] = 1e-3, 600.0, 1000.0
+    field = fixed(density, torch.ones(4, 3))
+    mean, median = (VolumeRenderer(unbounded=unbounded)(rays, samples, field).depth for unbounded in (False, True))
+    assert float(mean) > 1.5 * float(samples.t[2])
+    assert float(median) == pytest.approx(float(samples.t[2]), abs=float(samples.dt[2]))
+
+
 @pytest.mark.parametrize("sigma", [0.0, 0.3, 1e6])
 @pytest.mark.parametrize(
     ("background", "colour"),
