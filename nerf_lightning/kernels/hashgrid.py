@@ -139,7 +139,8 @@ class _HashInterpolate(torch.autograd.Function):
 
         places = unit.T.contiguous()
         cells = np.array(resolutions, np.int32).reshape(len(sizes), len(places))
-        ctx.save_for_backward(places)
+        # Only what the places' gradient reads, where that is asked for.
+        ctx.save_for_backward(places, *((tables,) if ctx.needs_input_grad[1] else ()))
         ctx.levels, ctx.shape = (cells, np.array(sizes, np.int64)), tuple(tables.shape)
         ctx.widths = (0,) * len(places), (0,) * tables.shape[1]
         out = torch.empty(len(sizes) * tables.shape[1], len(unit))
@@ -147,13 +148,18 @@ class _HashInterpolate(torch.autograd.Function):
         return out.T
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
         from nerf_lightning.kernels.cpu import hashgrid, workers
 
-        (places,) = ctx.saved_tensors
-        tables, above = torch.empty(ctx.shape), grad.T.contiguous().numpy()
+        places, *read = ctx.saved_tensors
+        tables, above, moved = torch.empty(ctx.shape), grad.T.contiguous().numpy(), None
         hashgrid.scatter(tables.numpy(), places.numpy(), *ctx.levels, above, *ctx.widths, workers())
-        return tables, None, None, None
+        if read:
+            moved = torch.empty_like(places)
+            given = read[0].numpy(), places.numpy(), *ctx.levels, above, moved.numpy()
+            hashgrid.slope(*given, *ctx.widths, workers())
+            moved = moved.T
+        return tables, moved, None, None
 
 
 def hash_interpolate(
@@ -167,6 +173,6 @@ def hash_interpolate(
         resolutions: each level's cells along every axis.
         sizes: entries of each level's table: all corners of its grid, or a power of two to hash into.
     """
-    if fast(tables, unit) and not unit.requires_grad:
+    if fast(tables, unit):
         return _HashInterpolate.apply(tables, unit, resolutions, sizes)
     return hash_interpolate_reference(tables, unit, resolutions, sizes)

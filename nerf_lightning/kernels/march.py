@@ -152,18 +152,32 @@ def points_reference(origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor
     return origins.index_select(0, ray) + t[:, None] * directions.index_select(0, ray)
 
 
+class _Points(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor) -> Tensor:
+        from nerf_lightning.kernels.cpu import march, workers
+
+        out = torch.empty(3, len(t))
+        arrays = (x.detach().contiguous().numpy() for x in (origins, directions, ray, t))
+        march.points(*arrays, out.numpy(), workers())
+        ctx.save_for_backward(ray, t)
+        ctx.rays = len(origins)
+        return out.T
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        ray, t = ctx.saved_tensors
+        origins, directions = (grad.new_zeros(ctx.rays, 3).index_add_(0, ray, x) for x in (grad, grad * t[:, None]))
+        return origins, directions, None, None
+
+
 def points(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
 ) -> Float[Tensor, "N 3"]:
     """Positions at distances `t` along rays; `ray` holds each position's ray."""
-    if not fast(origins, directions, t) or any(x.requires_grad for x in (origins, directions, t)):
+    if not fast(origins, directions, t) or t.requires_grad:
         return points_reference(origins, directions, ray, t)
-    from nerf_lightning.kernels.cpu import march, workers
-
-    out = torch.empty(3, len(t))
-    arrays = (x.contiguous().numpy() for x in (origins, directions, ray, t))
-    march.points(*arrays, out.numpy(), workers())
-    return out.T
+    return _Points.apply(origins, directions, ray, t)
 
 
 def mark_cells_reference(marks: Tensor, mark: int, bounds: Bounds, positions: Tensor) -> None:

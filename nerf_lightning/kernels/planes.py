@@ -82,7 +82,7 @@ class _PlaneLine(torch.autograd.Function):
         return out.T
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor | None, None]:
         from nerf_lightning.kernels.cpu import planes as cpu
         from nerf_lightning.kernels.cpu import workers
 
@@ -91,11 +91,12 @@ class _PlaneLine(torch.autograd.Function):
         given = planes.flatten(1, 2).numpy(), lines.numpy(), places.numpy(), grad.T.contiguous().numpy()
         lanes = (0,) * _block(lines.shape[2])
         cpu.scatter(*given, grad_planes.flatten(1, 2).numpy(), grad_lines.numpy(), lanes, workers())
-        return grad_planes, grad_lines, None, None
-
-
-def _fast(planes: Tensor, lines: Tensor, unit: Tensor) -> bool:
-    return fast(planes, lines, unit) and not unit.requires_grad
+        moved = None
+        if ctx.needs_input_grad[2]:
+            moved = torch.empty_like(places)
+            cpu.slope(*given, moved.numpy(), (0,) * lines.shape[2], workers())
+            moved = moved.T
+        return grad_planes, grad_lines, moved, None
 
 
 def plane_line_products(
@@ -108,7 +109,7 @@ def plane_line_products(
         lines: along the axes 0, 1 and 2.
         unit: positions in [0, 1]^3; outside they are clamped.
     """
-    if _fast(planes, lines, unit):
+    if fast(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, False)
     return plane_line_products_reference(planes, lines, unit)
 
@@ -117,7 +118,7 @@ def plane_line_sum(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N"]:
     """The sum of what `plane_line_products` gives at each position."""
-    if _fast(planes, lines, unit):
+    if fast(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, True)[:, 0]
     return _products(planes, lines, footprint(unit, lines.shape[1])).sum((1, 2))
 
@@ -128,7 +129,7 @@ def plane_line_sum_and_products(
     unit: Float[Tensor, "N 3"],
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N threeB"]]:
     """`plane_line_sum` of some planes and lines, and `plane_line_products` of others of the same size."""
-    if _fast(*summed, unit) and _fast(*apart, unit):
+    if fast(*summed, unit) and fast(*apart, unit):
         return plane_line_sum(*summed, unit), plane_line_products(*apart, unit)
     at = footprint(unit, summed[1].shape[1])
     return _products(*summed, at).sum((1, 2)), _products(*apart, at).flatten(1)

@@ -40,6 +40,30 @@ def locate_reference(
     return index.index_select(0, vertices.flatten()).view(-1, 8), weights.flatten(1)
 
 
+class _Locate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, index: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
+        from nerf_lightning.kernels.cpu import voxels, workers
+
+        places, cells = unit.T.contiguous(), side_of(index) - 1
+        rows, weights = torch.empty(len(unit), 8, dtype=torch.int32), torch.empty(len(unit), 8)
+        voxels.locate(index.numpy(), cells, places.numpy(), rows.numpy(), weights.numpy(), workers())
+        if ctx.needs_input_grad[1]:
+            ctx.save_for_backward(places)
+            ctx.cells = cells
+        ctx.mark_non_differentiable(rows)
+        return rows, weights
+
+    @staticmethod
+    def backward(ctx, _: Tensor, above: Tensor) -> tuple[None, Tensor]:
+        from nerf_lightning.kernels.cpu import voxels, workers
+
+        (places,) = ctx.saved_tensors
+        grad = torch.empty_like(places)
+        voxels.slope(ctx.cells, places.numpy(), above.contiguous().numpy(), grad.numpy(), workers())
+        return None, grad.T
+
+
 def locate(index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
     """Rows and trilinear weights of the eight vertices around each position, the last axis fastest.
 
@@ -47,14 +71,7 @@ def locate(index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]) -> tuple[Int
         index: row of every vertex of a cubic grid over the unit cube, 32-bit, last axis fastest.
         unit: positions in [0, 1]^3; outside they are clamped.
     """
-    if not fast(unit) or unit.requires_grad:
-        return locate_reference(index, unit)
-    from nerf_lightning.kernels.cpu import voxels, workers
-
-    places = unit.T.contiguous()
-    rows, weights = torch.empty(len(unit), 8, dtype=torch.int32), torch.empty(len(unit), 8)
-    voxels.locate(index.numpy(), side_of(index) - 1, places.numpy(), rows.numpy(), weights.numpy(), workers())
-    return rows, weights
+    return _Locate.apply(index, unit) if fast(unit) else locate_reference(index, unit)
 
 
 def mark_rows(seen: Int[Tensor, "V"], rows: Int[Tensor, "N 8"], step: int) -> None:
@@ -103,22 +120,28 @@ class _Read(torch.autograd.Function):
         if len(basis):
             lanes = (0,) * len(basis)
             voxels.add_views(views.detach().numpy(), *found, basis.numpy(), rgb.numpy(), lanes, workers())
-        ctx.save_for_backward(rows, weights, basis)
+        # Only what the weights' gradient reads, where that is asked for.
+        ctx.save_for_backward(rows, weights, basis, *((density, colour, views) if ctx.needs_input_grad[4] else ()))
         ctx.table = len(density)
         return raw, rgb.T
 
     @staticmethod
-    def backward(ctx, raw: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, Tensor, None, None, None]:
+    def backward(ctx, raw: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, Tensor, None, Tensor | None, None]:
         from nerf_lightning.kernels.cpu import voxels, workers
 
-        rows, weights, basis = ctx.saved_tensors
-        found, above = (rows.numpy(), weights.numpy()), rgb.T.contiguous().numpy()
+        rows, weights, basis, *read = ctx.saved_tensors
+        found, above, moved = (rows.numpy(), weights.numpy()), rgb.T.contiguous().numpy(), None
+        lanes = (0,) * len(basis)
         density, colour, views = (torch.zeros(ctx.table, *width) for width in ((), (3,), (3 * len(basis),)))
         voxels.scatter(density.numpy(), colour.numpy(), *found, raw.contiguous().numpy(), above, workers())
-        if len(basis):
-            lanes = (0,) * len(basis)
+        if lanes:
             voxels.scatter_views(views.numpy(), *found, basis.numpy(), above, lanes, workers())
-        return density, colour, views, None, None, None
+        if read:
+            values, moved = [table.detach().numpy() for table in read], torch.empty_like(weights)
+            voxels.pull(*values[:2], found[0], raw.contiguous().numpy(), above, moved.numpy(), workers())
+            if lanes:
+                voxels.pull_views(values[2], found[0], basis.numpy(), above, moved.numpy(), lanes, workers())
+        return density, colour, views, None, moved, None
 
 
 def read_voxels_reference(
@@ -147,7 +170,7 @@ def read_voxels(
         rows, weights: of the vertices around each sample, as `locate` gives them.
         basis: the basis functions at each sample's direction, constants.
     """
-    if fast(density, colour, views, weights, basis) and not (weights.requires_grad or basis.requires_grad):
+    if fast(density, colour, views, weights, basis) and not basis.requires_grad:
         return _Read.apply(density, colour, views, rows, weights, basis)
     return read_voxels_reference(density, colour, views, rows, weights, basis)
 

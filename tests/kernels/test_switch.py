@@ -38,7 +38,7 @@ def mark_cells(x: Tensor, c: Tensor):
 # What to call with numbers x [4, 3] and c, the same as constants; the entry point it runs; whether that gives all gradients.
 CASES: dict[str, tuple[Callable[[Tensor, Tensor], object], str, bool]] = {
     "tables": (lambda x, c: k.hash_interpolate(x, c, [(1, 1, 1)], [4]), "hashgrid.interpolate", True),
-    "positions": (lambda x, c: k.hash_interpolate(c, x, [(1, 1, 1)], [4]), "hashgrid.interpolate", False),
+    "positions": (lambda x, c: k.hash_interpolate(c, x, [(1, 1, 1)], [4]), "hashgrid.interpolate", True),
     "mlp": (lambda x, c: k.mlp(x, layers(c), c), "mlp.forward", True),
     "mlp_heads": (lambda x, c: k.mlp_heads(x, layers(c), 1, c), "mlp.forward", True),
     "density": (lambda x, c: k.composite(x[:, 0], x, c[:, 1], c[:, 2], RAY, OFFSETS), "composite.forward", True),
@@ -52,7 +52,7 @@ CASES: dict[str, tuple[Callable[[Tensor, Tensor], object], str, bool]] = {
     ),
     "march": (march, "march.walk", False),
     "mark_cells": (mark_cells, "march.mark", True),
-    "points of rays": (lambda x, c: k.points(x, c, RAY, c[:, 0]), "march.points", False),
+    "points of rays": (lambda x, c: k.points(x, c, RAY, c[:, 0]), "march.points", True),
     "points at distances": (lambda x, c: k.points(c, c, RAY, x[:, 0]), "march.points", False),
     "spherical_harmonics": (lambda x, c: k.spherical_harmonics(x), "harmonics.evaluate", False),
 }  # fmt: skip

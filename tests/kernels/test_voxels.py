@@ -72,7 +72,7 @@ def test_interpolation_agrees_with_a_loop_over_vertices(kernels: str):
 
 @pytest.mark.parametrize("count", [0, 1, 500])
 def test_fast_rows_and_weights_agree_with_the_reference(count: int):
-    agree(locate, [sparse_index(), places(count)], constants=(0, 1))
+    agree(locate, [sparse_index(), places(count)])
 
 
 @pytest.mark.parametrize("count", [0, 1, 500])
@@ -90,7 +90,7 @@ def test_fast_reading_agrees_with_the_reference(terms: int, count: int):
     index, unit = sparse_index(), places(count)
     rows, weights = locate(index, unit)
     inputs = [*tables(index, terms), rows, weights, basis_of(len(unit), terms)]
-    agree(read_voxels, inputs, constants=(4, 5), atol=3e-6)
+    agree(read_voxels, inputs, constants=(5,), atol=3e-6)
 
 
 def test_what_is_not_kept_gets_no_gradient(kernels: str):

@@ -91,6 +91,54 @@ def scatter_level(grad, unit, cells, above, axes, features):
                 grad[i[corner], f] += w[corner] * g
 
 
+@inner(inline="always")
+def pulled(table, row, above, n, features):
+    """How the loss changes with how much of an entry place n reads."""
+    value = float32(0)
+    for f in range(len(features)):
+        value += above[f, n] * table[row, f]
+    return value
+
+
+@inner(inline="always")
+def steepness(x, resolution):
+    """How many cells a coordinate passes per unit: none where it is clamped."""
+    return float32(resolution) if float32(0) <= x <= float32(1) else float32(0)
+
+
+@inner(inline="always")
+def trilinear_slope(v, fx, fy, fz):
+    """How the mean of the values at a cell's corners changes along each axis, per cell."""
+    gx, gy, gz = float32(1) - fx, float32(1) - fy, float32(1) - fz
+    return (
+        gy * (gz * (v[4] - v[0]) + fz * (v[5] - v[1])) + fy * (gz * (v[6] - v[2]) + fz * (v[7] - v[3])),
+        gx * (gz * (v[2] - v[0]) + fz * (v[3] - v[1])) + fx * (gz * (v[6] - v[4]) + fz * (v[7] - v[5])),
+        gx * (gy * (v[1] - v[0]) + fy * (v[3] - v[2])) + fx * (gy * (v[5] - v[4]) + fy * (v[7] - v[6])),
+    )
+
+
+@inner
+def slope_level(table, unit, first, last, cells, above, grad, axes, features):
+    """Adds to grad[:, first:last] the gradient in the places that one level's features, `above` [F, N], give."""
+    for n in range(first, last):
+        i, w = corners(unit, n, cells, len(table), axes)
+        x, fx = cell_of(unit[0, n], cells[0])
+        y, fy = cell_of(unit[1, n], cells[1])
+        a, b = pulled(table, i[0], above, n, features), pulled(table, i[1], above, n, features)
+        c, d = pulled(table, i[2], above, n, features), pulled(table, i[3], above, n, features)
+        if len(axes) == 2:
+            gx, gy = float32(1) - fx, float32(1) - fy
+            dx, dy = gy * (c - a) + fy * (d - b), gx * (b - a) + fx * (d - c)
+        else:
+            e, f = pulled(table, i[4], above, n, features), pulled(table, i[5], above, n, features)
+            g, h = pulled(table, i[6], above, n, features), pulled(table, i[7], above, n, features)
+            z, fz = cell_of(unit[2, n], cells[2])
+            dx, dy, dz = trilinear_slope((a, b, c, d, e, f, g, h), fx, fy, fz)
+            grad[2, n] += steepness(unit[2, n], cells[2]) * dz
+        grad[0, n] += steepness(unit[0, n], cells[0]) * dx
+        grad[1, n] += steepness(unit[1, n], cells[1]) * dy
+
+
 @kernel
 def interpolate(tables, unit, resolutions, sizes, out, axes, features, workers):
     """out [LF, N] from tables [T, F], unit [D, N] and resolutions [L, D]. A level belongs to one worker, so that its table
@@ -123,4 +171,18 @@ def scatter(grad, unit, resolutions, sizes, above, axes, features, workers):
                 part, cells = grad[start : start + sizes[level]], cells_of(resolutions, level, axes)
                 part[:] = float32(0)
                 scatter_level(part, unit, cells, above[level * width : (level + 1) * width], axes, features)
+            start += sizes[level]
+
+
+@kernel
+def slope(tables, unit, resolutions, sizes, above, grad, axes, features, workers):
+    """Fills grad [D, N], the gradient in the places."""
+    samples, width = unit.shape[1], len(features)
+    for worker in prange(workers):
+        first, last, start = samples * worker // workers, samples * (worker + 1) // workers, 0
+        grad[:, first:last] = float32(0)
+        for level in range(len(resolutions)):
+            table, cells = tables[start : start + sizes[level]], cells_of(resolutions, level, axes)
+            rows = above[level * width : (level + 1) * width]
+            slope_level(table, unit, first, last, cells, rows, grad, axes, features)
             start += sizes[level]

@@ -4,7 +4,7 @@ import numpy as np
 from numba import float32, prange, uint32
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
-from nerf_lightning.kernels.cpu.hashgrid import cell_of
+from nerf_lightning.kernels.cpu.hashgrid import cell_of, steepness
 from nerf_lightning.kernels.cpu.lanes import load, store, total
 
 TILE = 512
@@ -115,3 +115,43 @@ def scatter(planes, lines, unit, above, grad_planes, grad_lines, lanes, workers)
             scatter_block(
                 planes[mode], lines[mode], grad_planes[mode], grad_lines[mode], unit, given, mode, channel, lanes
             )
+
+
+@inner(inline="always")
+def slopes_on_plane(plane, corner, cells, fa, fb, lanes):
+    """How all channels change per cell along the plane's first axis, and along its second."""
+    ga, gb, one, less = float32(1) - fa, float32(1) - fb, uint32(1), float32(-1)
+    above = corner + uint32(cells + 1)
+    a, b = load(plane, corner, 0, lanes), load(plane, corner + one, 0, lanes)
+    c, d = load(plane, above, 0, lanes), load(plane, above + one, 0, lanes)
+    return gb * (c + less * a) + fb * (d + less * b), ga * (b + less * a) + fa * (d + less * c)
+
+
+@kernel
+def slope(planes, lines, unit, above, grad, lanes, workers):
+    """Fills grad [3, N], the gradient in the places; `above` as in `scatter`, `lanes` as in `products`."""
+    samples, cells, channels = unit.shape[1], lines.shape[1] - 1, len(lanes)
+    for worker in prange(workers):
+        start, end = samples * worker // workers, samples * (worker + 1) // workers
+        rows = np.empty((TILE, len(lanes)), np.float32)
+        grad[:, start:end] = float32(0)
+        for mode in range(3):
+            plane, line, one = planes[mode], lines[mode], uint32(1)
+            first_axis, second_axis = 1 if mode == 0 else 0, 1 if mode == 2 else 2
+            for first in range(start, end, TILE):
+                count = min(TILE, end - first)
+                for c in range(channels):
+                    row = above[mode * channels + c if len(above) > 1 else 0]
+                    for k in range(count):
+                        rows[k, c] = row[first + k]
+                for k in range(count):
+                    n = first + k
+                    corner, fa, fb, place, fc = locate(unit, n, mode, cells)
+                    given = load(rows, k, 0, lanes)
+                    to_plane = given * on_line(line, place, fc, 0, lanes)
+                    along = load(line, place + one, 0, lanes) + float32(-1) * load(line, place, 0, lanes)
+                    to_line = given * on_plane(plane, corner, cells, fa, fb, 0, lanes)
+                    da, db = slopes_on_plane(plane, corner, cells, fa, fb, lanes)
+                    grad[first_axis, n] += steepness(unit[first_axis, n], cells) * total(to_plane * da)
+                    grad[second_axis, n] += steepness(unit[second_axis, n], cells) * total(to_plane * db)
+                    grad[mode, n] += steepness(unit[mode, n], cells) * total(to_line * along)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import float32, int64, prange
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
-from nerf_lightning.kernels.cpu.hashgrid import cell_of
+from nerf_lightning.kernels.cpu.hashgrid import cell_of, steepness, trilinear_slope
 from nerf_lightning.kernels.cpu.lanes import load, store, total
 
 TILE = 64
@@ -41,6 +41,21 @@ def locate(index, cells, unit, rows, weights, workers):
             r, w = corners(unit, n, index, cells)
             for c in range(8):
                 rows[n, c], weights[n, c] = r[c], w[c]
+
+
+@kernel
+def slope(cells, unit, above, grad, workers):
+    """Fills grad [3, N], the gradient in the places, from that in the weights, `above` [N, 8]."""
+    samples = unit.shape[1]
+    for worker in prange(workers):
+        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
+            x, fx = cell_of(unit[0, n], cells)
+            y, fy = cell_of(unit[1, n], cells)
+            z, fz = cell_of(unit[2, n], cells)
+            dx, dy, dz = trilinear_slope(above[n], fx, fy, fz)
+            grad[0, n] = steepness(unit[0, n], cells) * dx
+            grad[1, n] = steepness(unit[1, n], cells) * dy
+            grad[2, n] = steepness(unit[2, n], cells) * dz
 
 
 @kernel
@@ -88,6 +103,24 @@ def read(density, colour, rows, weights, raw, rgb, workers):
 
 
 @inner
+def pull_run(density, colour, rows, raw, rgb, grad, first, last):
+    for n in range(first, last):
+        s, a, b, c = raw[n], rgb[0, n], rgb[1, n], rgb[2, n]
+        for corner in range(8):
+            row = rows[n, corner]
+            grad[n, corner] = s * density[row] + a * colour[row, 0] + b * colour[row, 1] + c * colour[row, 2]
+
+
+@kernel
+def pull(density, colour, rows, raw, rgb, grad, workers):
+    """Fills grad [N, 8], the gradient in the weights, from those of raw [N] and rgb [3, N]."""
+    samples = len(raw)
+    for worker in prange(workers):
+        first, last = samples * worker // workers, samples * (worker + 1) // workers
+        pull_run(density, colour, rows, raw, rgb, grad, first, last)
+
+
+@inner
 def turn(basis, first, count, tile):
     """tile [TILE, B] from `count` columns of basis [B, N]."""
     for b in range(tile.shape[1]):
@@ -126,6 +159,31 @@ def add_views(views, rows, weights, basis, rgb, lanes, workers):
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
         add_views_run(views, rows, weights, basis, rgb, lanes, start, end)
+
+
+@inner
+def pull_views_run(views, rows, basis, rgb, grad, lanes, start, end):
+    terms = len(lanes)
+    tile = np.empty((TILE, terms), np.float32)
+    for first in range(start, end, TILE):
+        count = min(TILE, end - first)
+        turn(basis, first, count, tile)
+        for k in range(count):
+            n = first + k
+            given = load(tile, k, 0, lanes)
+            for corner in range(8):
+                row = rows[n, corner]
+                mixed = rgb[0, n] * load(views, row, 0, lanes) + rgb[1, n] * load(views, row, terms, lanes)
+                grad[n, corner] += total((mixed + rgb[2, n] * load(views, row, 2 * terms, lanes)) * given)
+
+
+@kernel
+def pull_views(views, rows, basis, rgb, grad, lanes, workers):
+    """Adds to grad [N, 8] what the views [V, 3 B] times basis [B, N] contribute to the gradient in the weights."""
+    samples = rows.shape[0]
+    for worker in prange(workers):
+        start, end = samples * worker // workers, samples * (worker + 1) // workers
+        pull_views_run(views, rows, basis, rgb, grad, lanes, start, end)
 
 
 @inner
