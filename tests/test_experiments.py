@@ -104,8 +104,8 @@ def test_what_a_run_leaves(tmp_path: Path):
     results = json.loads((tmp_path / "results.json").read_text())
     assert set(results) == {
         "scene", "background", "method", "seed", "device", "threads", "machine", "load", "versions", "parameters",
-        "artifact_bytes", "train_seconds", "steps", "rays_per_second", "psnr", "ssim", "psnr_worst_view",
-        "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "plateau", "recoveries", "status",
+        "artifact_bytes", "train_seconds", "steps", "rays_per_second", "psnr", "psnr_aligned", "ssim", "psnr_worst_view",
+        "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "plateau", "corrections", "recoveries", "status",
         "diagnosis",
     }  # fmt: skip
     assert set(results["scene"]) == {"name", "source", "sha256", "views", "resolution"}

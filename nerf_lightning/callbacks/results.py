@@ -19,8 +19,8 @@ from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
-from nerf_lightning.dataset import PictureBatch
-from nerf_lightning.system import NeRF2D, System, mse_to_psnr
+from nerf_lightning.dataset import PictureBatch, Scene
+from nerf_lightning.system import NeRF2D, NeRF3D, System, aligned_psnr, mse_to_psnr
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.machine import describe_machine
 
@@ -102,6 +102,8 @@ class Results(L.Callback):
         self.seed = seed
         self.warnings = list(warnings)
         self.views: list[dict[str, float]] = []
+        self.aligned: list[float] = []
+        """PSNR of held-out photos with their own corrections, where training photos had such."""
         self.summary: dict[str, Any] = {}
         """What was written last."""
 
@@ -116,6 +118,9 @@ class Results(L.Callback):
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         quality = fmean(view["psnr"] for view in self.views)
         plain = fmean(view["plain_psnr"] for view in self.views)
+        scene = data_of(trainer).scene
+        if isinstance(pl_module, NeRF3D) and pl_module.corrections is not None and isinstance(scene, Scene):
+            self.aligned = aligned_psnr(pl_module, scene.val)
         nothing = min(plain + NO_BETTER, SEEN_AS_EQUAL)
         stopped = "stopped_early" if Budget.of(trainer).progress(trainer.global_step) < 1.0 else "finished"
         broken = [name for name, value in pl_module.named_parameters() if not value.isfinite().all()]
@@ -153,6 +158,7 @@ class Results(L.Callback):
         if quality is not None:
             curve = [*curve, [round(budget.seconds, 3), trainer.global_step, quality]]
         state = pl_module.state_dict().values()
+        corrections = pl_module.corrections if isinstance(pl_module, NeRF3D) else None
         self.summary = {
             "scene": scene.describe(),
             "background": pl_module.background,
@@ -176,6 +182,7 @@ class Results(L.Callback):
             "steps": trainer.global_step,
             "rays_per_second": round(throughput.rays / budget.seconds, 1) if throughput and budget.seconds else None,
             "psnr": quality,
+            "psnr_aligned": round(fmean(self.aligned), 4) if self.aligned else None,
             "ssim": over_views(fmean, "ssim"),
             "psnr_worst_view": over_views(min, "psnr"),
             "render_seconds_per_view": over_views(median, "seconds"),
@@ -183,6 +190,7 @@ class Results(L.Callback):
             "curve": curve,
             "warnings": self.warnings,
             "plateau": budget.stopped,
+            "corrections": None if corrections is None else corrections.summary(),
             "recoveries": [asdict(one) for one in guard.recoveries] if guard is not None else [],
             "status": status,
             "diagnosis": diagnosis,

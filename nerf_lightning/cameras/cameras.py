@@ -27,6 +27,10 @@ class Rays:
     def __getitem__(self, index: slice | Tensor) -> "Rays":
         return Rays(self.origins[index], self.directions[index])
 
+    def detach(self) -> "Rays":
+        """Without gradient."""
+        return Rays(self.origins.detach(), self.directions.detach())
+
     def to(self, device: torch.device | str) -> "Rays":
         return Rays(self.origins.to(device), self.directions.to(device))
 

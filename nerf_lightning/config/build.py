@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
 
 from nerf_lightning.callbacks import Budget, Results
-from nerf_lightning.cameras import Bounds
+from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.errors import InputError
@@ -124,7 +124,10 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     sampler = make(cfg, "sampler", bounds=frame.bounds)
     seen = {"half_size": float(frame.bounds.half_size.min()), "unbounded": frame.bounds.unbounded}
     renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
-    return NeRF3D(field, sampler, renderer, **common)
+    corrections = None
+    if cfg.get("refine") is not None and frame.cameras is not None:
+        corrections = make(cfg, "refine", cameras=frame.cameras, bounds=frame.bounds)
+    return NeRF3D(field, sampler, renderer, **common, corrections=corrections)
 
 
 @dataclass(frozen=True)
@@ -133,6 +136,8 @@ class SceneFrame:
 
     bounds: Bounds
     background: tuple[float, float, float]
+    cameras: Cameras | None = None
+    """Of the training photos; None where there is nothing to train."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +157,7 @@ def frame_of(data: RayDataModule | PixelDataModule) -> Frame:
         return PictureFrame(*data.scene.size)
     bounds = data.scene.bounds
     pixel = data.scene.train.cameras.pixel_width(bounds.centre)
-    return SceneFrame(replace(bounds, pixel=pixel or None), data.scene.background)
+    return SceneFrame(replace(bounds, pixel=pixel or None), data.scene.background, data.scene.train.cameras)
 
 
 def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, system: System) -> None:

@@ -1,9 +1,9 @@
 """RayDataModule: rays and their pixels, drawn uniformly from all training photos."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
@@ -26,9 +26,12 @@ class RayBatch:
     rays: Rays
     pixels: UInt8[Tensor, "R C"]
     """sRGB, with straight alpha where C is 4."""
+    views: Int[Tensor, "R"] | None = field(default=None, kw_only=True)
+    """The training photo that each belongs to; None where that is not asked for."""
 
     def to(self, device: torch.device | str) -> "RayBatch":
-        return RayBatch(self.rays.to(device), self.pixels.to(device))
+        views = None if self.views is None else self.views.to(device)
+        return RayBatch(self.rays.to(device), self.pixels.to(device), views=views)
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ def draw_rays(views: Views, count: int, generator: torch.Generator, part: slice 
         flat = views.known.find(flat)
     view = torch.searchsorted(views.starts, flat, right=True) - 1
     pixel, width = flat - views.starts[view], views.widths[view]
-    return RayBatch(views.cameras.rays(view, pixel // width, pixel % width), views.pixels[flat])
+    return RayBatch(views.cameras.rays(view, pixel // width, pixel % width), views.pixels[flat], views=view)
 
 
 class RayDataModule(StepDataModule[Views]):

@@ -148,12 +148,14 @@ class _HashInterpolate(torch.autograd.Function):
         return out.T
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         from nerf_lightning.kernels.cpu import hashgrid, workers
 
         places, *read = ctx.saved_tensors
-        tables, above, moved = torch.empty(ctx.shape), grad.T.contiguous().numpy(), None
-        hashgrid.scatter(tables.numpy(), places.numpy(), *ctx.levels, above, *ctx.widths, workers())
+        tables, above, moved = None, grad.T.contiguous().numpy(), None
+        if ctx.needs_input_grad[0]:
+            tables = torch.empty(ctx.shape)
+            hashgrid.scatter(tables.numpy(), places.numpy(), *ctx.levels, above, *ctx.widths, workers())
         if read:
             moved = torch.empty_like(places)
             given = read[0].numpy(), places.numpy(), *ctx.levels, above, moved.numpy()

@@ -142,7 +142,9 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device =
     system = build_system(cfg, frame, device)
     state = read_checkpoint(folder / "checkpoints" / checkpoint)
     try:
-        system.load_state_dict(state["state_dict"])
+        # Corrections are of training photos, which rendering has none of.
+        weights = {key: value for key, value in state["state_dict"].items() if not key.startswith("corrections.")}
+        system.load_state_dict(weights)
     except (KeyError, RuntimeError) as error:
         raise InputError(
             folder / "checkpoints" / checkpoint, "state_dict", str(error), "the weights of this run's model"

@@ -23,6 +23,7 @@ TARGETS = {
         *("FourierField", "HashGrid2DField", "HashGridField", "MLPField", "PictureMLP", "SirenField", "TensoRFField"),
         "VoxelField",
     ),
+    "nerf_lightning.refine": ("Corrections",),
     "nerf_lightning.renderer": ("VolumeRenderer",),
     "nerf_lightning.sampler": (
         *("ImportanceSampler", "OccupancySampler", "ProposalSampler", "UniformSampler"),

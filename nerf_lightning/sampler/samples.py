@@ -64,7 +64,7 @@ class Samples:
 
     def directions(self, rays: Rays) -> Float[Tensor, "N 3"]:
         """Unit viewing direction of each sample."""
-        return rays.directions.index_select(0, self.ray)
+        return rays.directions.detach().index_select(0, self.ray)
 
     def between(self, near: float, far: float) -> "Samples":
         """The samples whose midpoints lie between two distances along their rays."""

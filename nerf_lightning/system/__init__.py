@@ -1,5 +1,6 @@
 """Stage 6, systems: LightningModules that hold step, loss, metrics and optimiser, and nothing else."""
 
+from nerf_lightning.system.aligned import aligned_psnr
 from nerf_lightning.system.metrics import mse_to_psnr, psnr, ssim
 from nerf_lightning.system.nerf2d import NeRF2D
 from nerf_lightning.system.nerf3d import NeRF3D
@@ -12,6 +13,7 @@ __all__ = [
     "StepStats",
     "System",
     "ViewResult",
+    "aligned_psnr",
     "constant",
     "cosine",
     "mse_to_psnr",

@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.model import Field
+from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import Rendered, VolumeRenderer, over
 from nerf_lightning.sampler import Sampler, split
 from nerf_lightning.system.compiled import part
@@ -28,6 +30,7 @@ class NeRF3D(System):
         field: position, direction -> density, rgb.
         sampler: rays -> samples.
         renderer: samples -> pixels.
+        corrections: of the training photos' cameras and light, learned with the field; None takes them as they are.
         optimizer, schedule, seed, chunk: see `System`.
     """
 
@@ -42,12 +45,20 @@ class NeRF3D(System):
         schedule: Schedule,
         seed: int = 0,
         chunk: int = CHUNK,
+        corrections: Corrections | None = None,
     ):
         super().__init__(optimizer, schedule, seed, chunk)
         self.field = field
         self.sampler = sampler
         self.sampler.chunk = chunk
         self.renderer = renderer
+        self.corrections = corrections
+
+    def learned(self) -> list[dict[str, Any]]:
+        if self.corrections is None:
+            return super().learned()
+        apart = set(self.corrections.parameters())
+        return [{"params": [p for p in self.parameters() if p not in apart]}, *self.corrections.groups]
 
     def warm_start_from(self, smaller: System) -> None:
         super().warm_start_from(smaller)
@@ -64,6 +75,10 @@ class NeRF3D(System):
 
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
+        if self.corrections is not None:
+            factor = self.corrections.schedule(self.progress) * self.rate
+            for group in self.parameter_groups[1:]:
+                group["lr"] = group["initial_lr"] * factor
         self.renderer.fade(self.progress)
         replaced = self.field.grow(self.progress)
         if replaced:
@@ -77,23 +92,31 @@ class NeRF3D(System):
     def rehearse(self, batch: RayBatch) -> None:
         """Runs a step on a copy with the clock stopped: compiling for a new size does not count as training."""
         field, sampler = copy.deepcopy(self.field), copy.deepcopy(self.sampler)
-        trial = NeRF3D(field, sampler, self.renderer, self.make_optimizer, self.schedule, self.seed, self.chunk)
+        options = self.make_optimizer, self.schedule, self.seed, self.chunk, self.corrections
+        trial = NeRF3D(field, sampler, self.renderer, *options)
         trial.backend = self.backend
         with self.paused() if self.paused else nullcontext(), self.trainer.precision_plugin.train_step_context():
             trial.loss(batch, step_generator(self.seed, Stream.STEP, self.global_step, self.device), 1)[0].backward()
 
     def loss(self, batch: RayBatch, generator: torch.Generator, step: int) -> tuple[Tensor, StepStats]:
         """What a step minimises, and what it did. All its randomness comes from `generator`."""
+        rays, corrections = batch.rays, self.corrections
+        if corrections is not None:
+            assert batch.views is not None  # training rays are of photos
+            rays = corrections.rays(rays, batch.views)
         with torch.no_grad():
             density = part(self.field.density, self.backend)
             self.sampler.update(step, density, generator)
-            samples = self.sampler(batch.rays, density, generator)
+            samples = self.sampler(rays.detach(), density, generator)
         backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
         field = self.field.with_view_part if self.renderer.view_loss_weight else self.field
-        rendered = part(self.renderer.forward, self.backend)(batch.rays, samples, field, backgrounds)
-        truth = over(batch.pixels, backgrounds)
+        rendered = part(self.renderer.forward, self.backend)(rays, samples, field, backgrounds)
+        truth, rgb = over(batch.pixels, backgrounds), rendered.rgb
+        if corrections is not None:
+            assert batch.views is not None
+            rgb = corrections.lit(rgb, rendered.opacity, backgrounds, batch.views)
         # A ray without all of its samples must not be learned from.
-        rgb = rendered.rgb if samples.whole is None else torch.where(samples.whole[:, None], rendered.rgb, truth)
+        rgb = rgb if samples.whole is None else torch.where(samples.whole[:, None], rgb, truth)
         loss = torch.nn.functional.mse_loss(rgb, truth)
         stats = StepStats(
             loss.detach(), len(batch.rays), len(samples), samples.whole is None, rendered.opacity.detach()

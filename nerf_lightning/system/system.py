@@ -17,7 +17,7 @@ from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system.metrics import psnr, ssim
 from nerf_lightning.utils.device import synchronize
 
-MakeOptimizer = Callable[[Iterable[torch.nn.Parameter]], torch.optim.Optimizer]
+MakeOptimizer = Callable[[list[dict[str, Any]]], torch.optim.Optimizer]
 Schedule = Callable[[float], float]
 """Progress in [0, 1] -> factor on the learning rate."""
 CHUNK = 1 << 15
@@ -98,8 +98,12 @@ class System(L.LightningModule):
         field: Any = self.field
         field.warm_start_from(smaller.field)
 
+    def learned(self) -> list[dict[str, Any]]:
+        """The optimiser's groups of parameters; those that say no learning rate take the optimiser's own."""
+        return [{"params": list(self.parameters())}]
+
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        optimizer = self.make_optimizer(self.parameters())
+        optimizer = self.make_optimizer(self.learned())
         for group in optimizer.param_groups:
             group["initial_lr"] = group["lr"]
         return optimizer

@@ -99,6 +99,9 @@ def train(
     trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(system, data, verbose=False)
     if trainer.is_global_zero:
+        if isinstance(system, NeRF3D) and system.corrections is not None:
+            found = results.summary["psnr_aligned"]
+            print(f"{system.corrections.told()}; {found:.2f} dB held out with held-out photos corrected too")
         if trainer.logger is not None:
             log_hyperparameters(trainer.logger, cfg, results.summary)
         report(results.summary, folder)

@@ -1,0 +1,5 @@
+"""Between cameras and samplers: small corrections of cameras and light, learned together with the field."""
+
+from nerf_lightning.refine.corrections import Corrections
+
+__all__ = ["Corrections"]

@@ -1,0 +1,63 @@
+"""Small motions of cameras: what they do to rays, and to where places appear in the photos."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SMALL = 1e-6
+"""Squared angle below which a series stands in for the factors of a turn, so that gradients exist at 0 too."""
+
+
+def turned(vectors: Float[Tensor, "R 3"], turns: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+    """Vectors, each turned about an axis (Rodrigues' formula).
+
+    Args:
+        vectors: of any length.
+        turns: the axes' directions, as long as the angles are in radians.
+    """
+    square = turns.square().sum(1, keepdim=True)
+    small = square < SMALL
+    angle = torch.where(small, 1.0, square).sqrt()
+    first = torch.where(small, 1 - square / 6, angle.sin() / angle)
+    second = torch.where(small, 0.5 - square / 24, (1 - angle.cos()) / angle.square())
+    across = torch.linalg.cross(turns, vectors, dim=1)
+    return vectors + first * across + second * torch.linalg.cross(turns, across, dim=1)
+
+
+def pixel_shifts(
+    centres: Float[Tensor, "V 3"], focals: Float[Tensor, "V"], places: Float[Tensor, "P 3"]
+) -> Float[Tensor, "V P 3 6"]:
+    """How far places move in each photo, per unit of a small turn and a small move of its camera.
+
+    Args:
+        centres: of the cameras, world frame.
+        focals: in pixels.
+        places: world frame.
+
+    Returns:
+        Derivatives of the direction from the camera, in pixels at the photo's centre, as vectors of the camera's frame written
+        along world axes. The first three columns are of a turn about the camera's centre (world axes, radians), the last three
+        of a move of it (world units).
+    """
+    towards = places - centres[:, None]
+    distance = towards.norm(dim=2)[..., None, None]
+    ray = towards[..., None] / distance
+    axes = torch.eye(3, dtype=ray.dtype, device=ray.device).expand(*ray.shape[:2], 3, 3)
+    # Seen from a camera that turns by w and moves by m, a place at p moves by p x w - m.
+    turn = torch.linalg.cross(towards[:, :, None].expand_as(axes), axes, dim=3).mT
+    return focals[:, None, None, None] * (axes - ray * ray.mT) @ torch.cat([turn, -axes], dim=3) / distance
+
+
+def whitening(shifts: Float[Tensor, "V P 3 6"], damping: float) -> Float[Tensor, "V 6 6"]:
+    """For each photo the matrix that turns a vector of unit length into a motion that shifts places by about a pixel.
+
+    The inverse square root of the mean of J^T J, damped: Park et al. 2023, "CamP", section 4.
+
+    Args:
+        shifts: J, see `pixel_shifts`.
+        damping: share of each motion's own effect that is added, so that motions which hardly show do not grow without limit.
+    """
+    square = (shifts.mT @ shifts).mean(1)
+    square = square + damping * torch.diag_embed(square.diagonal(dim1=1, dim2=2))
+    values, vectors = torch.linalg.eigh(square)
+    return vectors @ torch.diag_embed(values.rsqrt()) @ vectors.mT

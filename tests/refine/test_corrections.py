@@ -1,0 +1,171 @@
+"""Corrections as they act on rays and colours, their gradients through every field, and a run with them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import nerf_lightning as nl
+from nerf_lightning.cameras import Bounds, Cameras, Rays
+from nerf_lightning.cameras.orbit import look_at
+from nerf_lightning.config.compose import composed
+from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import use_kernels
+from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
+from nerf_lightning.refine import Corrections
+from nerf_lightning.renderer import VolumeRenderer
+from nerf_lightning.sampler import Samples, UniformSampler
+from nerf_lightning.system import aligned
+from nerf_lightning.training.train import train
+
+BOX = Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+VIEWS, SIZE = 5, 12
+"""Photos, and pixels along a side of each."""
+STEPS = 300
+
+
+@pytest.fixture
+def cameras() -> Cameras:
+    """Around the box, looking at its centre."""
+    centres = 3 * torch.nn.functional.normalize(torch.randn(VIEWS, 3), dim=1)
+    K = torch.tensor([[1.2 * SIZE, 0, SIZE / 2], [0, 1.2 * SIZE, SIZE / 2], [0, 0, 1]])
+    return Cameras.of_size(K.repeat(VIEWS, 1, 1), look_at(centres, torch.zeros(3), torch.eye(3)[2]), SIZE, SIZE)
+
+
+def some_pixels(count: int) -> tuple[Tensor, Tensor, Tensor]:
+    return torch.randint(0, VIEWS, (count,)), torch.randint(0, SIZE, (count,)), torch.randint(0, SIZE, (count,))
+
+
+def blob(positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """A ball with soft borders, whose colour changes from place to place."""
+    density = 8 * torch.sigmoid(8 * (0.7 - positions.norm(dim=1)))
+    return density, torch.sigmoid(4 * torch.sin(3 * positions + torch.tensor([0, 1, 2]).to(positions)))
+
+
+def test_at_the_start_nothing_is_corrected_and_means_stay_zero(cameras: Cameras):
+    corrections = Corrections(cameras, BOX)
+    rays, (views, *_) = cameras.rays(*(pixels := some_pixels(50))), pixels
+    same = corrections.rays(rays, views)
+    torch.testing.assert_close((same.origins, same.directions), (rays.origins, rays.directions))
+    torch.nn.init.normal_(corrections.motions), torch.nn.init.normal_(corrections.log_gains)
+    for mean in (*(x.mean(0) for x in corrections.turns_and_moves), corrections.gains.log().mean(0)):
+        torch.testing.assert_close(mean, torch.zeros(3), atol=1e-6, rtol=0)
+
+
+def test_corrected_rays_are_those_of_the_corrected_cameras(cameras: Cameras):
+    corrections = Corrections(cameras, BOX)
+    torch.nn.init.normal_(corrections.motions, std=2)
+    pixels = some_pixels(50)
+    found = corrections.rays(cameras.rays(*pixels), pixels[0])
+    expected = corrections.cameras(cameras).rays(*pixels)
+    torch.testing.assert_close(found.origins, expected.origins)
+    torch.testing.assert_close(found.directions, expected.directions, atol=1e-5, rtol=0)
+
+
+def test_gains_leave_the_background_alone(cameras: Cameras):
+    corrections, views = Corrections(cameras, BOX, poses=False), torch.arange(VIEWS)
+    torch.nn.init.normal_(corrections.log_gains)
+    behind, opacity = torch.rand(VIEWS, 3), torch.tensor([0, 0.5, 1, 1, 1])
+    red = torch.tensor([0.5, 0, 0]).expand(VIEWS, 3)
+    found = corrections.lit(opacity[:, None] * red + (1 - opacity)[:, None] * behind, opacity, behind, views)
+    torch.testing.assert_close(found, opacity[:, None] * red * corrections.gains + (1 - opacity)[:, None] * behind)
+
+
+def test_cameras_and_gains_are_found_again_with_a_known_field(cameras: Cameras):
+    """Photos of a known ball, by cameras that stand elsewhere than was said, in changing light."""
+    truth, corrections = Corrections(cameras, BOX), Corrections(cameras, BOX)
+    torch.nn.init.normal_(truth.motions, std=0.5), torch.nn.init.normal_(truth.log_gains, std=0.1)
+    sampler, renderer, behind = UniformSampler(BOX, 32), VolumeRenderer("black"), torch.zeros(200, 3)
+
+    def seen(by: Corrections, pixels: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+        rays = by.rays(cameras.rays(*pixels), pixels[0])
+        found = renderer(rays, sampler(rays.detach(), lambda x: x[:, 0]), blob)
+        return by.lit(found.rgb, found.opacity, behind, pixels[0])
+
+    optimizer = torch.optim.Adam(corrections.groups)
+    for step in range(STEPS):
+        for group, rate in zip(optimizer.param_groups, (0.1, 0.02), strict=True):
+            group["lr"] = rate * 0.02 ** (step / STEPS)
+        pixels = some_pixels(200)
+        optimizer.zero_grad()
+        (seen(corrections, pixels) - seen(truth, pixels).detach()).square().mean().backward()
+        optimizer.step()
+    before, after = (
+        by.cameras(cameras).c2w - truth.cameras(cameras).c2w for by in (Corrections(cameras, BOX), corrections)
+    )
+    assert float(after.norm()) < 0.15 * float(before.norm())
+    left, wrong = (
+        float((by.gains - truth.gains).abs().max().detach()) for by in (corrections, Corrections(cameras, BOX))
+    )
+    assert left < 0.2 * wrong
+
+
+FIELDS = {
+    "hashgrid": lambda: HashGridField(BOX, levels=3, log2_entries=8, coarsest=4, finest=16, width=16),
+    "tensorf": lambda: TensoRFField(BOX, 8, 8, coarsest=6, finest=6, stages=1, width=16),
+    "voxels": lambda: VoxelField(BOX, coarsest=6, finest=6, stages=1),
+    "mlp": lambda: MLPField(BOX, width=16),
+}
+
+
+def loss(field: Field, corrections: Corrections, rays: Rays, views: Tensor, samples: Samples, way: Tensor) -> Tensor:
+    """A sum over what is seen along these samples, from directions that do not follow the cameras."""
+    seen = VolumeRenderer("black").to(way.device, way.dtype)(
+        corrections.rays(rays, views), samples, lambda x, _: field(x, samples.directions(rays))
+    )
+    return (corrections.lit(seen.rgb, seen.opacity, torch.zeros_like(way), views) * way).sum()
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_gradients_through_every_field(name: str, cameras: Cameras):
+    """Against differences in double precision; then those of the fast version against those of the reference."""
+    pixels, way = some_pixels(40), torch.randn(40, 3)
+    given, views, field, corrections = cameras.rays(*pixels), pixels[0], FIELDS[name](), Corrections(cameras, BOX)
+    for parameter in field.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+    torch.nn.init.normal_(corrections.motions, std=0.1), torch.nn.init.normal_(corrections.log_gains, std=0.1)
+    samples, learned = UniformSampler(BOX, 12)(given, lambda x: x[:, 0]), list(corrections.parameters())
+    by = {}
+    for choice in ("auto", "reference"):
+        use_kernels(choice)
+        by[choice] = torch.autograd.grad(loss(field, corrections, given, views, samples, way), learned)
+    for fast, plain in zip(by["auto"], by["reference"], strict=True):
+        assert float(plain.norm()) > 1e-3
+        torch.testing.assert_close(fast, plain, rtol=1e-3, atol=1e-4 * float(plain.abs().max()))
+
+    field, corrections = field.double(), corrections.double()
+    field.aabb = field.aabb.double()
+    double = replace(samples, t=samples.t.double(), dt=samples.dt.double(), places=None)
+    rest = Rays(given.origins.double(), given.directions.double()), views, double, way.double()
+    for parameter in corrections.parameters():
+        (slope,) = torch.autograd.grad(loss(field, corrections, *rest), parameter)
+        along, step = torch.randn_like(slope), 1e-7
+        ends = []
+        with torch.no_grad():
+            for side in (step, -2 * step, step):
+                parameter += side * along
+                ends.append(float(loss(field, corrections, *rest)))
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float((slope * along).sum()), rel=1e-3)
+
+
+def test_a_run_says_what_it_corrected_and_is_rendered_without_its_photos(tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.setattr(aligned, "STEPS", 3), monkeypatch.setattr(aligned, "RAYS", 64)
+    few = ["dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", "dataset.rays=64", "budget.steps=12"]
+    train(composed(["+experiment=smoke_3d", "refine=both", *few], tmp_path))
+    assert "refine: cameras turned by up to" in capsys.readouterr().out
+    found = json.loads((tmp_path / "results.json").read_text())["corrections"]
+    assert {key: len(value) for key, value in found.items()} == {"turned_degrees": 4, "moved": 4, "exposure": 4}
+    assert max(found["turned_degrees"]) > 0 and min(found["exposure"]) < 1 < max(found["exposure"])
+    assert nl.load_run(tmp_path, "cpu").system.corrections is None
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [({"poses": False, "light": False}, "refine.poses"), ({"pose_rate": 0.0}, "refine.pose_rate")],
+)
+def test_what_corrects_nothing_is_refused(options: dict, key: str, cameras: Cameras):
+    with pytest.raises(InputError, match=key):
+        Corrections(cameras, BOX, **options)

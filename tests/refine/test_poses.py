@@ -1,0 +1,42 @@
+"""Turns against the matrix exponential, and shifts of pixels against cameras that really moved."""
+
+import torch
+from torch import Tensor
+
+from nerf_lightning.refine.poses import pixel_shifts, turned, whitening
+
+
+def cross(turns: Tensor) -> Tensor:
+    """Matrices that take the cross product with these vectors."""
+    found = torch.zeros(len(turns), 3, 3, dtype=turns.dtype)
+    found[:, [2, 0, 1], [1, 2, 0]] = turns
+    return found - found.mT
+
+
+def test_a_turn_is_that_of_the_rotation_matrix_from_none_to_more_than_half_a_circle():
+    turns = torch.randn(6, 3).double() * torch.tensor([0, 1e-9, 1e-4, 1e-2, 0.5, 2.5]).double()[:, None]
+    vectors = torch.randn(6, 3).double()
+    expected = (torch.linalg.matrix_exp(cross(turns)) @ vectors[..., None]).squeeze(2)
+    torch.testing.assert_close(turned(vectors, turns), expected)
+    assert torch.autograd.gradcheck(turned, (vectors.requires_grad_(), turns.requires_grad_()))
+
+
+def test_shifts_are_those_of_cameras_that_turned_and_moved():
+    centres, places, focals = 3 * torch.randn(4, 3).double(), 0.3 * torch.randn(20, 3).double(), torch.full((4,), 90.0)
+    motions = 1e-6 * torch.randn(4, 6).double()
+    before = places - centres[:, None]
+    back = torch.linalg.matrix_exp(cross(-motions[:, :3]))
+    after = (places - centres[:, None] - motions[:, None, 3:]) @ back.mT
+    expected = 90 * (torch.nn.functional.normalize(after, dim=2) - torch.nn.functional.normalize(before, dim=2))
+    found = (pixel_shifts(centres, focals.double(), places) @ motions[:, None, :, None]).squeeze(3)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-9)
+
+
+def test_a_whitened_motion_of_any_kind_shifts_places_by_about_a_pixel():
+    centres, places = 3 * torch.nn.functional.normalize(torch.randn(5, 3).double(), dim=1), torch.rand(500, 3).double()
+    shifts = pixel_shifts(centres, torch.full((5,), 200.0).double(), places - 0.5)
+    free, damped = (
+        (shifts @ whitening(shifts, damping)[:, None]).square().sum(2).mean(1).sqrt() for damping in (1e-9, 1.0)
+    )
+    torch.testing.assert_close(free, torch.ones(5, 6).double(), rtol=1e-3, atol=0)
+    assert (damped < 1).all() and (damped > 0.01).all()
