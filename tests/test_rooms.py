@@ -8,7 +8,7 @@ ORDER = (
     ("errors",),
     ("utils", "cameras"),
     ("kernels",),
-    ("dataset", "model"),
+    ("dataset", "model", "refine"),
     ("sampler",),  # some have a small field of their own
     ("renderer",),
     ("system",),

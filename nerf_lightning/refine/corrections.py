@@ -89,7 +89,7 @@ class Corrections(torch.nn.Module):
     @property
     def turns_and_moves(self) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3"]]:
         """Of each camera: about its centre (world axes, radians), and of it (world units)."""
-        motions = (self.scales @ self.motions[..., None]).squeeze(2)
+        motions = (self.scales * self.motions[:, None]).sum(2)  # no matrix product, which half precision would round
         turns, moves = self._own(motions).split(3, dim=1)
         return turns, moves
 
