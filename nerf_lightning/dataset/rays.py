@@ -48,6 +48,13 @@ class ViewBatch(RayBatch):
         return ViewBatch(self.rays.to(device), self.pixels.to(device), self.height, self.width, known)
 
 
+def rays_through(views: Views, places: Int[Tensor, "R"]) -> tuple[Rays, Int[Tensor, "R"]]:
+    """Rays through the pixels at these places in `Views.pixels`, and the photos they belong to."""
+    view = torch.searchsorted(views.starts, places, right=True) - 1
+    pixel, width = places - views.starts[view], views.widths[view]
+    return views.cameras.rays(view, pixel // width, pixel % width), view
+
+
 def draw_rays(views: Views, count: int, generator: torch.Generator, part: slice = slice(None)) -> RayBatch:  # noqa: B008
     """Draws `count` pixels uniformly from all views, masked ones excepted, with replacement; returns a part of them.
 
@@ -57,9 +64,8 @@ def draw_rays(views: Views, count: int, generator: torch.Generator, part: slice 
     flat = torch.randint(whole, (count,), generator=generator, device=views.pixels.device)[part]
     if views.known is not None:
         flat = views.known.find(flat)
-    view = torch.searchsorted(views.starts, flat, right=True) - 1
-    pixel, width = flat - views.starts[view], views.widths[view]
-    return RayBatch(views.cameras.rays(view, pixel // width, pixel % width), views.pixels[flat], views=view)
+    rays, view = rays_through(views, flat)
+    return RayBatch(rays, views.pixels[flat], views=view)
 
 
 class RayDataModule(StepDataModule[Views]):

@@ -18,6 +18,8 @@ def median_depth(density: Float[Tensor, "N"], opacity: Float[Tensor, "R"], sampl
         opacity: of the rays.
         samples: along them.
     """
+    if not len(samples):
+        return torch.zeros_like(opacity)
     thickness = density * samples.dt
     passed = before(thickness, samples.ray, samples.offsets)
     goal = -torch.log1p(-opacity / 2)
@@ -25,7 +27,5 @@ def median_depth(density: Float[Tensor, "N"], opacity: Float[Tensor, "R"], sampl
     first, last = samples.offsets[:-1], samples.offsets[1:] - 1
     # A sum that falls short by rounding ends at the last sample; a ray without samples reads any, and is told apart below.
     place = torch.minimum(first + short[samples.offsets[1:]] - short[first], last).clamp_min(0)
-    if not len(samples):
-        return torch.zeros_like(opacity)
     share = ((goal - passed[place]) / thickness[place].clamp_min(1e-12)).clamp(0, 1)
     return torch.where(opacity > 0, samples.t[place] + (share - 0.5) * samples.dt[place], 0.0)

@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import Views
+from nerf_lightning.dataset.rays import rays_through
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import over
 from nerf_lightning.system.metrics import mse_to_psnr
 from nerf_lightning.system.nerf3d import NeRF3D
-from nerf_lightning.utils.progress import counted
+from nerf_lightning.utils.progress import tracked
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 STEPS, RAYS = 200, 2048
@@ -28,34 +28,25 @@ def halves(views: Views, view: int) -> tuple[Int[Tensor, "L"], Int[Tensor, "R"]]
     return first, second
 
 
-def rays_of(views: Views, places: Int[Tensor, "R"]) -> tuple[Rays, Int[Tensor, "R"]]:
-    """Rays through pixels, and the photos they belong to."""
-    view = torch.searchsorted(views.starts, places, right=True) - 1
-    pixel, width = places - views.starts[view], views.widths[view]
-    return views.cameras.rays(view, pixel // width, pixel % width), view
-
-
 def fitted(system: NeRF3D, views: Views, places: Int[Tensor, "P"], corrections: Corrections) -> None:
     """Finds corrections with which a field, that stays as it is, fits these pixels best."""
     field = copy.deepcopy(system.field).requires_grad_(False)
     optimizer = torch.optim.Adam(corrections.groups, betas=(0.9, 0.99))
     started = [group["lr"] for group in optimizer.param_groups]
     generator = step_generator(system.seed, Stream.STUDY, 1, system.device)
-    with counted(STEPS, "aligning held-out photos") as count:
-        for step in range(STEPS):
-            for group, rate in zip(optimizer.param_groups, started, strict=True):
-                group["lr"] = rate * corrections.FINAL ** (step / STEPS)
-            some = places[torch.randint(len(places), (RAYS,), generator=generator, device=places.device)]
-            given, view = rays_of(views, some)
-            rays, behind = corrections.rays(given, view), system.renderer.backgrounds(RAYS)
-            with torch.no_grad():
-                samples = system.sampler(rays.detach(), field.density)
-            seen = system.renderer(rays, samples, field, behind)
-            rgb = corrections.lit(seen.rgb, seen.opacity, behind, view)
-            optimizer.zero_grad()
-            torch.nn.functional.mse_loss(rgb, over(views.pixels[some], behind)).backward()
-            optimizer.step()
-            count(1)
+    for step in tracked(range(STEPS), STEPS, "aligning held-out photos"):
+        for group, rate in zip(optimizer.param_groups, started, strict=True):
+            group["lr"] = rate * corrections.FINAL ** (step / STEPS)
+        some = places[torch.randint(len(places), (RAYS,), generator=generator, device=places.device)]
+        given, view = rays_through(views, some)
+        rays, behind = corrections.rays(given, view), system.renderer.backgrounds(RAYS)
+        with torch.no_grad():
+            samples = system.sampler(rays.detach(), field.density)
+        seen = system.renderer(rays, samples, field, behind)
+        rgb = corrections.lit(seen.rgb, seen.opacity, behind, view)
+        optimizer.zero_grad()
+        torch.nn.functional.mse_loss(rgb, over(views.pixels[some], behind)).backward()
+        optimizer.step()
 
 
 @torch.inference_mode(False)  # a trainer's test is without gradients
@@ -75,7 +66,7 @@ def aligned_psnr(system: NeRF3D, views: Views) -> list[float]:
         fitted(system, views, torch.cat([part[side] for part in parts]), corrections)
         with torch.no_grad():
             for view, part in enumerate(parts):
-                given, of = rays_of(views, part[1 - side])
+                given, of = rays_through(views, part[1 - side])
                 seen, behind = system.render(corrections.rays(given, of)), system.renderer.backgrounds(len(of))
                 rgb = corrections.lit(seen.rgb, seen.opacity, behind, of).clamp(0, 1)
                 squares[view] += float((rgb - over(views.pixels[part[1 - side]], behind)).square().sum())
