@@ -8,11 +8,13 @@ import json
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 
 from nerf_lightning.callbacks import Checkpoints
 from nerf_lightning.config.compose import composed
+from nerf_lightning.refine import corrections
 from nerf_lightning.system import aligned
 from nerf_lightning.training.train import train
 
@@ -25,7 +27,7 @@ PICTURE = [
     *("callbacks.training_gif=null", "callbacks.charts=null"),
 ]
 MODELS = {
-    "hashgrid": [*SCENE, "model.levels=3", "model.finest=32", "model.log2_entries=10", "model.width=16"],
+    "hashgrid": [*SCENE, "refine=auto", "model.levels=3", "model.finest=32", "model.log2_entries=10", "model.width=16"],
     "voxels": [*SCENE, "recipe=voxels_small", "model.coarsest=8", "model.finest=16", "model.grown=1"],
     "tensorf": [*SCENE, "refine=both", "recipe=tensorf_small", "model.coarsest=8", "model.finest=16", "model.grown=1"],
     "mlp": [*SCENE, "recipe=mlp_small", "model.width=16"],
@@ -45,6 +47,7 @@ class Stop(Exception):
     """Training is to end here."""
 
 
+@patch.object(corrections, "WORTHWHILE", -1.0)  # refine=auto begins with its first trial
 def fingerprints(folder: Path, stop: int) -> dict[str, str]:
     save = Checkpoints.on_train_batch_end
 

@@ -20,7 +20,7 @@ from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
 from nerf_lightning.dataset import PictureBatch, Scene
-from nerf_lightning.system import NeRF2D, NeRF3D, System, aligned_psnr, mse_to_psnr
+from nerf_lightning.system import NeRF2D, NeRF3D, System, aligned_psnr, misfits, mse_to_psnr, psnr_of_photos
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.machine import describe_machine
 
@@ -104,6 +104,8 @@ class Results(L.Callback):
         self.views: list[dict[str, float]] = []
         self.aligned: list[float] = []
         """PSNR of held-out photos with their own corrections, where training photos had such."""
+        self.misfits: list[dict[str, Any]] | None = None
+        """Training photos that do not fit."""
         self.summary: dict[str, Any] = {}
         """What was written last."""
 
@@ -119,8 +121,13 @@ class Results(L.Callback):
         quality = fmean(view["psnr"] for view in self.views)
         plain = fmean(view["plain_psnr"] for view in self.views)
         scene = data_of(trainer).scene
-        if isinstance(pl_module, NeRF3D) and pl_module.corrections is not None and isinstance(scene, Scene):
-            self.aligned = aligned_psnr(pl_module, scene.val)
+        if isinstance(pl_module, NeRF3D) and isinstance(scene, Scene):
+            if pl_module.corrections is not None and pl_module.corrections.since:
+                self.aligned = aligned_psnr(pl_module, scene.val)
+            by_photo = psnr_of_photos(pl_module, scene.train)
+            self.misfits = [
+                {"photo": scene.train.name(i), "number": i, "psnr": round(by_photo[i], 2)} for i in misfits(by_photo)
+            ]
         nothing = min(plain + NO_BETTER, SEEN_AS_EQUAL)
         stopped = "stopped_early" if Budget.of(trainer).progress(trainer.global_step) < 1.0 else "finished"
         broken = [name for name, value in pl_module.named_parameters() if not value.isfinite().all()]
@@ -190,6 +197,7 @@ class Results(L.Callback):
             "curve": curve,
             "warnings": self.warnings,
             "plateau": budget.stopped,
+            "misfits": self.misfits,
             "corrections": None if corrections is None else corrections.summary(),
             "recoveries": [asdict(one) for one in guard.recoveries] if guard is not None else [],
             "status": status,

@@ -94,6 +94,10 @@ class Views:
         start = self._cuts[view]
         return self.pixels[start : start + width * height].view(height, width, -1)
 
+    def name(self, view: int) -> str:
+        """Of a photo's file, or its number."""
+        return self.names[view] if self.names else f"photo {view}"
+
     @property
     def images(self) -> UInt8[Tensor, "V H W C"]:
         """All photos, where they have one size; no copy.

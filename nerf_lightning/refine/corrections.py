@@ -18,6 +18,16 @@ DAMPING = 1.0
 """See `whitening`. A turn and a move of a camera that undo each other in the photo are told apart slowly, and surely."""
 START = 0.05
 """Share of the training before which nothing is corrected: photos cannot fit a field that shows nothing yet."""
+TRIALS = (0.1, 0.2, 0.4)
+"""Shares of it at which `auto` tries what it does not correct yet: small faults show when the field is sharp."""
+FAR, FASTER = 4.0, 3.0
+"""Root mean square of how far the content has moved in the photos, in pixels, above which rates rise with it, and by how much
+at most: what is far off would else not arrive."""
+WORTHWHILE = 0.01
+"""Share by which the squared error has to fall; what there is nothing to gain from raises it."""
+FOCUSED = 0.4
+"""Share of the training that it takes, once poses are corrected, until the field shows all of its detail."""
+PARAMETERS = {"poses": "motions", "light": "log_gains"}
 
 
 class Corrections(torch.nn.Module):
@@ -30,6 +40,7 @@ class Corrections(torch.nn.Module):
         light: whether photos have gains.
         pose_rate: learning rate of poses, in pixels that the content moves a step.
         light_rate: learning rate of the gains' logarithms.
+        auto: whether each is corrected from the first trial on that shows that it helps, and else not; see `due` and `note`.
         centred: whether the means over the photos stay zero, so that a scene neither drifts away nor grows brighter; photos
             of a field that is already there have their own.
 
@@ -49,38 +60,93 @@ class Corrections(torch.nn.Module):
         light: bool = True,
         pose_rate: float = 0.1,
         light_rate: float = 0.003,
+        auto: bool = False,
         centred: bool = True,
     ):
         super().__init__()
         if not (poses or light):
             raise InputError("refine.poses", "", "false, with refine.light=false", "one of them", "or give refine=null")
+        self.given_rates = pose_rate, light_rate
         for name, rate in (("pose_rate", pose_rate), ("light_rate", light_rate)):
             if not rate > 0:
                 raise InputError(f"refine.{name}", "", str(rate), "above 0")
+        rates = ("poses", pose_rate, poses), ("light", light_rate, light)
         corners = torch.rand(PLACES, 3, dtype=torch.float64, generator=step_generator(0, Stream.STUDY, 0))
         places = bounds.centre.cpu().double() + bounds.half_size.cpu().double() * (2 * corners - 1)
         shifts = pixel_shifts(cameras.centres.cpu().double(), cameras.K[:, 0, 0].cpu().double(), places)
         self.register_buffer("scales", whitening(shifts, DAMPING).float())
-        self.motions = torch.nn.Parameter(torch.zeros(len(cameras), 6), requires_grad=poses)
-        self.log_gains = torch.nn.Parameter(torch.zeros(len(cameras), 3), requires_grad=light)
+        self.motions = torch.nn.Parameter(torch.zeros(len(cameras), 6), requires_grad=False)
+        self.log_gains = torch.nn.Parameter(torch.zeros(len(cameras), 3), requires_grad=False)
         self.centred = centred
-        self.rates = {"motions": pose_rate, "log_gains": light_rate}
+        self.rates = {name: rate for name, rate, wanted in rates if wanted}
+        self.auto = auto
+        self.tried = 0
+        """Trials so far."""
+        self.worth: dict[str, float] = {}
+        """What the last of them said, see `note`."""
+        self.since: dict[str, float] = {}
+        """What is corrected, and from which progress on."""
+        if not auto:
+            self.begin(START, *self.rates)
+
+    def begin(self, progress: float, *names: str) -> None:
+        """Corrects poses or light from now on."""
+        for name in names:
+            self.since[name] = progress
+            self.get_parameter(PARAMETERS[name]).requires_grad_(True)
+
+    def due(self, progress: float) -> bool:
+        """Whether it is time for a trial."""
+        undecided = self.auto and len(self.since) < len(self.rates)
+        return undecided and self.tried < len(TRIALS) and progress >= TRIALS[self.tried]
+
+    def note(self, progress: float, worth: dict[str, float]) -> None:
+        """Takes in what a trial said: by what share the squared error would fall if poses, or light, were corrected."""
+        self.tried = sum(progress >= share for share in TRIALS)
+        open_yet = [name for name in self.rates if name not in self.since]
+        self.worth |= {name: worth[name] for name in open_yet}
+        self.begin(progress, *(name for name in open_yet if worth[name] > WORTHWHILE))
+
+    def decided(self) -> dict[str, Any]:
+        """What the state of the parameters does not say, for `decide`."""
+        return {"tried": self.tried, "worth": self.worth, "since": self.since}
+
+    def decide(self, decided: dict[str, Any]) -> None:
+        """Goes on as decided before."""
+        self.tried, self.worth = int(decided["tried"]), dict(decided["worth"])
+        for name, progress in decided["since"].items():
+            self.begin(progress, name)
 
     @property
     def groups(self) -> list[dict[str, Any]]:
-        """The optimiser's groups: what is corrected, each with its learning rate."""
-        free = [(name, parameter) for name, parameter in self.named_parameters() if parameter.requires_grad]
-        return [{"params": [parameter], "lr": self.rates[name]} for name, parameter in free]
+        """The optimiser's groups: what is or may be corrected, each with its learning rate."""
+        return [{"params": [self.get_parameter(PARAMETERS[name])], "lr": rate} for name, rate in self.rates.items()]
 
     def alike(self, cameras: Cameras, bounds: Bounds) -> "Corrections":
-        """Of the same kind, for photos of the field that was trained with these."""
-        poses, light = self.motions.requires_grad, self.log_gains.requires_grad
-        pose_rate, light_rate = self.rates.values()
-        return Corrections(cameras, bounds, poses, light, pose_rate, light_rate, centred=False)
+        """With what is corrected here, for photos of the field that was trained with these."""
+        poses, light = ("poses" in self.since), ("light" in self.since)
+        return Corrections(cameras, bounds, poses, light, *self.given_rates, centred=False)
 
-    def schedule(self, progress: float) -> float:
-        """Factor on the rates by progress in training: nothing at first, then from 1 down to `FINAL`."""
-        return 0.0 if progress < START else self.FINAL ** ((progress - START) / (1 - START))
+    def factors(self, progress: float) -> list[float]:
+        """On the rates of `groups`, by progress in training: nothing at first, then from 1 down to `FINAL`."""
+        return [self._factor(name, self.since.get(name), progress) for name in self.rates]
+
+    def _factor(self, name: str, start: float | None, progress: float) -> float:
+        if start is None or progress < start:
+            return 0.0
+        return self.pace(name) * self.FINAL ** ((progress - start) / (1 - start))
+
+    def pace(self, name: str) -> float:
+        """Factor on the rate of poses, by how far they have moved."""
+        if name != "poses":
+            return 1.0
+        moved = float(self.motions.detach().square().sum(1).mean().sqrt())  # in pixels, as they are whitened
+        return min(FASTER, max(1.0, moved / FAR))
+
+    def focus(self, progress: float) -> float:
+        """How much detail of the field cameras may be corrected by; 1 is all, see `Field.focus`."""
+        start = self.since.get("poses")
+        return 1.0 if start is None else min(1.0, (progress - start) / FOCUSED)
 
     def _own(self, values: Float[Tensor, "V K"]) -> Float[Tensor, "V K"]:
         """Without their mean, if that is to be zero."""
@@ -111,12 +177,17 @@ class Corrections(torch.nn.Module):
         opacity: Float[Tensor, "R"],
         backgrounds: Float[Tensor, "R 3"],
         views: Int[Tensor, "R"],
+        truth: Float[Tensor, "R 3"] | None = None,
     ) -> Float[Tensor, "R 3"]:
-        """Rendered colours as these photos show them; what is behind stays as it is."""
+        """Rendered colours as these photos show them; what is behind stays as it is.
+
+        Where a photo's own colours are given and are burnt out (1), those that are brighter still count as equal.
+        """
         if not self.log_gains.requires_grad:
             return rgb
         behind = (1 - opacity)[:, None] * backgrounds
-        return (rgb - behind) * self.gains.index_select(0, views) + behind
+        found = (rgb - behind) * self.gains.index_select(0, views) + behind
+        return found if truth is None else torch.where(truth >= 1, found.clamp_max(1), found)
 
     @torch.no_grad()
     def cameras(self, given: Cameras) -> Cameras:
@@ -131,11 +202,15 @@ class Corrections(torch.nn.Module):
     def told(self) -> str:
         """In a line, what was found."""
         found, said = self.summary(), []
-        if self.motions.requires_grad:
+        if "poses" in self.since:
             turned_by, moved_by = max(found["turned_degrees"]), max(found["moved"])
             said.append(f"cameras turned by up to {turned_by:.2f} degrees and moved by up to {moved_by:.3g}")
-        if self.log_gains.requires_grad:
+        if "light" in self.since:
             said.append(f"exposure from {min(found['exposure']):.2f} to {max(found['exposure']):.2f}")
+        for name in self.rates:
+            if name not in self.since:
+                share = max(0.0, self.worth.get(name, 0.0))
+                said.append(f"{name} as given (corrections would lower the error by {share:.1%})")
         return "refine: " + "; ".join(said)
 
     @torch.no_grad()

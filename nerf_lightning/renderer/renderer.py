@@ -145,7 +145,7 @@ class VolumeRenderer(torch.nn.Module):
             distance = opacity * median_depth(density, opacity, samples)
         colour = torch.addcmul(summed, (1 - opacity)[:, None], backgrounds)
         penalty, weights = None, None
-        if density.requires_grad and self.penalises:
+        if self.training and density.requires_grad and self.penalises:
             weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
             penalty = self.penalty(weights, samples, view_part[0] if view_part else None)
         elif samples.proposals is not None:

@@ -41,13 +41,35 @@ def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
     return replace(scene, train=train, val=val, orbit=placed(scene.orbit), bounds=frame.bounds, to_source=to_source)
 
 
-def data_again(cfg: DictConfig, scene: Mapping[str, Any], photos: str | None = None) -> RayDataModule | PixelDataModule:
+def seen_by_corrected(scene: Scene, content: Mapping[str, Any]) -> Scene:
+    """A run's scene with its training cameras as the training has corrected them, if it has.
+
+    Raises:
+        InputError: where those are not as many poses as there are photos.
+    """
+    if "corrected" not in content:
+        return scene
+    cameras = scene.train.cameras
+    try:
+        c2w = torch.tensor(content["corrected"], dtype=torch.float32).view(len(cameras), 4, 4)
+    except (ValueError, TypeError, RuntimeError) as error:
+        expected = f"{len(cameras)} poses, one of each training photo"
+        raise InputError(
+            "scene.json", "corrected", str(error), expected, "have photos been added or removed?"
+        ) from error
+    return replace(scene, train=replace(scene.train, cameras=replace(cameras, c2w=c2w)))
+
+
+def data_again(
+    cfg: DictConfig, scene: Mapping[str, Any], photos: str | None = None, corrected: bool = True
+) -> RayDataModule | PixelDataModule:
     """The data module of a run. The network is never used, as the run may be a stranger's.
 
     Args:
         cfg: the run's configuration.
         scene: what its scene.json says.
         photos: a file or folder of others; None takes those it was trained on.
+        corrected: whether those are seen by cameras as training has corrected them.
 
     Raises:
         InputError: if they are gone, or have changed.
@@ -61,6 +83,8 @@ def data_again(cfg: DictConfig, scene: Mapping[str, Any], photos: str | None = N
     data = build_data(at_hand, photos)
     if isinstance(data, RayDataModule):
         data.scene = in_frame_of(data.scene, scene)
+        if photos is None and corrected:
+            data.scene = seen_by_corrected(data.scene, scene)
     name = scene.get("name", data.scene.name)
     if photos is None and data.scene.name != name:
         expected = f"{name!r}, which the run was trained on"

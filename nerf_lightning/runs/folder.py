@@ -1,7 +1,7 @@
 """The run folder: what a run writes, and how it is read back without trusting it.
 
 config.yaml            the resolved configuration
-scene.json             bounds, background and orbit of the scene, so that rendering needs no photos
+scene.json             bounds, background and orbit of the scene, so that rendering needs no photos; corrected cameras
 checkpoints/           last.ckpt, best.ckpt: tensors and plain values only
 results.json           see callbacks/results.py
 snapshots/ orbit.gif   pictures
@@ -70,9 +70,12 @@ def load_config(folder: Path) -> DictConfig:
     return OmegaConf.create(checked)
 
 
-def save_scene(data: RayDataModule | PixelDataModule, folder: Path) -> None:
-    """Writes what rendering needs of the scene, without its photos."""
-    write_json(folder / "scene.json", scene_content(data))
+def save_scene(data: RayDataModule | PixelDataModule, folder: Path, corrected: Cameras | None = None) -> None:
+    """Writes what rendering needs of the scene, without its photos, and the training cameras if training has corrected them."""
+    content = scene_content(data)
+    if corrected is not None:
+        content["corrected"] = corrected.c2w.tolist()
+    write_json(folder / "scene.json", content)
 
 
 def scene_content(data: RayDataModule | PixelDataModule) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Stage 6, systems: LightningModules that hold step, loss, metrics and optimiser, and nothing else."""
 
 from nerf_lightning.system.aligned import aligned_psnr
+from nerf_lightning.system.fits import misfits, psnr_of_photos
 from nerf_lightning.system.metrics import mse_to_psnr, psnr, ssim
 from nerf_lightning.system.nerf2d import NeRF2D
 from nerf_lightning.system.nerf3d import NeRF3D
@@ -16,8 +17,10 @@ __all__ = [
     "aligned_psnr",
     "constant",
     "cosine",
-    "mse_to_psnr",
     "exponential",
+    "misfits",
+    "mse_to_psnr",
     "psnr",
+    "psnr_of_photos",
     "ssim",
 ]

@@ -1,7 +1,5 @@
 """Held-out photos whose own cameras and light are corrected too: half of a photo decides, the other half is scored."""
 
-import copy
-
 import torch
 from jaxtyping import Int
 from torch import Tensor
@@ -30,8 +28,7 @@ def halves(views: Views, view: int) -> tuple[Int[Tensor, "L"], Int[Tensor, "R"]]
 
 def fitted(system: NeRF3D, views: Views, places: Int[Tensor, "P"], corrections: Corrections) -> None:
     """Finds corrections with which a field, that stays as it is, fits these pixels best."""
-    field = copy.deepcopy(system.field).requires_grad_(False)
-    optimizer = torch.optim.Adam(corrections.groups, betas=(0.9, 0.99))
+    see, optimizer = system.as_it_is(), torch.optim.Adam(corrections.groups, betas=(0.9, 0.99))
     started = [group["lr"] for group in optimizer.param_groups]
     generator = step_generator(system.seed, Stream.STUDY, 1, system.device)
     for step in tracked(range(STEPS), STEPS, "aligning held-out photos"):
@@ -39,13 +36,12 @@ def fitted(system: NeRF3D, views: Views, places: Int[Tensor, "P"], corrections: 
             group["lr"] = rate * corrections.FINAL ** (step / STEPS)
         some = places[torch.randint(len(places), (RAYS,), generator=generator, device=places.device)]
         given, view = rays_through(views, some)
-        rays, behind = corrections.rays(given, view), system.renderer.backgrounds(RAYS)
-        with torch.no_grad():
-            samples = system.sampler(rays.detach(), field.density)
-        seen = system.renderer(rays, samples, field, behind)
-        rgb = corrections.lit(seen.rgb, seen.opacity, behind, view)
+        behind = system.renderer.backgrounds(RAYS)
+        seen = see(corrections.rays(given, view), behind)
+        truth = over(views.pixels[some], behind)
+        rgb = corrections.lit(seen.rgb, seen.opacity, behind, view, truth)
         optimizer.zero_grad()
-        torch.nn.functional.mse_loss(rgb, over(views.pixels[some], behind)).backward()
+        torch.nn.functional.mse_loss(rgb, truth).backward()
         optimizer.step()
 
 

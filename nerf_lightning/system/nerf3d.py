@@ -17,6 +17,7 @@ from nerf_lightning.renderer import Rendered, VolumeRenderer, over
 from nerf_lightning.sampler import Sampler, split
 from nerf_lightning.system.compiled import part
 from nerf_lightning.system.system import CHUNK, MakeOptimizer, Schedule, StepStats, System
+from nerf_lightning.system.trial import See, worth
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 RAYS = 8
@@ -76,9 +77,12 @@ class NeRF3D(System):
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
         if self.corrections is not None:
-            factor = self.corrections.schedule(self.progress) * self.rate
-            for group in self.parameter_groups[1:]:
-                group["lr"] = group["initial_lr"] * factor
+            if self.corrections.due(self.progress):
+                self.try_corrections()
+            self.field.focus(max(0.0, self.corrections.focus(self.progress)))
+            factors = self.corrections.factors(self.progress)
+            for group, factor in zip(self.parameter_groups[1:], factors, strict=True):
+                group["lr"] = group["initial_lr"] * factor * self.rate
         self.renderer.fade(self.progress)
         replaced = self.field.grow(self.progress)
         if replaced:
@@ -88,6 +92,35 @@ class NeRF3D(System):
                 optimizer.state.pop(parameter, None)
             if self.backend is not None:
                 self.rehearse(batch)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        if self.corrections is not None:
+            checkpoint["corrections"] = self.corrections.decided()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        if self.corrections is not None:
+            self.corrections.decide(checkpoint["corrections"])
+
+    def as_it_is(self) -> See:
+        """Renders without randomness and with gradient in the rays alone: the field does not learn from it."""
+        field, renderer = copy.deepcopy(self.field).requires_grad_(False), copy.deepcopy(self.renderer).eval()
+
+        def see(rays: Rays, behind: Tensor) -> Rendered:
+            with torch.no_grad():
+                samples = self.sampler(rays.detach(), field.density)
+            return renderer(rays, samples, field, behind)
+
+        return see
+
+    def try_corrections(self) -> None:
+        """Corrects cameras and light from now on, if that would help."""
+        assert self.corrections is not None  # asked for by the caller
+        views, generator = (
+            self.data.scene.train.to(self.device),
+            step_generator(self.seed, Stream.TRIAL, self.global_step, self.device),
+        )
+        found = worth(self.as_it_is(), views, self.renderer.colour, self.corrections, generator)
+        self.corrections.note(self.progress, found)
 
     def rehearse(self, batch: RayBatch) -> None:
         """Runs a step on a copy with the clock stopped: compiling for a new size does not count as training."""
@@ -114,7 +147,7 @@ class NeRF3D(System):
         truth, rgb = over(batch.pixels, backgrounds), rendered.rgb
         if corrections is not None:
             assert batch.views is not None
-            rgb = corrections.lit(rgb, rendered.opacity, backgrounds, batch.views)
+            rgb = corrections.lit(rgb, rendered.opacity, backgrounds, batch.views, truth)
         # A ray without all of its samples must not be learned from.
         rgb = rgb if samples.whole is None else torch.where(samples.whole[:, None], rgb, truth)
         loss = torch.nn.functional.mse_loss(rgb, truth)

@@ -42,6 +42,8 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 
 SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
 """Figures shown beside the options in TensorBoard's HParams tab."""
+NAMED = 10
+"""Photos that do not fit which are printed; all stand in results.json."""
 log = logging.getLogger(__name__)
 LATER = {"device": "auto", "compile": False, "limits": {"batch": None, "chunk": None}}
 """Options that runs of earlier versions lack, and that may be given when they are resumed."""
@@ -74,7 +76,7 @@ def train(
     if cfg.compile:
         check_compiler(device, BACKEND)
     if resumed:
-        data = data_again(cfg, load_scene(folder)[0], cfg.dataset.get("path"))
+        data = data_again(cfg, load_scene(folder)[0], cfg.dataset.get("path"), corrected=False)
     elif scene is None:
         data = build_data(cfg)
     else:
@@ -100,8 +102,16 @@ def train(
     trainer.test(system, data, verbose=False)
     if trainer.is_global_zero:
         if isinstance(system, NeRF3D) and system.corrections is not None:
+            assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
+            if "poses" in system.corrections.since:
+                save_scene(data, folder, system.corrections.cameras(data.scene.train.cameras))
             found = results.summary["psnr_aligned"]
-            print(f"{system.corrections.told()}; {found:.2f} dB held out with held-out photos corrected too")
+            aligned = "" if found is None else f"; {found:.2f} dB held out with held-out photos corrected too"
+            print(system.corrections.told() + aligned)
+        if results.misfits:
+            named = ", ".join(f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results.misfits[:NAMED])
+            rest = f" and {len(results.misfits) - NAMED} more" if len(results.misfits) > NAMED else ""
+            print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}{rest}")
         if trainer.logger is not None:
             log_hyperparameters(trainer.logger, cfg, results.summary)
         report(results.summary, folder)

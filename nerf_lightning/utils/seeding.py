@@ -20,6 +20,8 @@ class Stream(IntEnum):
     """Fresh weights after a breakdown."""
     STUDY = 4
     """Experiments on a scene or a trained field: damage, other samplers."""
+    TRIAL = 5
+    """Pixels that decide whether cameras and light are corrected."""
 
 
 def step_generator(seed: int, stream: Stream, step: int, device: torch.device | str = "cpu") -> torch.Generator:

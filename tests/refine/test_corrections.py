@@ -6,22 +6,23 @@ from pathlib import Path
 
 import pytest
 import torch
+from blob import BOX, around_it, blob
 from torch import Tensor
 
 import nerf_lightning as nl
-from nerf_lightning.cameras import Bounds, Cameras, Rays
-from nerf_lightning.cameras.orbit import look_at
+from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import VolumeRenderer
+from nerf_lightning.runs.data import data_again
+from nerf_lightning.runs.folder import load_config, load_scene
 from nerf_lightning.sampler import Samples, UniformSampler
 from nerf_lightning.system import aligned
 from nerf_lightning.training.train import train
 
-BOX = Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3]))
 VIEWS, SIZE = 5, 12
 """Photos, and pixels along a side of each."""
 STEPS = 300
@@ -30,19 +31,11 @@ STEPS = 300
 @pytest.fixture
 def cameras() -> Cameras:
     """Around the box, looking at its centre."""
-    centres = 3 * torch.nn.functional.normalize(torch.randn(VIEWS, 3), dim=1)
-    K = torch.tensor([[1.2 * SIZE, 0, SIZE / 2], [0, 1.2 * SIZE, SIZE / 2], [0, 0, 1]])
-    return Cameras.of_size(K.repeat(VIEWS, 1, 1), look_at(centres, torch.zeros(3), torch.eye(3)[2]), SIZE, SIZE)
+    return around_it(VIEWS, SIZE)
 
 
 def some_pixels(count: int) -> tuple[Tensor, Tensor, Tensor]:
     return torch.randint(0, VIEWS, (count,)), torch.randint(0, SIZE, (count,)), torch.randint(0, SIZE, (count,))
-
-
-def blob(positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """A ball with soft borders, whose colour changes from place to place."""
-    density = 8 * torch.sigmoid(8 * (0.7 - positions.norm(dim=1)))
-    return density, torch.sigmoid(4 * torch.sin(3 * positions + torch.tensor([0, 1, 2]).to(positions)))
 
 
 def test_at_the_start_nothing_is_corrected_and_means_stay_zero(cameras: Cameras):
@@ -160,6 +153,14 @@ def test_a_run_says_what_it_corrected_and_is_rendered_without_its_photos(tmp_pat
     assert {key: len(value) for key, value in found.items()} == {"turned_degrees": 4, "moved": 4, "exposure": 4}
     assert max(found["turned_degrees"]) > 0 and min(found["exposure"]) < 1 < max(found["exposure"])
     assert nl.load_run(tmp_path, "cpu").system.corrections is None
+    again = [
+        data_again(load_config(tmp_path), load_scene(tmp_path)[0], corrected=which).scene for which in (True, False)
+    ]
+    moved, given = ([poses.train.cameras.centres for poses in again][i] for i in (0, 1))
+    torch.testing.assert_close((moved - given).norm(dim=1), torch.tensor(found["moved"]), atol=2e-5, rtol=0)
+    assert found["moved"][0] > 0 and torch.equal(again[0].val.cameras.c2w, again[1].val.cameras.c2w)
+    with pytest.raises(InputError, match="corrected.*4 poses, one of each training photo"):
+        data_again(load_config(tmp_path), {**load_scene(tmp_path)[0], "corrected": [1.0]})
 
 
 @pytest.mark.parametrize(

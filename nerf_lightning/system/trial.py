@@ -1,0 +1,135 @@
+"""Whether corrections are worth their while: a least-squares step on some pixels of each photo, judged on others."""
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Generator, Tensor
+
+from nerf_lightning.cameras import Rays
+from nerf_lightning.dataset import Views
+from nerf_lightning.dataset.rays import rays_through
+from nerf_lightning.refine import Corrections
+from nerf_lightning.renderer import Rendered, over
+from nerf_lightning.utils.evenly import evenly
+
+PHOTOS, PIXELS = 64, 128
+"""How many photos are looked at, and pixels of each that decide; as many others judge."""
+DAMPING = 0.3
+"""Share of each unknown's own effect that is added to the normal equations (Levenberg and Marquardt)."""
+TINY = 1e-6
+"""Likewise, of the mean over a photo's unknowns: some have no effect at all."""
+POSES, LIGHT = slice(0, 6), slice(6, 9)
+"""Columns of the unknowns: a camera's `motions`, then its `log_gains`."""
+See = Callable[[Rays, Float[Tensor, "R 3"]], Rendered]
+"""Renders rays onto backgrounds, with gradient in the rays."""
+
+
+class Pixels(NamedTuple):
+    """P pixels of each of V photos, photo by photo."""
+
+    rays: Rays
+    views: Int[Tensor, "VP"]
+    truth: Float[Tensor, "VP 3"]
+    behind: Float[Tensor, "VP 3"]
+    known: Bool[Tensor, "VP"]
+    """Whether they count."""
+
+
+def some_pixels(
+    views: Views, chosen: Sequence[int], count: int, behind: Float[Tensor, "3"], generator: Generator
+) -> Pixels:
+    """Random pixels of some photos, as many of each, drawn with replacement."""
+    photos = torch.tensor(chosen, device=behind.device)
+    share = torch.rand(len(chosen), count, generator=generator, device=behind.device)
+    first, last = views.starts[photos, None], views.starts[photos + 1, None] - 1
+    places = torch.minimum(first + (share * (last - first + 1)).long(), last).flatten()
+    rays, view = rays_through(views, places)
+    backgrounds = behind.expand(len(places), 3)
+    return Pixels(rays, view, over(views.pixels[places], backgrounds), backgrounds, views.mask[places])
+
+
+def squared_errors(see: See, corrections: Corrections | None, pixels: Pixels, photos: int) -> Float[Tensor, "V"]:
+    """Of each photo: the sum over its known pixels and their channels."""
+    with torch.no_grad():
+        rays = pixels.rays if corrections is None else corrections.rays(pixels.rays, pixels.views)
+        seen = see(rays, pixels.behind)
+        rgb = seen.rgb
+        if corrections is not None:
+            rgb = corrections.lit(rgb, seen.opacity, pixels.behind, pixels.views)
+        rgb = rgb.clamp(0, 1)
+        return ((rgb - pixels.truth).square().sum(1) * pixels.known).view(photos, -1).sum(1)
+
+
+def derivatives(
+    see: See, corrections: Corrections, pixels: Pixels, photos: int
+) -> tuple[Float[Tensor, "V N 1"], Float[Tensor, "V N 9"]]:
+    """What is left to explain of each pixel's channels, and how they follow their photo's `motions` and `log_gains`."""
+    with torch.no_grad():
+        rays = corrections.rays(pixels.rays, pixels.views)
+    origins, directions = (x.detach().requires_grad_() for x in (rays.origins, rays.directions))
+    with torch.enable_grad():
+        seen = see(Rays(origins, directions), pixels.behind)
+        rgb = corrections.lit(seen.rgb, seen.opacity, pixels.behind, pixels.views, pixels.truth)
+        by = [torch.autograd.grad(rgb[:, c].sum(), (origins, directions), retain_graph=c < 2) for c in range(3)]
+    with torch.no_grad():
+        moves, turns = (torch.stack(found, dim=1) for found in zip(*by, strict=True))
+        turns = torch.linalg.cross(directions[:, None].expand_as(turns), turns, dim=2)
+        by_motion = torch.cat([turns, moves], dim=2) @ corrections.scales.index_select(0, pixels.views)
+        lit = rgb - (1 - seen.opacity)[:, None] * pixels.behind
+        counted = pixels.known[:, None].float()
+        jacobian = torch.cat([by_motion, torch.diag_embed(lit)], dim=2) * counted[..., None]
+        return ((pixels.truth - rgb) * counted).view(photos, -1, 1), jacobian.view(photos, -1, 9)
+
+
+def least_squares(left: Float[Tensor, "V N 1"], jacobian: Float[Tensor, "V N K"]) -> Float[Tensor, "V K"]:
+    """Of each photo, the change of its K unknowns that explains most of what is left."""
+    square = jacobian.mT @ jacobian
+    own = square.diagonal(dim1=1, dim2=2)
+    damping = DAMPING * own + TINY * own.mean(1, keepdim=True) + torch.finfo(own.dtype).tiny ** 0.5
+    return torch.linalg.solve(square + torch.diag_embed(damping), jacobian.mT @ left)[..., 0]
+
+
+def changed(
+    corrections: Corrections, chosen: Sequence[int], motions: Tensor | None, log_gains: Tensor | None
+) -> Corrections:
+    """Corrections with these changes of some photos; all others change by their mean, which `centred` takes off."""
+    trial = copy.deepcopy(corrections)
+    with torch.no_grad():
+        for parameter, change in ((trial.motions, motions), (trial.log_gains, log_gains)):
+            if change is not None:
+                parameter.requires_grad_(True)
+                parameter.add_(change.mean(0))
+                parameter[chosen] += change - change.mean(0)
+    return trial
+
+
+def worth(
+    see: See, views: Views, behind: Float[Tensor, "3"], corrections: Corrections, generator: Generator
+) -> dict[str, float]:
+    """By what share of itself the squared error falls on pixels that did not decide, if a field that stays as it is may be seen
+    by corrected cameras ("poses") and in corrected light ("light"), each besides the other.
+
+    Args:
+        see: renders.
+        views: the training photos.
+        behind: the colour behind the scene.
+        corrections: those that there are already; they are not changed.
+        generator: of the pixels.
+    """
+    chosen = evenly(len(views), PHOTOS)
+    deciding, judging = (some_pixels(views, chosen, PIXELS, behind, generator) for _ in range(2))
+    left, jacobian = derivatives(see, corrections, deciding, len(chosen))
+
+    def error(motions: Tensor | None, log_gains: Tensor | None) -> float:
+        trial = changed(corrections, chosen, motions, log_gains)
+        return float(squared_errors(see, trial, judging, len(chosen)).sum())
+
+    both = least_squares(left, jacobian)
+    as_it_is = max(error(None, None), torch.finfo(torch.float32).tiny)
+    corrected = error(both[:, POSES], both[:, LIGHT])
+    only_poses = error(least_squares(left, jacobian[..., POSES]), None)
+    only_light = error(None, least_squares(left, jacobian[..., LIGHT]))
+    return {"poses": (only_light - corrected) / as_it_is, "light": (only_poses - corrected) / as_it_is}

@@ -1,0 +1,109 @@
+"""Trials of corrections: what they say of photos of a known field, and what follows from it in training."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from blob import BOX, around_it, blob
+from torch import Tensor
+
+from nerf_lightning.cameras import Cameras, Rays
+from nerf_lightning.dataset import Views
+from nerf_lightning.dataset.views import Runs
+from nerf_lightning.refine import Corrections
+from nerf_lightning.refine.corrections import FAR, FASTER, START, TRIALS
+from nerf_lightning.renderer import Rendered, VolumeRenderer
+from nerf_lightning.sampler import UniformSampler
+from nerf_lightning.system.fits import misfits
+from nerf_lightning.system.trial import least_squares, worth
+
+VIEWS, SIZE = 6, 24
+BLACK = torch.zeros(3)
+
+
+def see(rays: Rays, behind: Tensor) -> Rendered:
+    samples = UniformSampler(BOX, 48)(rays.detach(), lambda x: x[:, 0])
+    return VolumeRenderer("black")(rays, samples, blob, behind)
+
+
+@pytest.fixture
+def views() -> Views:
+    """Photos of the blob."""
+    cameras = around_it(VIEWS, SIZE)
+    with torch.no_grad():
+        rays = [cameras.view_rays(view) for view in range(VIEWS)]
+        photos = torch.stack([see(of, BLACK.expand(len(of), 3)).rgb.view(SIZE, SIZE, 3) for of in rays])
+    return Views.of((photos * 255).round().to(torch.uint8), cameras)
+
+
+def tried(views: Views, given: Cameras | None = None) -> dict[str, float]:
+    """What a trial says of these photos, by cameras that may be others than took them."""
+    views = replace(views, cameras=given or views.cameras)
+    corrections = Corrections(views.cameras, BOX, auto=True)
+    before = [p.clone() for p in corrections.parameters()]
+    found = worth(see, views, BLACK, corrections, torch.Generator().manual_seed(1))
+    torch.testing.assert_close(list(corrections.parameters()), before)
+    return found
+
+
+def test_exact_photos_have_nothing_to_gain_and_others_what_is_wrong_with_them(views: Views):
+    wrong = Corrections(views.cameras, BOX)
+    torch.nn.init.normal_(wrong.motions, std=0.5)
+    assert max(tried(views, wrong.cameras(views.cameras)).values()) > 0.5
+    assert tried(views, wrong.cameras(views.cameras))["light"] < 0.1
+    gains = torch.linspace(0.7, 1.3, VIEWS)[:, None, None, None]
+    lit = Views.of((views.images * gains).clamp(0, 255).round().to(torch.uint8), views.cameras)
+    assert tried(lit)["light"] > 0.5 and tried(lit)["poses"] < 0.1
+    noise = torch.randint(-20, 21, views.images.shape)
+    noisy = Views.of((views.images + noise).clamp(0, 255).to(torch.uint8), views.cameras)
+    assert max(tried(noisy).values()) < 0.02  # what is left to explain is not theirs
+
+
+def test_pixels_that_are_masked_do_not_decide(views: Views):
+    """Half of every photo is spoilt, and masked."""
+    images, mask = views.images.clone(), torch.ones(VIEWS, SIZE, SIZE, dtype=torch.bool)
+    images[:, :, SIZE // 2 :] = images[:, :, SIZE // 2 :].roll(3, dims=1)
+    mask[:, :, SIZE // 2 :] = False
+    spoilt = Views.of(images, views.cameras)
+    assert tried(spoilt)["poses"] > 0.1
+    assert tried(replace(spoilt, known=Runs.of(mask.flatten())))["poses"] < 0.02
+
+
+def test_least_squares_are_damped_and_leave_alone_what_has_no_effect():
+    jacobian = torch.randn(2, 50, 3)
+    jacobian[:, :, 2] = 0
+    truth = torch.tensor([[1.0, -2.0, 5.0], [0.5, 3.0, 5.0]])
+    found = least_squares(jacobian @ truth[..., None], jacobian)
+    torch.testing.assert_close(found[:, :2], truth[:, :2], rtol=0.3, atol=0.3)
+    assert not found[:, 2].any()
+
+
+def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Views):
+    corrections = Corrections(views.cameras, BOX, auto=True)
+    assert corrections.factors(1.0) == [0.0, 0.0] and not corrections.since
+    assert not corrections.due(TRIALS[0] - 0.01) and corrections.due(TRIALS[0])
+    corrections.note(TRIALS[0], {"poses": 0.3, "light": 0.005})
+    assert corrections.motions.requires_grad and not corrections.log_gains.requires_grad
+    assert not corrections.due(TRIALS[1] - 0.01) and corrections.due(TRIALS[1])
+    assert corrections.factors(TRIALS[0]) == [1.0, 0.0] and corrections.factors(1.0) == [Corrections.FINAL, 0.0]
+    again = Corrections(views.cameras, BOX, auto=True)
+    again.decide(corrections.decided())
+    assert again.motions.requires_grad and again.decided() == corrections.decided()
+    corrections.note(TRIALS[2], {"poses": 0.0, "light": 0.005})
+    assert not corrections.due(1.0)
+    assert "light as given (corrections would lower the error by 0.5%)" in corrections.told()
+
+
+def test_photos_far_worse_than_the_others_stand_out():
+    assert misfits([30.0, 31.0, 29.0, 30.5, 12.0, 30.2, 14.0]) == [4, 6]
+    assert misfits([30.0, 20.0, 25.0, 15.0, 28.0]) == []
+    assert misfits([float("nan"), 30.0, 30.1, 29.9, 3.0]) == [4]
+
+
+def test_what_is_far_off_moves_faster(views: Views):
+    corrections = Corrections(views.cameras, BOX)
+    assert corrections.factors(START) == [1.0, 1.0]
+    torch.nn.init.constant_(corrections.motions, 2 * FAR / 6**0.5)
+    assert corrections.factors(START) == pytest.approx([2.0, 1.0])
+    torch.nn.init.constant_(corrections.motions, 100.0)
+    assert corrections.factors(START) == [FASTER, 1.0]
