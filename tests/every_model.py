@@ -47,7 +47,7 @@ class Stop(Exception):
     """Training is to end here."""
 
 
-@patch.object(corrections, "WORTHWHILE", -1.0)  # refine=auto begins with its first trial
+@patch.dict(corrections.WORTHWHILE, poses=-1.0, light=-1.0)  # refine=auto begins with its first trial
 def fingerprints(folder: Path, stop: int) -> dict[str, str]:
     save = Checkpoints.on_train_batch_end
 

@@ -20,11 +20,11 @@ START = 0.05
 """Share of the training before which nothing is corrected: photos cannot fit a field that shows nothing yet."""
 TRIALS = (0.1, 0.2, 0.4)
 """Shares of it at which `auto` tries what it does not correct yet: small faults show when the field is sharp."""
-FAR, FASTER = 4.0, 3.0
-"""Root mean square of how far the content has moved in the photos, in pixels, above which rates rise with it, and by how much
-at most: what is far off would else not arrive."""
-WORTHWHILE = 0.01
-"""Share by which the squared error has to fall; what there is nothing to gain from raises it."""
+HURRY, FAR, FASTER = 0.1, 4.0, 3.0
+"""Poses move `FASTER` times as fast for a first share of the training, and then where they have moved far: with the root mean
+square of how far the content has moved in the photos, above `FAR` pixels. What is far off would else not arrive."""
+WORTHWHILE = {"poses": 0.01, "light": 0.02}
+"""Share by which the squared error has to fall. Exact poses raise it; gains explain a little of all that is wrong."""
 FOCUSED = 0.4
 """Share of the training that it takes, once poses are corrected, until the field shows all of its detail."""
 PARAMETERS = {"poses": "motions", "light": "log_gains"}
@@ -105,7 +105,7 @@ class Corrections(torch.nn.Module):
         self.tried = sum(progress >= share for share in TRIALS)
         open_yet = [name for name in self.rates if name not in self.since]
         self.worth |= {name: worth[name] for name in open_yet}
-        self.begin(progress, *(name for name in open_yet if worth[name] > WORTHWHILE))
+        self.begin(progress, *(name for name in open_yet if worth[name] > WORTHWHILE[name]))
 
     def decided(self) -> dict[str, Any]:
         """What the state of the parameters does not say, for `decide`."""
@@ -134,12 +134,13 @@ class Corrections(torch.nn.Module):
     def _factor(self, name: str, start: float | None, progress: float) -> float:
         if start is None or progress < start:
             return 0.0
-        return self.pace(name) * self.FINAL ** ((progress - start) / (1 - start))
+        pace = self.pace(progress - start) if name == "poses" else 1.0
+        return pace * self.FINAL ** ((progress - start) / (1 - start))
 
-    def pace(self, name: str) -> float:
-        """Factor on the rate of poses, by how far they have moved."""
-        if name != "poses":
-            return 1.0
+    def pace(self, passed: float) -> float:
+        """Factor on the rate of poses, by how far they have moved since a share of the training ago."""
+        if passed < HURRY:
+            return FASTER
         moved = float(self.motions.detach().square().sum(1).mean().sqrt())  # in pixels, as they are whitened
         return min(FASTER, max(1.0, moved / FAR))
 
@@ -147,6 +148,14 @@ class Corrections(torch.nn.Module):
         """How much detail of the field cameras may be corrected by; 1 is all, see `Field.focus`."""
         start = self.since.get("poses")
         return 1.0 if start is None else min(1.0, (progress - start) / FOCUSED)
+
+    def ripeness(self, progress: float, grown_after: float) -> float:
+        """The progress by which a field grows: slower while cameras find their places, as detail would hold them where they
+        are."""
+        start = self.since.get("poses", 1.0)
+        if not start < grown_after or progress < start:
+            return progress
+        return min(progress, start + (grown_after - start) * self.focus(progress))
 
     def _own(self, values: Float[Tensor, "V K"]) -> Float[Tensor, "V K"]:
         """Without their mean, if that is to be zero."""

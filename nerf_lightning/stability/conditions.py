@@ -93,6 +93,7 @@ def _room(name: str) -> MakeScene:
 SURVIVES, TOLD = "no collapse", "refused, or an alarm"
 NETWORKS = ("mlp", "hashgrid", "tensorf")
 GRIDS = ("hashgrid", "voxels", "tensorf")
+CORRECTED = ("refine=auto",)
 CAPTURE = tuple(
     f"renderer.{name}_loss_weight={weight}"
     for name, weight in (("distortion", 0.001), ("near", 0.01), ("view", "suited"))
@@ -135,6 +136,12 @@ CONDITIONS = (
         for degrees in (0.5, 2.0, 5.0)
     ),
     Condition("exposure +-30%", SURVIVES, _damaged(damage.with_exposure_drift, 0.3)),
+    *(
+        Condition(f"pose noise {degrees:g} deg, corrected", SURVIVES, _damaged(damage.with_pose_noise, degrees), CORRECTED)
+        for degrees in (0.5, 2.0, 5.0)
+    ),
+    Condition("exposure +-30%, corrected", SURVIVES, _damaged(damage.with_exposure_drift, 0.3), CORRECTED),
+    Condition("clean, nothing to correct", "within 1 dB of clean", _pile, CORRECTED, loses=1.0),
     Condition("image noise 0.1", SURVIVES, _damaged(damage.with_noise, 0.1)),
     Condition("thin rod", SURVIVES, lambda seed: toy(ROD)),
     Condition("occupancy emptied", SURVIVES, _pile, by_method=tuple((m, "sampler.threshold=1000") for m in GRIDS)),

@@ -84,7 +84,10 @@ class NeRF3D(System):
             for group, factor in zip(self.parameter_groups[1:], factors, strict=True):
                 group["lr"] = group["initial_lr"] * factor * self.rate
         self.renderer.fade(self.progress)
-        replaced = self.field.grow(self.progress)
+        ripe = self.progress
+        if self.corrections is not None:
+            ripe = self.corrections.ripeness(ripe, self.field.grown_after)
+        replaced = self.field.grow(ripe)
         if replaced:
             optimizer = self.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one

@@ -11,7 +11,7 @@ from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.refine import Corrections
-from nerf_lightning.refine.corrections import FAR, FASTER, START, TRIALS
+from nerf_lightning.refine.corrections import FAR, FASTER, FOCUSED, HURRY, START, TRIALS
 from nerf_lightning.renderer import Rendered, VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system.fits import misfits
@@ -85,7 +85,7 @@ def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Vi
     corrections.note(TRIALS[0], {"poses": 0.3, "light": 0.005})
     assert corrections.motions.requires_grad and not corrections.log_gains.requires_grad
     assert not corrections.due(TRIALS[1] - 0.01) and corrections.due(TRIALS[1])
-    assert corrections.factors(TRIALS[0]) == [1.0, 0.0] and corrections.factors(1.0) == [Corrections.FINAL, 0.0]
+    assert corrections.factors(TRIALS[0]) == [FASTER, 0.0] and corrections.factors(1.0) == [Corrections.FINAL, 0.0]
     again = Corrections(views.cameras, BOX, auto=True)
     again.decide(corrections.decided())
     assert again.motions.requires_grad and again.decided() == corrections.decided()
@@ -101,9 +101,21 @@ def test_photos_far_worse_than_the_others_stand_out():
 
 
 def test_what_is_far_off_moves_faster(views: Views):
-    corrections = Corrections(views.cameras, BOX)
-    assert corrections.factors(START) == [1.0, 1.0]
-    torch.nn.init.constant_(corrections.motions, 2 * FAR / 6**0.5)
-    assert corrections.factors(START) == pytest.approx([2.0, 1.0])
-    torch.nn.init.constant_(corrections.motions, 100.0)
+    corrections, later = Corrections(views.cameras, BOX), START + HURRY + 0.1
     assert corrections.factors(START) == [FASTER, 1.0]
+    poses, light = corrections.factors(later)
+    assert poses == light < 1
+    torch.nn.init.constant_(corrections.motions, 2 * FAR / 6**0.5)
+    assert corrections.factors(later) == pytest.approx([2 * light, light])
+    torch.nn.init.constant_(corrections.motions, 100.0)
+    assert corrections.factors(later) == pytest.approx([FASTER * light, light])
+
+
+def test_a_field_grows_later_while_cameras_find_their_places(views: Views):
+    corrections = Corrections(views.cameras, BOX, auto=True)
+    assert corrections.ripeness(0.2, grown_after=0.3) == 0.2
+    corrections.begin(0.2, "poses")
+    assert corrections.ripeness(0.1, grown_after=0.3) == 0.1
+    assert corrections.ripeness(0.3, grown_after=0.3) == pytest.approx(0.2 + 0.1 * 0.1 / FOCUSED)
+    assert corrections.ripeness(0.2 + FOCUSED, grown_after=0.3) == pytest.approx(0.3)
+    assert corrections.ripeness(0.25, grown_after=0.0) == 0.25  # it has its size from the start
