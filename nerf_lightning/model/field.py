@@ -100,10 +100,6 @@ class Field(InBounds, AnyField):
         """
         return []
 
-    def focus(self, share: float) -> None:
-        """Called before each training step while cameras are being corrected, with a share that rises from 0 to 1: how much
-        detail the field may show. Detail at wrong places holds cameras there; a field that grows has none at first anyway."""
-
     def penalty(self) -> Float[Tensor, ""] | None:
         """What training adds to the squared error, or None."""
         return None

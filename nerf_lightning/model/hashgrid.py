@@ -18,9 +18,6 @@ from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_fr
 from nerf_lightning.model.layers.widening import widen_all
 from nerf_lightning.utils.options import Count
 
-FIRST_LEVELS = 0.5
-"""Share of the levels that are seen when `HashGridField.focus` begins."""
-
 
 def level_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
     """Cells along each side of every level, growing geometrically from coarsest to finest (Instant-NGP, eq. 2 and 3)."""
@@ -153,8 +150,6 @@ class HashGridField(Field):
         self.split_colour = split_colour
         self.colour_net = layers(self.GEOMETRY + self.terms, width, width, 3)
         self.starts_thin = density == "exp"
-        self.blur: Tensor | None = None
-        """Factors on the features while fine levels are held back."""
         self.reset_parameters()
 
     @torch.no_grad()
@@ -175,17 +170,8 @@ class HashGridField(Field):
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
         self.grid.prune(reached)
 
-    def focus(self, share: float) -> None:
-        """Level after level fades in (BARF, Lin et al. 2021, eq. 14, with levels for frequencies)."""
-        levels = len(self.grid.resolutions)
-        shown = levels * (FIRST_LEVELS + (1 - FIRST_LEVELS) * share) - torch.arange(levels)
-        weights = (1 - torch.cos(torch.pi * shown.clamp(0, 1))) / 2
-        per_feature = weights.repeat_interleave(self.grid.tables.shape[1]).to(self.grid.tables)
-        self.blur = None if share >= 1 else per_feature
-
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         encoded = self.grid(self.bounds.to_unit(positions))
-        encoded = encoded if self.blur is None else encoded * self.blur
         raw, geometry = mlp_heads(encoded, weights(self.density_net), 1)
         return self.activation(raw.squeeze(1)), geometry
 

@@ -1,6 +1,7 @@
 """What is learned about each photo's camera and light."""
 
 from dataclasses import replace
+from statistics import median
 from typing import Any
 
 import torch
@@ -25,8 +26,10 @@ HURRY, FAR, FASTER = 0.1, 4.0, 3.0
 square of how far the content has moved in the photos, above `FAR` pixels. What is far off would else not arrive."""
 WORTHWHILE = {"poses": 0.01, "light": 0.02}
 """Share by which the squared error has to fall. Exact poses raise it; gains explain a little of all that is wrong."""
-FOCUSED = 0.4
-"""Share of the training that it takes, once poses are corrected, until the field shows all of its detail."""
+FAR_OFF = 2.5
+"""Degrees by which most cameras may have turned: from 2 degrees they come back, from 5 most do not."""
+RIPENED = 0.4
+"""Share of the training that it takes, once poses are corrected, until the field has grown."""
 PARAMETERS = {"poses": "motions", "light": "log_gains"}
 
 
@@ -144,18 +147,13 @@ class Corrections(torch.nn.Module):
         moved = float(self.motions.detach().square().sum(1).mean().sqrt())  # in pixels, as they are whitened
         return min(FASTER, max(1.0, moved / FAR))
 
-    def focus(self, progress: float) -> float:
-        """How much detail of the field cameras may be corrected by; 1 is all, see `Field.focus`."""
-        start = self.since.get("poses")
-        return 1.0 if start is None else min(1.0, (progress - start) / FOCUSED)
-
     def ripeness(self, progress: float, grown_after: float) -> float:
         """The progress by which a field grows: slower while cameras find their places, as detail would hold them where they
         are."""
         start = self.since.get("poses", 1.0)
         if not start < grown_after or progress < start:
             return progress
-        return min(progress, start + (grown_after - start) * self.focus(progress))
+        return min(progress, start + (grown_after - start) * (progress - start) / RIPENED)
 
     def _own(self, values: Float[Tensor, "V K"]) -> Float[Tensor, "V K"]:
         """Without their mean, if that is to be zero."""
@@ -214,6 +212,10 @@ class Corrections(torch.nn.Module):
         if "poses" in self.since:
             turned_by, moved_by = max(found["turned_degrees"]), max(found["moved"])
             said.append(f"cameras turned by up to {turned_by:.2f} degrees and moved by up to {moved_by:.3g}")
+            if (middle := median(found["turned_degrees"])) > FAR_OFF:
+                said.append(
+                    f"half of them by more than {middle:.1f} degrees, too far for all to have found their places"
+                )
         if "light" in self.since:
             said.append(f"exposure from {min(found['exposure']):.2f} to {max(found['exposure']):.2f}")
         for name in self.rates:

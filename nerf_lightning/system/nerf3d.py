@@ -79,7 +79,6 @@ class NeRF3D(System):
         if self.corrections is not None:
             if self.corrections.due(self.progress):
                 self.try_corrections()
-            self.field.focus(max(0.0, self.corrections.focus(self.progress)))
             factors = self.corrections.factors(self.progress)
             for group, factor in zip(self.parameter_groups[1:], factors, strict=True):
                 group["lr"] = group["initial_lr"] * factor * self.rate

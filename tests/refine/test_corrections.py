@@ -58,6 +58,13 @@ def test_corrected_rays_are_those_of_the_corrected_cameras(cameras: Cameras):
     torch.testing.assert_close(found.directions, expected.directions, atol=1e-5, rtol=0)
 
 
+def test_cameras_that_were_far_off_are_said_to_be_so(cameras: Cameras):
+    corrections = Corrections(cameras, BOX, light=False)
+    for size, told in ((0.1, False), (100.0, True)):
+        torch.nn.init.normal_(corrections.motions, std=size)
+        assert ("too far for all to have found their places" in corrections.told()) == told
+
+
 def test_gains_leave_the_background_alone(cameras: Cameras):
     corrections, views = Corrections(cameras, BOX, poses=False), torch.arange(VIEWS)
     torch.nn.init.normal_(corrections.log_gains)

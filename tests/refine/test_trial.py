@@ -11,7 +11,7 @@ from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.refine import Corrections
-from nerf_lightning.refine.corrections import FAR, FASTER, FOCUSED, HURRY, START, TRIALS
+from nerf_lightning.refine.corrections import FAR, FASTER, HURRY, RIPENED, START, TRIALS
 from nerf_lightning.renderer import Rendered, VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system.fits import misfits
@@ -116,6 +116,6 @@ def test_a_field_grows_later_while_cameras_find_their_places(views: Views):
     assert corrections.ripeness(0.2, grown_after=0.3) == 0.2
     corrections.begin(0.2, "poses")
     assert corrections.ripeness(0.1, grown_after=0.3) == 0.1
-    assert corrections.ripeness(0.3, grown_after=0.3) == pytest.approx(0.2 + 0.1 * 0.1 / FOCUSED)
-    assert corrections.ripeness(0.2 + FOCUSED, grown_after=0.3) == pytest.approx(0.3)
+    assert corrections.ripeness(0.3, grown_after=0.3) == pytest.approx(0.2 + 0.1 * 0.1 / RIPENED)
+    assert corrections.ripeness(0.2 + RIPENED, grown_after=0.3) == pytest.approx(0.3)
     assert corrections.ripeness(0.25, grown_after=0.0) == 0.25  # it has its size from the start
