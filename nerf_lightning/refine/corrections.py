@@ -25,7 +25,7 @@ HURRY, FAR, FASTER = 0.1, 4.0, 3.0
 """Poses move `FASTER` times as fast for a first share of the training, and then where they have moved far: with the root mean
 square of how far the content has moved in the photos, above `FAR` pixels. What is far off would else not arrive."""
 WORTHWHILE = {"poses": 0.01, "light": 0.02}
-"""Share by which the squared error has to fall. Exact poses raise it; gains explain a little of all that is wrong."""
+"""Share by which most photos' squared error has to fall. Exact poses raise it; gains explain a little of all that is wrong."""
 FAR_OFF = 2.5
 """Degrees by which most cameras may have turned: from 2 degrees they come back, from 5 most do not."""
 RIPENED = 0.4
@@ -221,7 +221,7 @@ class Corrections(torch.nn.Module):
         for name in self.rates:
             if name not in self.since:
                 share = max(0.0, self.worth.get(name, 0.0))
-                said.append(f"{name} as given (corrections would lower the error by {share:.1%})")
+                said.append(f"{name} as given (corrections would lower most photos' error by {share:.1%})")
         return "refine: " + "; ".join(said)
 
     @torch.no_grad()

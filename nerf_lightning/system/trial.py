@@ -109,8 +109,9 @@ def changed(
 def worth(
     see: See, views: Views, behind: Float[Tensor, "3"], corrections: Corrections, generator: Generator
 ) -> dict[str, float]:
-    """By what share of itself the squared error falls on pixels that did not decide, if a field that stays as it is may be seen
-    by corrected cameras ("poses") and in corrected light ("light"), each besides the other.
+    """By what share of itself a photo's squared error falls on pixels that did not decide, if a field that stays as it is may
+    be seen by corrected cameras ("poses") and in corrected light ("light"), each besides the other: the median over photos,
+    since a few in which something moved say nothing of the others.
 
     Args:
         see: renders.
@@ -123,13 +124,14 @@ def worth(
     deciding, judging = (some_pixels(views, chosen, PIXELS, behind, generator) for _ in range(2))
     left, jacobian = derivatives(see, corrections, deciding, len(chosen))
 
-    def error(motions: Tensor | None, log_gains: Tensor | None) -> float:
+    def errors(motions: Tensor | None, log_gains: Tensor | None) -> Float[Tensor, "V"]:
         trial = changed(corrections, chosen, motions, log_gains)
-        return float(squared_errors(see, trial, judging, len(chosen)).sum())
+        return squared_errors(see, trial, judging, len(chosen))
 
     both = least_squares(left, jacobian)
-    as_it_is = max(error(None, None), torch.finfo(torch.float32).tiny)
-    corrected = error(both[:, POSES], both[:, LIGHT])
-    only_poses = error(least_squares(left, jacobian[..., POSES]), None)
-    only_light = error(None, least_squares(left, jacobian[..., LIGHT]))
-    return {"poses": (only_light - corrected) / as_it_is, "light": (only_poses - corrected) / as_it_is}
+    as_it_is, corrected = errors(None, None), errors(both[:, POSES], both[:, LIGHT])
+    only_poses = errors(least_squares(left, jacobian[..., POSES]), None)
+    only_light = errors(None, least_squares(left, jacobian[..., LIGHT]))
+    shares = ((without - corrected) / as_it_is for without in (only_light, only_poses))  # nan where all is masked
+    poses, light = (float(share.nanmedian().nan_to_num()) for share in shares)
+    return {"poses": poses, "light": light}
