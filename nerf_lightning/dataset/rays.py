@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
@@ -17,6 +17,10 @@ RAYS, SAMPLES = 1024, 16384
 """Rays of the first step, and the samples per step that the number of rays then adapts to."""
 SOME_PIXELS = 8192
 """Pixels drawn to measure the error of one plain colour."""
+NEIGHBOUR = 0.0125
+"""How far from a pixel its photo is looked at for `plainness`, in longer sides of the photo."""
+CONTRAST = 0.01
+"""Difference of colours at which a photo is plain by 1/e: two or three steps of 8 bits, hardly more than their noise."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +32,12 @@ class RayBatch:
     """sRGB, with straight alpha where C is 4."""
     views: Int[Tensor, "R"] | None = field(default=None, kw_only=True)
     """The training photo that each belongs to; None where that is not asked for."""
+    plain: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
+    """How plain the photo is around each, see `plainness`; None where that is not asked for."""
 
     def to(self, device: torch.device | str) -> "RayBatch":
-        views = None if self.views is None else self.views.to(device)
-        return RayBatch(self.rays.to(device), self.pixels.to(device), views=views)
+        views, plain = (None if x is None else x.to(device) for x in (self.views, self.plain))
+        return RayBatch(self.rays.to(device), self.pixels.to(device), views=views, plain=plain)
 
 
 @dataclass(frozen=True)
@@ -55,17 +61,51 @@ def rays_through(views: Views, places: Int[Tensor, "R"]) -> tuple[Rays, Int[Tens
     return views.cameras.rays(view, pixel // width, pixel % width), view
 
 
-def draw_rays(views: Views, count: int, generator: torch.Generator, part: slice = slice(None)) -> RayBatch:  # noqa: B008
+def plainness(views: Views, places: Int[Tensor, "R"], view: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
+    """How plain photos are around the pixels at these places in `Views.pixels`: 1 where the colour is the same on all four
+    sides, falling toward 0 with its largest difference.
+
+    Such places look alike in photos from elsewhere too, so that these hardly tell how far they are.
+    """
+    start, width = views.starts[view], views.widths[view]
+    pixel, height = places - start, (views.starts[view + 1] - start) // width
+    row, column = pixel // width, pixel % width
+    reach = (NEIGHBOUR * torch.maximum(width, height)).round().long().clamp_min(1)
+    sides = (
+        start + row * width + (column - reach).clamp_min(0),
+        start + row * width + torch.minimum(column + reach, width - 1),
+        start + (row - reach).clamp_min(0) * width + column,
+        start + torch.minimum(row + reach, height - 1) * width + column,
+    )
+    here = views.pixels[places].short()
+    contrast = torch.stack([(views.pixels[side].short() - here).abs().amax(1) for side in sides]).amax(0)
+    return torch.exp(-contrast / (255 * CONTRAST))
+
+
+def draw_rays(
+    views: Views,
+    count: int,
+    generator: torch.Generator,
+    part: slice = slice(None),  # noqa: B008
+    plain: bool = False,
+) -> RayBatch:
     """Draws `count` pixels uniformly from all views, masked ones excepted, with replacement; returns a part of them.
 
     Photos stay bytes, and rays are made only for the drawn pixels: the cost does not depend on the number of photos.
+
+    Args:
+        views: the photos.
+        count: pixels drawn.
+        generator: of the draw.
+        part: of the pixels that is returned.
+        plain: whether to look how plain photos are around them.
     """
     whole = len(views.pixels) if views.known is None else len(views.known)
     flat = torch.randint(whole, (count,), generator=generator, device=views.pixels.device)[part]
     if views.known is not None:
         flat = views.known.find(flat)
     rays, view = rays_through(views, flat)
-    return RayBatch(rays, views.pixels[flat], views=view)
+    return RayBatch(rays, views.pixels[flat], views=view, plain=plainness(views, flat, view) if plain else None)
 
 
 class RayDataModule(StepDataModule[Views]):
@@ -93,6 +133,8 @@ class RayDataModule(StepDataModule[Views]):
         self.rays = self.first_rays = rays
         self.samples = samples
         self.batch = 1
+        self.plain = False
+        """Whether batches say how plain photos are, see `RayBatch.plain`."""
 
     @property
     def photos(self) -> Views:
@@ -119,7 +161,7 @@ class RayDataModule(StepDataModule[Views]):
 
     def draw_from(self, photos: Views, step: int, part: slice) -> RayBatch:
         generator = step_generator(self.seed, Stream.BATCH, step, photos.pixels.device)
-        return draw_rays(photos, self.rays, generator, part)
+        return draw_rays(photos, self.rays, generator, part, self.plain)
 
     def some_pixels(self) -> RayBatch:
         """Training pixels to measure the error of one plain colour on."""

@@ -11,6 +11,10 @@ NEAR_POWER = 4
 """Power of the nearness that weight is penalised with: what stands at the box is hardly touched."""
 NEAR_UNTIL = 0.7
 """Share of the training in which the penalty on nearness fades out: surfaces that it pushed back then find their place."""
+PLAIN_PRICE = 3.0
+"""What a view part costs by its size where photos are plain, in what it costs by its square everywhere."""
+TINY = 1e-3
+"""Size of a view part below which its price falls off."""
 SUITED_VIEW_WEIGHT = {False: 0.01, True: 0.001}
 """Weight of the penalty on view parts, without and with a background. A subject that stands alone was often turned before
 the camera, so that its light did not turn with it; before a background, the direction also stands for a changing exposure."""
@@ -52,15 +56,27 @@ def near_loss(weight: Float[Tensor, "N"], samples: Samples, scale: float) -> Flo
     return (weight * nearness**NEAR_POWER).sum() / (len(samples.offsets) - 1)
 
 
-def view_loss(weight: Float[Tensor, "N"], view_part: Float[Tensor, "N 3"], samples: Samples) -> Float[Tensor, ""]:
-    """Mean over rays of sum_i w_i |v_i|^2, where v is what the direction adds to the logits of the colour.
+def view_loss(
+    weight: Float[Tensor, "N"],
+    view_part: Float[Tensor, "N 3"],
+    samples: Samples,
+    plain: Float[Tensor, "R"] | None = None,
+) -> Float[Tensor, ""]:
+    """Mean over rays of sum_i w_i (|v_i|^2 + 3 p |v_i|), where v is what the direction adds to the logits of the colour.
 
     A place that may look different from every side can show each photo what it wants to see, wherever it stands. A price on
-    that keeps surfaces where all photos agree; a highlight that explains many pixels still pays.
+    that keeps surfaces where all photos agree; a highlight that explains many pixels still pays. Where photos are plain, even
+    a little is enough to move a surface, and a price on the size itself keeps it at none.
 
     Args:
         weight: of the samples, see `volume_weights`; no gradient goes there.
         view_part: see `Field.with_view_part`.
         samples: along R rays.
+        plain: p of each ray, see `RayBatch.plain`; None for 0.
     """
-    return (weight.detach() * view_part.square().sum(1)).sum() / (len(samples.offsets) - 1)
+    squares = view_part.square().sum(1)
+    price = squares
+    if plain is not None:
+        size = (squares + TINY**2).sqrt() - TINY  # with a gradient where there is none
+        price = squares + PLAIN_PRICE * plain.index_select(0, samples.ray) * size
+    return (weight.detach() * price).sum() / (len(samples.offsets) - 1)

@@ -133,9 +133,14 @@ class VolumeRenderer(torch.nn.Module):
         return self.colour.expand(rays, 3)
 
     def forward(
-        self, rays: Rays, samples: Samples, field: FieldFn, backgrounds: Float[Tensor, "R 3"] | None = None
+        self,
+        rays: Rays,
+        samples: Samples,
+        field: FieldFn,
+        backgrounds: Float[Tensor, "R 3"] | None = None,
+        plain: Float[Tensor, "R"] | None = None,
     ) -> Rendered:
-        """Renders one colour a ray; `backgrounds` defaults to the renderer's own."""
+        """Renders one colour a ray; `backgrounds` defaults to the renderer's own, `plain` is for `view_loss`."""
         if backgrounds is None:
             backgrounds = self.backgrounds(len(rays))
         density, rgb, *view_part = field(samples.positions(rays), samples.directions(rays))
@@ -147,14 +152,18 @@ class VolumeRenderer(torch.nn.Module):
         penalty, weights = None, None
         if self.training and density.requires_grad and self.penalises:
             weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
-            penalty = self.penalty(weights, samples, view_part[0] if view_part else None)
+            penalty = self.penalty(weights, samples, view_part[0] if view_part else None, plain)
         elif samples.proposals is not None:
             weights = volume_weights(density.detach(), samples.dt, samples.ray, samples.offsets)
         learned = None if samples.proposals is None or weights is None else weights.detach()
         return Rendered(colour, opacity, distance, penalty, learned)
 
     def penalty(
-        self, weights: Float[Tensor, "N"], samples: Samples, view_part: Float[Tensor, "N 3"] | None
+        self,
+        weights: Float[Tensor, "N"],
+        samples: Samples,
+        view_part: Float[Tensor, "N 3"] | None,
+        plain: Float[Tensor, "R"] | None,
     ) -> Float[Tensor, ""]:
         """What training adds to its loss for where the weight is, and for what the direction adds there."""
         total = weights.new_zeros(())
@@ -163,5 +172,5 @@ class VolumeRenderer(torch.nn.Module):
         if self.near_loss_weight:
             total = total + self.near_weight * near_loss(weights, samples, self.half_size)
         if self.view_loss_weight and view_part is not None:
-            total = total + self.view_loss_weight * view_loss(weights, view_part, samples)
+            total = total + self.view_loss_weight * view_loss(weights, view_part, samples, plain)
         return total

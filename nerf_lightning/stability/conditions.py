@@ -96,7 +96,7 @@ GRIDS = ("hashgrid", "voxels", "tensorf")
 CORRECTED = ("refine=auto",)
 CAPTURE = tuple(
     f"renderer.{name}_loss_weight={weight}"
-    for name, weight in (("distortion", 0.001), ("near", 0.01), ("view", "suited"))
+    for name, weight in (("distortion", 0.001), ("near", 0.02), ("view", "suited"))
 )
 """How photos with a background are trained."""
 CAPTURED = (*((method, "sampler=proposal") for method in GRIDS), ("hashgrid", "model.split_colour=true"))

@@ -73,6 +73,7 @@ class NeRF3D(System):
 
     def on_fit_start(self) -> None:
         self.sampler.look_through(self.data.scene.train.cameras)
+        self.data.plain = self.renderer.view_loss_weight > 0
 
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
@@ -145,7 +146,7 @@ class NeRF3D(System):
             samples = self.sampler(rays.detach(), density, generator)
         backgrounds = self.renderer.backgrounds(len(batch.rays), generator)
         field = self.field.with_view_part if self.renderer.view_loss_weight else self.field
-        rendered = part(self.renderer.forward, self.backend)(rays, samples, field, backgrounds)
+        rendered = part(self.renderer.forward, self.backend)(rays, samples, field, backgrounds, batch.plain)
         truth, rgb = over(batch.pixels, backgrounds), rendered.rgb
         if corrections is not None:
             assert batch.views is not None

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import islice
 
 import pytest
@@ -6,7 +7,7 @@ import torch
 from nerf_lightning.cameras import Bounds, Cameras, Rays, orbit_around
 from nerf_lightning.dataset import RayBatch, RayDataModule, Scene, Views
 from nerf_lightning.dataset.loader import StepLoader
-from nerf_lightning.dataset.rays import draw_rays
+from nerf_lightning.dataset.rays import draw_rays, plainness
 from nerf_lightning.errors import InputError
 from nerf_lightning.renderer import over
 from nerf_lightning.utils.seeding import Stream, step_generator
@@ -41,6 +42,25 @@ def test_drawn_colours_belong_to_drawn_rays(scene: Scene):
         torch.testing.assert_close(batch.rays.directions[i].double(), direction / direction.norm(), atol=1e-6, rtol=0)
 
 
+def test_plain_is_what_looks_alike_on_all_sides():
+    """One photo with a step of colour and one with a slope, of two sizes: what counts is near by, and within the photo."""
+    step, slope = torch.full((20, 160, 3), 90), torch.arange(80).expand(40, 80)[..., None].repeat(1, 1, 3)
+    step[:, 100:, 1] = 120
+    images = [x.to(torch.uint8) for x in (step, slope)]
+    cameras = labelled(2).cameras
+    views = Views(
+        torch.cat([image.flatten(0, 1) for image in images]),
+        replace(cameras, sizes=torch.tensor([[160, 20], [80, 40]])),
+    )
+    every = torch.arange(len(views.pixels))
+    found = plainness(views, every, (every >= 20 * 160).long())
+    first, second = found[: 20 * 160].view(20, 160), found[20 * 160 :].view(40, 80)
+    near = 2  # 1.25 % of 160 pixels
+    assert (first[:, : 100 - near] == 1).all() and (first[:, 100 + near :] == 1).all()
+    assert (first[:, 100 - near : 100 + near] < 1e-4).all()
+    torch.testing.assert_close(second, torch.full_like(second, float(torch.tensor(-1 / 2.55).exp())))
+
+
 def test_all_pixels_of_all_views_are_equally_likely(scene: Scene):
     pixels = draw_rays(scene.train, 36_000, torch.Generator().manual_seed(0)).pixels.long()
     counts = torch.bincount((pixels[:, 0] * HEIGHT + pixels[:, 1]) * WIDTH + pixels[:, 2])
@@ -62,6 +82,15 @@ def test_data_and_model_draw_apart(scene: Scene):
     drawn = RayDataModule(scene, rays=50, seed=2).draw(5).pixels
     assert torch.equal(drawn, draw_rays(scene.train, 50, step_generator(2, Stream.BATCH, 5)).pixels)
     assert not torch.equal(drawn, draw_rays(scene.train, 50, step_generator(2, Stream.STEP, 5)).pixels)
+
+
+def test_batches_say_how_plain_photos_are_where_that_is_asked_for(scene: Scene):
+    data = RayDataModule(scene, rays=50)
+    assert data.draw(3).plain is None
+    data.plain = True
+    batch = data.draw(3)
+    assert batch.plain is not None and batch.plain.shape == (50,) and (batch.plain < 1).all()
+    assert torch.equal(batch.pixels, RayDataModule(scene, rays=50).draw(3).pixels)
 
 
 def test_held_out_views_come_whole_and_in_order(scene: Scene):

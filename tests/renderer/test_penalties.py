@@ -76,3 +76,18 @@ def test_what_the_direction_adds_costs_by_its_weight_which_it_does_not_move():
     loss.backward()
     assert density.grad is None and view_part.grad is not None
     assert view_loss(w, torch.zeros(9, 3), samples) == 0
+
+
+def test_where_photos_are_plain_the_size_of_a_view_part_has_a_price_too():
+    density, samples = packed([6, 0, 3], seed=2)
+    w, plain = weights(density, samples), torch.tensor([1.0, 0.3, 0.5], dtype=torch.float64)
+    view_part = 0.1 + torch.rand(9, 3, dtype=torch.float64)
+    sizes = w * view_part.norm(dim=1)
+    extra = 3.0 * (1.0 * sizes[:6].sum() + 0.5 * sizes[6:].sum()) / 3
+    torch.testing.assert_close(
+        view_loss(w, view_part, samples, plain) - view_loss(w, view_part, samples), extra, rtol=0.01, atol=0.0
+    )
+    nothing = torch.zeros(9, 3, dtype=torch.float64, requires_grad=True)
+    loss = view_loss(w, nothing, samples, plain)
+    loss.backward()
+    assert loss == 0 and nothing.grad is not None and not nothing.grad.any()

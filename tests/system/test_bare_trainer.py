@@ -10,10 +10,25 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.training.train import prepare_process, train
 from nerf_lightning.utils.device import CPU
+from nerf_lightning.utils.quiet import quiet
 
 STEPS = 24
 OPTIONS = ("+experiment=smoke_3d", "dataset.size=16", "dataset.train_views=6", f"budget.steps={STEPS}", "device=cpu")
 OFF = ("callbacks.heldout=null", "callbacks.snapshots=null", "callbacks.orbit=null", "callbacks.guard=null", "~logger")
+
+
+def bare(steps: int) -> L.Trainer:
+    quiet()
+    return L.Trainer(
+        max_steps=steps,
+        max_epochs=-1,
+        accelerator="cpu",
+        limit_val_batches=0,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
 
 
 def test_a_trainer_with_steps_alone_gives_the_weights_of_a_budget_of_as_many(tmp_path: Path):
@@ -24,18 +39,17 @@ def test_a_trainer_with_steps_alone_gives_the_weights_of_a_budget_of_as_many(tmp
     prepare_process(cfg.seed, cfg.threads, cfg.kernels)
     data = build_data(cfg)
     system = build_system(cfg, frame_of(data), CPU)
-    trainer = L.Trainer(
-        max_steps=STEPS,
-        max_epochs=-1,
-        accelerator="cpu",
-        limit_val_batches=0,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
+    trainer = bare(STEPS)
     trainer.fit(system, data)
     assert trainer.global_step == STEPS and system.progress == (STEPS - 1) / STEPS
     found = system.state_dict()
     assert found.keys() == expected.keys()
     assert all(torch.equal(found[key], expected[key]) for key in found)
+
+
+def test_photos_are_looked_at_for_plain_places_where_the_renderer_has_a_price_on_view_parts(tmp_path: Path):
+    for weight in (0.0, 0.001):
+        cfg = composed([*OPTIONS, "model.split_colour=true", f"renderer.view_loss_weight={weight}"], tmp_path)
+        data = build_data(cfg)
+        bare(1).fit(build_system(cfg, frame_of(data), CPU), data)
+        assert (data.draw(0).plain is not None) == (weight > 0)
