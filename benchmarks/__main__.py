@@ -77,6 +77,7 @@ def main() -> None:
     parser.add_argument(
         "--scenes", default="", help="of the part captures: more folders of photos, separated by commas"
     )
+    parser.add_argument("--recipes", default=",".join(captures.RECIPES), help="of the part captures: what to train")
     parser.add_argument("--device", default="auto", help="of the part device: auto, cpu, cuda or mps")
     parser.add_argument("--output", type=Path, default=Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S"))
     arguments = parser.parse_intermixed_args()  # overrides may stand behind options
@@ -91,6 +92,7 @@ def main() -> None:
         parser.error(str(error))
     budgets, seeds = [float(x) for x in arguments.budgets.split(",")], [int(x) for x in arguments.seeds.split(",")]
     experiments = arguments.experiments.split(",")
+    recipes = arguments.recipes.split(",")
     scenes = [Path(scene) for scene in arguments.scenes.split(",") if scene]
     report: dict[str, Any] = {
         "machine": {
@@ -118,7 +120,7 @@ def main() -> None:
         elif part == "capture":
             tables = capture.measure(seeds, arguments.output)
         elif part == "captures":
-            tables = captures.measure(overrides, budgets[0], seeds, scenes, arguments.output)
+            tables = captures.measure(overrides, budgets[0], seeds, scenes, recipes, arguments.output)
         elif part == "photos":
             tables = photos.measure(seeds, arguments.output)
         elif part == "pictures":

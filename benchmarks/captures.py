@@ -54,7 +54,9 @@ def against_truth(run: nl.Run, scene: Scene, room: Room) -> dict[str, float]:
     }
 
 
-def measure(overrides: list[str], budget: float, seeds: list[int], scenes: list[Path], output: Path) -> dict[str, Any]:
+def measure(
+    overrides: list[str], budget: float, seeds: list[int], scenes: list[Path], recipes: list[str], output: Path
+) -> dict[str, Any]:
     """One line for each scene and recipe: medians over seeds."""
     folders: dict[str, tuple[Path, Room | None]] = {path.name: (path, None) for path in scenes}
     for name, made in ROOMS.items():
@@ -64,7 +66,7 @@ def measure(overrides: list[str], budget: float, seeds: list[int], scenes: list[
         folders[name] = folder, made
     rows = []
     for name, (path, room) in folders.items():
-        for recipe in RECIPES:
+        for recipe in recipes:
             found = []
             for seed in seeds:
                 print(f"captures: {name}, {recipe}, seed {seed}", flush=True)
