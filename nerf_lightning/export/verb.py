@@ -10,15 +10,16 @@ from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.mesh import mesh_file, points_file, voxels_file
 from nerf_lightning.export.options import ExportOptions
+from nerf_lightning.export.photos import write_photos
 from nerf_lightning.export.smallest import MOST_VIEWS, PRECISIONS, smallest, some_cameras
 from nerf_lightning.export.volume import volume_of
 from nerf_lightning.runs.data import data_again
-from nerf_lightning.runs.folder import plain_config
+from nerf_lightning.runs.folder import load_config, load_scene, plain_config
 from nerf_lightning.runs.open import SceneRun, beside, open_run, open_scene_run
 from nerf_lightning.utils.device import the_device
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.extras import require
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import atomic, atomic_folder
 from nerf_lightning.utils.machine import device_in_words
 
 NAMES = {
@@ -27,6 +28,7 @@ NAMES = {
     ("ply", "mesh"): "mesh.ply",
     ("glb", "mesh"): "mesh.glb",
     ("ply", "points"): "points.ply",
+    ("transforms", "mesh"): "posed",
 }
 """Default names of the output, by format and content."""
 
@@ -52,12 +54,33 @@ def export(options: ExportOptions) -> None:
     output = beside(source) / NAMES[options.format, options.content]
     if options.output is not None:
         output = Path(options.output).expanduser()
+    if options.format == "transforms":
+        return posed(options, source, output)
     if options.format in ("ply", "glb"):
         require("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
     content, words = (compacted if options.format == "compact" else shaped)(options, source, device)
     with atomic(output) as temporary:
         temporary.write_bytes(content)
     print(f"{output}: {words}")
+
+
+def posed(options: ExportOptions, source: Path, output: Path) -> None:
+    """Writes a run's photos, as it saw them, and their cameras, as it corrected them, into a folder."""
+    if not source.is_dir():
+        raise InputError(source, "", "a file", "a run's folder", "its compact file does not know corrected cameras")
+    if output.exists():
+        raise InputError(output, "", "something", "a folder that is not there yet", "give another output=, or remove it")
+    content, _ = load_scene(source)
+    data = data_again(load_config(source), content, options.photos)
+    if not isinstance(data, RayDataModule):
+        raise InputError(source, "", "a picture's run", "a scene's run")
+    with atomic_folder(output) as temporary:
+        write_photos(data.scene, temporary)
+    count, cameras = (
+        len(data.scene.train) + len(data.scene.val),
+        "as corrected" if "corrected" in content else "as given",
+    )
+    print(f"{output}: {count} photos and transforms.json, cameras {cameras}")
 
 
 def compacted(options: ExportOptions, source: Path, device: torch.device) -> tuple[bytes, str]:

@@ -1,0 +1,74 @@
+"""Photos and cameras written for other programs, read again."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf_lightning.cameras import Bounds, Cameras, Distortion, Lenses, orbit_around
+from nerf_lightning.dataset import Scene, Views
+from nerf_lightning.dataset.formats.nerfstudio import load_nerfstudio
+from nerf_lightning.dataset.views import Runs
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.photos import placed, write_photos
+
+WIDTH, HEIGHT = 12, 8
+
+
+def photographed(count: int, channels: int, lens: Distortion, fisheye: bool, masked: bool) -> Views:
+    generator = torch.Generator().manual_seed(count)
+    pixels = torch.randint(0, 256, (count, HEIGHT, WIDTH, channels), generator=generator, dtype=torch.uint8)
+    c2w = orbit_around(torch.zeros(3), torch.tensor([0.0, 0, 1]), 1.5, 0.4, count)
+    K = torch.tensor([[15.0, 0, 6.2], [0, 14, 3.9], [0, 0, 1]]).repeat(count, 1, 1)
+    lenses = Lenses(torch.tensor([lens] * count), torch.tensor([fisheye] * count)) if any(lens) or fisheye else None
+    cameras = replace(Cameras.of_size(K, c2w, WIDTH, HEIGHT), lenses=lenses)
+    known = None
+    if masked:
+        known = Runs.of(torch.rand(count * HEIGHT * WIDTH, generator=generator) < 0.7)
+    return Views(pixels.view(-1, channels), cameras, known, tuple(f"shots/{count}_{i}.jpg" for i in range(count)))
+
+
+LENSES = {
+    "pinhole": (Distortion(), False),
+    "opencv": (Distortion(k1=0.05, k2=-0.01, p1=0.002, p2=-0.001), False),
+    "fisheye": (Distortion(k1=0.02, k4=-0.001), True),
+}
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(("lens", "fisheye"), LENSES.values(), ids=LENSES)
+def test_what_is_written_is_read_again(lens: Distortion, fisheye: bool, masked: bool, tmp_path: Path):
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)))[0]
+    to_source = torch.eye(4)
+    to_source[:3, :3] = 2.5 * turn * turn.det()
+    to_source[:3, 3] = torch.tensor([3.0, -1.0, 0.5])
+    train, val = (photographed(count, 3, lens, fisheye, masked) for count in (6, 2))
+    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    write_photos(Scene("made", "made", train, val, val.cameras, box, to_source=to_source), tmp_path)
+    again = load_nerfstudio(tmp_path)
+    for views, found in ((train, again.train), (val, again.val)):
+        assert torch.equal(found.pixels, views.pixels) and found.names[0] == f"images/{len(views)}_0.png"
+        assert torch.equal(found.mask, views.mask)
+        torch.testing.assert_close(
+            placed(found.cameras, again.to_source), placed(views.cameras, to_source), atol=1e-5, rtol=1e-5
+        )
+        torch.testing.assert_close(found.cameras.K, views.cameras.K)
+        local = [(x.view_rays(1).directions @ x.c2w[1, :3, :3]) for x in (found.cameras, views.cameras)]
+        torch.testing.assert_close(*local, atol=1e-5, rtol=1e-5)
+
+
+def test_alpha_stays_and_equal_names_become_numbers(tmp_path: Path):
+    views = photographed(3, 4, Distortion(), False, False)
+    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    write_photos(Scene("made", "made", views, views, views.cameras, box), tmp_path)
+    again = load_nerfstudio(tmp_path)
+    assert again.val.names == ("images/0003.png", "images/0004.png", "images/0005.png")
+    assert torch.equal(again.train.pixels, views.pixels)
+
+
+def test_a_lens_that_the_format_does_not_know_is_refused(tmp_path: Path):
+    views = photographed(3, 3, Distortion(d1=0.1), False, False)
+    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    with pytest.raises(InputError, match=r"3_0.jpg: d1: found 0.1, expected at most k1, k2, k3, p1, p2"):
+        write_photos(Scene("made", "made", views, views, views.cameras, box), tmp_path)
