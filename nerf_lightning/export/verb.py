@@ -69,7 +69,9 @@ def posed(options: ExportOptions, source: Path, output: Path) -> None:
     if not source.is_dir():
         raise InputError(source, "", "a file", "a run's folder", "its compact file does not know corrected cameras")
     if output.exists():
-        raise InputError(output, "", "something", "a folder that is not there yet", "give another output=, or remove it")
+        raise InputError(
+            output, "", "something", "a folder that is not there yet", "give another output=, or remove it"
+        )
     content, _ = load_scene(source)
     data = data_again(load_config(source), content, options.photos)
     if not isinstance(data, RayDataModule):

@@ -1,5 +1,6 @@
 """What is learned about each photo's camera and light."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from statistics import median
 from typing import Any
@@ -11,6 +12,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.refine.poses import pixel_shifts, turned, whitening
+from nerf_lightning.utils.listing import first_few
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 PLACES = 512
@@ -28,6 +30,8 @@ WORTHWHILE = {"poses": 0.01, "light": 0.02}
 """Share by which most photos' squared error has to fall. Exact poses raise it; gains explain a little of all that is wrong."""
 FAR_OFF = 2.5
 """Degrees by which most cameras may have turned: from 2 degrees they come back, from 5 most do not."""
+APART, NAMED = 4.0, 5
+"""Times the median by which a photo moves far more than the others, and how many of such are named."""
 RIPENED = 0.4
 """Share of the training that it takes, once poses are corrected, until the field has grown."""
 PARAMETERS = {"poses": "motions", "light": "log_gains"}
@@ -206,12 +210,14 @@ class Corrections(torch.nn.Module):
         c2w[:, :3, 3] += moves
         return replace(given, c2w=c2w)
 
-    def told(self) -> str:
-        """In a line, what was found."""
+    def told(self, name: Callable[[int], str] = "photo {}".format) -> str:
+        """In a line, what was found; `name` gives the names of photos."""
         found, said = self.summary(), []
         if "poses" in self.since:
             turned_by, moved_by = max(found["turned_degrees"]), max(found["moved"])
             said.append(f"cameras turned by up to {turned_by:.2f} degrees and moved by up to {moved_by:.3g}")
+            if apart := self.moved_apart():
+                said.append(f"far more than the others: {first_few([name(i) for i in apart], NAMED)}")
             if (middle := median(found["turned_degrees"])) > FAR_OFF:
                 said.append(
                     f"half of them by more than {middle:.1f} degrees, too far for all to have found their places"
@@ -223,6 +229,12 @@ class Corrections(torch.nn.Module):
                 share = max(0.0, self.worth.get(name, 0.0))
                 said.append(f"{name} as given (corrections would lower most photos' error by {share:.1%})")
         return "refine: " + "; ".join(said)
+
+    def moved_apart(self) -> list[int]:
+        """Photos whose content moved far, and many times as far as in the others; the farthest first."""
+        moved = self.motions.detach().norm(dim=1)
+        limit = max(FAR, APART * float(moved.median()))
+        return [int(i) for i in moved.argsort(descending=True) if moved[i] > limit]
 
     @torch.no_grad()
     def summary(self) -> dict[str, list[float]]:

@@ -34,6 +34,7 @@ from nerf_lightning.runs.folder import load_config, load_scene, read_checkpoint,
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND, check_compiler
 from nerf_lightning.utils.allocator import keep_freed_memory
+from nerf_lightning.utils.listing import first_few
 from nerf_lightning.utils.machine import CROWDED, crowding
 from nerf_lightning.utils.options import AtLeast, Count, check_options
 from nerf_lightning.utils.progress import animates
@@ -107,11 +108,10 @@ def train(
                 save_scene(data, folder, system.corrections.cameras(data.scene.train.cameras))
             found = results.summary["psnr_aligned"]
             aligned = "" if found is None else f"; {found:.2f} dB held out with held-out photos corrected too"
-            print(system.corrections.told() + aligned)
+            print(system.corrections.told(data.scene.train.name) + aligned)
         if results.misfits:
-            named = ", ".join(f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results.misfits[:NAMED])
-            rest = f" and {len(results.misfits) - NAMED} more" if len(results.misfits) > NAMED else ""
-            print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}{rest}")
+            named = first_few([f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results.misfits], NAMED)
+            print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}")
         if trainer.logger is not None:
             log_hyperparameters(trainer.logger, cfg, results.summary)
         report(results.summary, folder)

@@ -169,7 +169,7 @@ def test_a_run_says_what_it_corrected_and_is_rendered_without_its_photos(tmp_pat
     moved, given = ([poses.train.cameras.centres for poses in again][i] for i in (0, 1))
     torch.testing.assert_close((moved - given).norm(dim=1), torch.tensor(found["moved"]), atol=2e-5, rtol=0)
     assert found["moved"][0] > 0 and torch.equal(again[0].val.cameras.c2w, again[1].val.cameras.c2w)
-    given_to_export = {key: None for key in ("precision", "resolution", "threshold", "box", "photos", "output")}
+    given_to_export = dict.fromkeys(("precision", "resolution", "threshold", "box", "photos", "output"))
     options = ExportOptions(str(tmp_path), "transforms", loss=0.1, content="mesh", device="cpu", **given_to_export)
     export(options)
     assert "5 photos and transforms.json, cameras as corrected" in capsys.readouterr().out
@@ -181,6 +181,19 @@ def test_a_run_says_what_it_corrected_and_is_rendered_without_its_photos(tmp_pat
         export(options)
     with pytest.raises(InputError, match="corrected.*4 poses, one of each training photo"):
         data_again(load_config(tmp_path), {**load_scene(tmp_path)[0], "corrected": [1.0]})
+
+
+def test_cameras_that_moved_far_more_than_the_others_are_named(cameras: Cameras):
+    corrections = Corrections(cameras, BOX)
+    with torch.no_grad():
+        corrections.motions[:, 0] = 1.5
+    assert "far more" not in corrections.told()
+    with torch.no_grad():
+        corrections.motions[1, 3], corrections.motions[2, 4] = 7.0, -9.0
+    assert "; far more than the others: IMG_2, IMG_1; " in corrections.told("IMG_{}".format)
+    with torch.no_grad():
+        corrections.motions *= 0.1
+    assert "far more" not in corrections.told()
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.dataset.placing.structure import reconstruct
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.extras import require
+from nerf_lightning.utils.listing import first_few
 
 log = logging.getLogger(__name__)
 
@@ -65,5 +66,4 @@ def _told(target: Path, count: int, missing: Sequence[str]) -> str:
     line = f"{count - len(missing)} of {count} photos placed, kept in {target}"
     if not missing:
         return line
-    more = f" and {len(missing) - SHOWN} more" if len(missing) > SHOWN else ""
-    return f"{line}; not placed, for they share too few points with the others: {', '.join(missing[:SHOWN])}{more}"
+    return f"{line}; not placed, for they share too few points with the others: {first_few(missing, SHOWN)}"
