@@ -224,10 +224,10 @@ class Corrections(torch.nn.Module):
                 )
         if "light" in self.since:
             said.append(f"exposure from {min(found['exposure']):.2f} to {max(found['exposure']):.2f}")
-        for name in self.rates:
-            if name not in self.since:
-                share = max(0.0, self.worth.get(name, 0.0))
-                said.append(f"{name} as given (corrections would lower most photos' error by {share:.1%})")
+        for part in self.rates:
+            if part not in self.since:
+                share = max(0.0, self.worth.get(part, 0.0))
+                said.append(f"{part} as given (corrections would lower most photos' error by {share:.1%})")
         return "refine: " + "; ".join(said)
 
     def moved_apart(self) -> list[int]:

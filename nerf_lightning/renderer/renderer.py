@@ -122,6 +122,11 @@ class VolumeRenderer(torch.nn.Module):
         # A tensor, since compiled steps are compiled again for every new number.
         self.register_buffer("near_weight", torch.tensor(float(near_loss_weight)), persistent=False)
 
+    @property
+    def prices_plain(self) -> bool:
+        """Whether `view_loss` wants to know how plain photos are: a subject that stands alone is told by its outlines."""
+        return self.view_loss_weight > 0 and self.unbounded
+
     def fade(self, progress: float) -> None:
         """Called before each training step with the fraction of the budget done."""
         self.near_weight.fill_(self.near_loss_weight * max(0.0, 1 - progress / NEAR_UNTIL))

@@ -189,8 +189,8 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
         trial = copy.deepcopy(system).to(device)
         if isinstance(trial, NeRF3D):
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
-            plain = trial.renderer.view_loss_weight > 0
-            batch = draw_rays(data.scene.train, 64, step_generator(0, Stream.BATCH, 0), plain=plain).to(device)
+            generator, plain = step_generator(0, Stream.BATCH, 0), trial.renderer.prices_plain
+            batch = draw_rays(data.scene.train, 64, generator, plain=plain).to(device)
             # Step 1: step 0 would update the whole occupancy grid.
             loss, _ = trial.loss(batch, step_generator(0, Stream.STEP, 0, device), 1)
             loss.backward()

@@ -1,8 +1,10 @@
 """The systems are LightningModules like others: they train without this package's callbacks too."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import lightning as L
+import pytest
 import torch
 
 from nerf_lightning.config.build import build_data, build_system, frame_of
@@ -47,9 +49,12 @@ def test_a_trainer_with_steps_alone_gives_the_weights_of_a_budget_of_as_many(tmp
     assert all(torch.equal(found[key], expected[key]) for key in found)
 
 
-def test_photos_are_looked_at_for_plain_places_where_the_renderer_has_a_price_on_view_parts(tmp_path: Path):
-    for weight in (0.0, 0.001):
-        cfg = composed([*OPTIONS, "model.split_colour=true", f"renderer.view_loss_weight={weight}"], tmp_path)
-        data = build_data(cfg)
-        bare(1).fit(build_system(cfg, frame_of(data), CPU), data)
-        assert (data.draw(0).plain is not None) == (weight > 0)
+@pytest.mark.parametrize(("weight", "unbounded"), [(0.0, True), (0.001, False), (0.001, True)])
+def test_plain_places_are_looked_for_before_a_background_where_view_parts_have_a_price(
+    weight: float, unbounded: bool, tmp_path: Path
+):
+    cfg = composed([*OPTIONS, "model.split_colour=true", f"renderer.view_loss_weight={weight}"], tmp_path)
+    data = build_data(cfg)
+    data.scene = replace(data.scene, bounds=replace(data.scene.bounds, unbounded=unbounded))
+    bare(1).fit(build_system(cfg, frame_of(data), CPU), data)
+    assert (data.draw(0).plain is not None) == (weight > 0 and unbounded)
