@@ -11,7 +11,7 @@ NEAR_POWER = 4
 """Power of the nearness that weight is penalised with: what stands at the box is hardly touched."""
 NEAR_UNTIL = 0.7
 """Share of the training in which the penalty on nearness fades out: surfaces that it pushed back then find their place."""
-PLAIN_PRICE = 3.0
+PLAIN_PRICE = 10.0
 """What a view part costs by its size where photos are plain, in what it costs by its square everywhere."""
 TINY = 1e-3
 """Size of a view part below which its price falls off."""
@@ -62,7 +62,7 @@ def view_loss(
     samples: Samples,
     plain: Float[Tensor, "R"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean over rays of sum_i w_i (|v_i|^2 + 3 p |v_i|), where v is what the direction adds to the logits of the colour.
+    """Mean over rays of sum_i w_i (|v_i|^2 + 10 p |v_i|), where v is what the direction adds to the logits of the colour.
 
     A place that may look different from every side can show each photo what it wants to see, wherever it stands. A price on
     that keeps surfaces where all photos agree; a highlight that explains many pixels still pays. Where photos are plain, even
