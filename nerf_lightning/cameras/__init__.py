@@ -12,7 +12,13 @@ from nerf_lightning.cameras.orbit import (
     spiral_like,
     typical_view,
 )
-from nerf_lightning.cameras.transforms import pixel_to_camera, pixel_to_ray, transform, transform_directions
+from nerf_lightning.cameras.transforms import (
+    in_other_frame,
+    pixel_to_camera,
+    pixel_to_ray,
+    transform,
+    transform_directions,
+)
 from nerf_lightning.cameras.upright import held, turn_upright
 
 __all__ = [
@@ -25,6 +31,7 @@ __all__ = [
     "axes_meet",
     "focus_point",
     "held",
+    "in_other_frame",
     "look_at",
     "orbit_around",
     "orbit_like",

@@ -17,6 +17,13 @@ def transform_directions(
     return (c2w[..., :3, :3] * directions[..., None, :]).sum(-1)
 
 
+def in_other_frame(c2w: Float[Tensor, "V 4 4"], similarity: Float[Tensor, "4 4"]) -> Float[Tensor, "V 4 4"]:
+    """Poses in the frame that a similarity (a turn, a scale and a shift) leads to, in double precision; they stay rigid."""
+    moved = similarity.double() @ c2w.double()
+    moved[:, :3, :3] /= torch.linalg.det(similarity[:3, :3].double()) ** (1 / 3)
+    return moved
+
+
 def pixel_to_camera(
     K: Float[Tensor, "*#batch 3 3"], uv: Float[Tensor, "*#batch 2"], depth: Float[Tensor, "*#batch"]
 ) -> Float[Tensor, "*batch 3"]:

@@ -5,11 +5,8 @@ from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from nerf_lightning.cameras import Cameras, Distortion
+from nerf_lightning.cameras import Distortion, in_other_frame
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.dataset.formats.conventions import opengl_to_opencv
 from nerf_lightning.errors import InputError
@@ -35,7 +32,7 @@ def write_photos(scene: Scene, folder: Path) -> None:
     content: dict[str, Any] = {"frames": []}
     named = iter(tracked(stems, len(stems), "writing photos"))
     for key, views in parts.items():
-        poses = opengl_to_opencv(placed(views.cameras, scene.to_source).numpy())  # its own inverse
+        poses = opengl_to_opencv(in_other_frame(views.cameras.c2w, scene.to_source).numpy())  # its own inverse
         content[key] = []
         for view in range(len(views)):
             stem = next(named)
@@ -53,13 +50,6 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
     """As a PNG, in a folder that is made if need be."""
     path.parent.mkdir(parents=True, exist_ok=True)
     imageio.imwrite(path, picture)
-
-
-def placed(cameras: Cameras, to_source: Float[Tensor, "4 4"]) -> Float[Tensor, "V 4 4"]:
-    """Camera to world in the frame of the photos' own file, double precision."""
-    c2w = to_source.double() @ cameras.c2w.double()
-    c2w[:, :3, :3] /= torch.linalg.det(to_source[:3, :3].double()) ** (1 / 3)
-    return c2w
 
 
 def optics(views: Views, view: int) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.cameras import Cameras
+from nerf_lightning.cameras import Cameras, in_other_frame
 from nerf_lightning.config.build import SceneFrame, build_data, target_of
 from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
@@ -30,12 +30,9 @@ def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
     if torch.allclose(to_source, scene.to_source, atol=1e-5):
         return replace(scene, bounds=frame.bounds, to_source=to_source)
     moved = torch.linalg.solve(to_source.double(), scene.to_source.double())
-    scale = torch.linalg.det(moved[:3, :3]) ** (1 / 3)
 
     def placed(cameras: Cameras) -> Cameras:
-        c2w = moved @ cameras.c2w.double()
-        c2w[:, :3, :3] /= scale
-        return replace(cameras, c2w=c2w.float())
+        return replace(cameras, c2w=in_other_frame(cameras.c2w, moved).float())
 
     train, val = (replace(views, cameras=placed(views.cameras)) for views in (scene.train, scene.val))
     return replace(scene, train=train, val=val, orbit=placed(scene.orbit), bounds=frame.bounds, to_source=to_source)
