@@ -32,6 +32,15 @@ def test_a_scene_of_a_room_knows_what_its_rays_meet(tmp_path: Path, monkeypatch:
     seen = room.see(Rays(*(x.float() for x in (rays_in_the_room(rays, scene)))))[0]
     off = (seen - scene.val.image(0).view(-1, 3) / 255).abs()
     assert float(off.median()) < 0.05
+    own = scene.train.cameras.view_rays(3)
+    distance, body = rooms.meet(room, scene, own)
+    surface, behind = (
+        rooms.photos_that_show(room, scene, own.origins + share * distance[:, None] * own.directions)
+        for share in (1, 1.3)
+    )
+    assert int(surface.min()) >= 1 and int(surface.max()) <= len(scene.train)
+    subject = body < room.subject  # 1.3 times as far is its inside, or what it hides from here
+    assert float(behind[subject].float().mean()) < 0.5 * float(surface[subject].float().mean())
 
 
 def rays_in_the_room(rays: Rays, scene) -> tuple[torch.Tensor, torch.Tensor]:

@@ -13,6 +13,8 @@ from nerf_lightning.dataset import Scene
 from nerf_lightning.stability.rooms import Room, handheld, photograph
 
 WIDTH, HEIGHT, VIEWS = 240, 180, 56
+HIDDEN = 0.99
+"""A place is hidden where something stands nearer than this share of its distance."""
 
 
 def write_room(room: Room, folder: Path, seed: int = 0) -> None:
@@ -31,7 +33,22 @@ def write_room(room: Room, folder: Path, seed: int = 0) -> None:
 
 def true_view(room: Room, scene: Scene, view: int) -> tuple[Float[Tensor, "R"], Int[Tensor, "R"]]:
     """Distance of what the rays of a held-out view meet, scene's unit, and the body's number."""
-    rays = scene.val.cameras.view_rays(view)
+    return meet(room, scene, scene.val.cameras.view_rays(view))
+
+
+def photos_that_show(room: Room, scene: Scene, places: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
+    """How many training photos show places on surfaces, scene's unit."""
+    cameras, shown = scene.train.cameras, torch.zeros(len(places), dtype=torch.long)
+    for view in range(len(cameras)):
+        apart = places - cameras.centres[view]
+        far = apart.norm(dim=1)
+        met, _ = meet(room, scene, Rays(cameras.centres[view].expand_as(places), apart / far[:, None]))
+        shown += cameras.project(places, view)[2] & (met > HIDDEN * far)
+    return shown
+
+
+def meet(room: Room, scene: Scene, rays: Rays) -> tuple[Float[Tensor, "R"], Int[Tensor, "R"]]:
+    """Distance of what rays of a scene meet, its unit, and the body's number."""
     scale = float(torch.linalg.det(scene.to_source[:3, :3])) ** (1 / 3)
     turn, shift = scene.to_source[:3, :3], scene.to_source[:3, 3]
     there = Rays(rays.origins @ turn.mT + shift, rays.directions @ turn.mT / scale)

@@ -1,5 +1,7 @@
 """Proposals: a small field of density alone learns where the large one's samples are worth their time."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
@@ -32,9 +34,11 @@ class ProposalSampler(Sampler):
         anneal: steps until proposals count in full; before, samples are spread more evenly.
         padding: share of the samples that are spread evenly all the same.
         levels, coarsest, finest, log2_entries: of the small field, see `HashGrid`.
+        final: what its learning rate has fallen to in the end, besides the schedule. A small field that goes on learning
+            quickly follows every flicker of the large one, which then has no samples where plain surfaces really are.
 
     Raises:
-        InputError: padding that is not above 0 and below 1.
+        InputError: padding that is not above 0 and below 1, or `final` outside of 0 to 1.
     """
 
     def __init__(
@@ -49,19 +53,27 @@ class ProposalSampler(Sampler):
         coarsest: Count = 32,
         finest: Count = 128,
         log2_entries: Count = 18,
+        final: float = 0.02,
     ):
         super().__init__(bounds)
         if not 0 < padding < 1:
             raise InputError("sampler.padding", "", str(padding), "above 0, below 1")
+        if not 0 <= final <= 1:
+            raise InputError("sampler.final", "", str(final), "0 to 1")
         self.samples = samples
         self.first, self.second = first, second
         self.anneal = anneal
         self.padding = padding
+        self.final = final
         self.grid = HashGrid(levels, log2_entries, 1, coarsest, finest)
         self.unit_length = bounds.longest
         self.first_step = 0
         """The step at which training began."""
         self.step = 0
+
+    @property
+    def groups(self) -> list[dict[str, Any]]:
+        return [{"params": list(self.parameters()), "final": self.final}]
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)

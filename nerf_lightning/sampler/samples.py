@@ -3,7 +3,7 @@
 import bisect
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -104,6 +104,11 @@ class Sampler(InBounds):
 
     chunk = 1 << 15
     """Samples that a device renders at a time; samplers work on multiples of it."""
+
+    @property
+    def groups(self) -> list[dict[str, Any]]:
+        """The optimiser's groups of what is learned at a rate of its own, see `System.learned`."""
+        return []
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         raise TypeError(f"{type(self).__name__} must define forward(rays, density, generator) -> Samples")

@@ -56,10 +56,9 @@ class NeRF3D(System):
         self.corrections = corrections
 
     def learned(self) -> list[dict[str, Any]]:
-        if self.corrections is None:
-            return super().learned()
-        apart = set(self.corrections.parameters())
-        return [{"params": [p for p in self.parameters() if p not in apart]}, *self.corrections.groups]
+        groups = [*self.sampler.groups, *(self.corrections.groups if self.corrections is not None else [])]
+        apart = {parameter for group in groups for parameter in group["params"]}
+        return [{"params": [p for p in self.parameters() if p not in apart]}, *groups]
 
     def warm_start_from(self, smaller: System) -> None:
         super().warm_start_from(smaller)
@@ -81,7 +80,8 @@ class NeRF3D(System):
             if self.corrections.due(self.progress):
                 self.try_corrections()
             factors = self.corrections.factors(self.progress)
-            for group, factor in zip(self.parameter_groups[1:], factors, strict=True):
+            first = len(self.parameter_groups) - len(factors)  # they come last, see `learned`
+            for group, factor in zip(self.parameter_groups[first:], factors, strict=True):
                 group["lr"] = group["initial_lr"] * factor * self.rate
         self.renderer.fade(self.progress)
         ripe = self.progress

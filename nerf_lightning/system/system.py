@@ -99,7 +99,11 @@ class System(L.LightningModule):
         field.warm_start_from(smaller.field)
 
     def learned(self) -> list[dict[str, Any]]:
-        """The optimiser's groups of parameters; those that say no learning rate take the optimiser's own."""
+        """The optimiser's groups of parameters.
+
+        Those that say no learning rate `lr` take the optimiser's own, and those that say `final` have it fall to this share by
+        the end, besides the schedule.
+        """
         return [{"params": list(self.parameters())}]
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -113,7 +117,7 @@ class System(L.LightningModule):
             self.progress = self.global_step / self.trainer.max_steps
         factor = self.schedule(self.progress) * self.rate
         for group in self.parameter_groups:
-            group["lr"] = group["initial_lr"] * factor
+            group["lr"] = group["initial_lr"] * factor * group.get("final", 1.0) ** self.progress
 
     @property
     def parameter_groups(self) -> list[dict[str, Any]]:

@@ -130,6 +130,11 @@ def test_no_padding_would_let_places_starve():
         ProposalSampler(AROUND, padding=0.0)
 
 
+def test_a_rate_that_grows_is_refused():
+    with pytest.raises(InputError, match="sampler.final: found 1.5, expected 0 to 1"):
+        ProposalSampler(AROUND, final=1.5)
+
+
 @pytest.mark.parametrize("unbounded", [False, True])
 def test_fast_and_plain_intervals_agree(unbounded: bool):
     bounds, some = replace(AROUND, unbounded=unbounded), rays(50)

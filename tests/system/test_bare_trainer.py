@@ -10,6 +10,7 @@ import torch
 from nerf_lightning.config.build import build_data, build_system, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.runs.folder import load_run
+from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import prepare_process, train
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.quiet import quiet
@@ -58,3 +59,17 @@ def test_plain_places_are_looked_for_before_a_background_where_view_parts_have_a
     data.scene = replace(data.scene, bounds=replace(data.scene.bounds, unbounded=unbounded))
     bare(1).fit(build_system(cfg, frame_of(data), CPU), data)
     assert (data.draw(0).plain is not None) == (weight > 0 and unbounded)
+
+
+def test_proposals_and_corrections_learn_at_rates_of_their_own(tmp_path: Path):
+    given = ["refine=poses", "sampler=proposal", "~sampler.resolution", "sampler.final=0.01", "optimizer.lr=0.02"]
+    cfg = composed([*OPTIONS, *given, "schedule=constant"], tmp_path)
+    data = build_data(cfg)
+    system, trainer = build_system(cfg, frame_of(data), CPU), bare(2)
+    trainer.fit(system, data)
+    assert isinstance(system, NeRF3D) and system.corrections is not None
+    rates = {parameter: group["lr"] for group in system.parameter_groups for parameter in group["params"]}
+    assert rates.keys() == set(system.parameters())
+    assert {rates[parameter] for parameter in system.field.parameters()} == {0.02}
+    assert rates[system.sampler.grid.tables] == 0.02 * 0.01**0.5  # in the second of two steps
+    assert rates[system.corrections.motions] == system.corrections.groups[0]["lr"] * system.corrections.factors(0.5)[0]
