@@ -80,8 +80,8 @@ class NeRF3D(System):
             if self.corrections.due(self.progress):
                 self.try_corrections()
             factors = self.corrections.factors(self.progress)
-            first = len(self.parameter_groups) - len(factors)  # they come last, see `learned`
-            for group, factor in zip(self.parameter_groups[first:], factors, strict=True):
+            ours = self.parameter_groups[-len(factors) :]  # the last, see `learned`; there is at least one
+            for group, factor in zip(ours, factors, strict=True):
                 group["lr"] = group["initial_lr"] * factor * self.rate
         self.renderer.fade(self.progress)
         ripe = self.progress
@@ -103,6 +103,13 @@ class NeRF3D(System):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if self.corrections is not None:
             self.corrections.decide(checkpoint["corrections"])
+        expected = self.learned()
+        for state in checkpoint["optimizer_states"]:
+            saved = state["param_groups"]
+            if len(saved) < len(expected):  # from when samplers learned in the field's group: it goes on at that rate
+                count = len(expected[0]["params"])
+                parts = saved[0]["params"][:count], saved[0]["params"][count:]
+                state["param_groups"] = [*({**saved[0], "params": part} for part in parts), *saved[1:]]
 
     def as_it_is(self) -> See:
         """Renders without randomness and with gradient in the rays alone: the field does not learn from it."""
