@@ -38,7 +38,7 @@ class ProposalSampler(Sampler):
             quickly follows every flicker of the large one, which then has no samples where plain surfaces really are.
 
     Raises:
-        InputError: padding that is not above 0 and below 1, or `final` outside of 0 to 1.
+        InputError: padding that is not above 0 and below 1, or `final` that is not above 0 and at most 1.
     """
 
     def __init__(
@@ -58,8 +58,8 @@ class ProposalSampler(Sampler):
         super().__init__(bounds)
         if not 0 < padding < 1:
             raise InputError("sampler.padding", "", str(padding), "above 0, below 1")
-        if not 0 <= final <= 1:
-            raise InputError("sampler.final", "", str(final), "0 to 1")
+        if not 0 < final <= 1:  # at 0 they would learn nothing after the first step
+            raise InputError("sampler.final", "", str(final), "above 0, at most 1")
         self.samples = samples
         self.first, self.second = first, second
         self.anneal = anneal

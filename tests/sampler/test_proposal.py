@@ -130,9 +130,10 @@ def test_no_padding_would_let_places_starve():
         ProposalSampler(AROUND, padding=0.0)
 
 
-def test_a_rate_that_grows_is_refused():
-    with pytest.raises(InputError, match="sampler.final: found 1.5, expected 0 to 1"):
-        ProposalSampler(AROUND, final=1.5)
+@pytest.mark.parametrize("final", [0.0, 1.5])
+def test_a_rate_that_grows_or_learns_nothing_is_refused(final: float):
+    with pytest.raises(InputError, match=f"sampler.final: found {final}, expected above 0, at most 1"):
+        ProposalSampler(AROUND, final=final)
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
