@@ -43,12 +43,12 @@ def against_truth(run: nl.Run, scene: Scene, room: Room) -> dict[str, float]:
         camera = scene.val.cameras[view]
         rays, (distance, body) = camera.view_rays(0), true_view(room, scene, view)
         some = torch.arange(0, len(rays), max(1, len(rays) // PIXELS))
-        off = (run.system.render(rays[some]).depth - distance[some]).abs() / distance[some]
+        few, far = rays[some], distance[some]
+        off = (run.system.render(few).depth - far).abs() / far
         errors.append(off)
         floors.append(off[body[some] == room.floor])
-        fog.append(opacity_before(run.system, rays[some], NEARER * distance[some]))
-        places = rays.origins[some] + distance[some, None] * rays.directions[some]
-        known.append(photos_that_show(room, scene, places) >= ENOUGH)
+        fog.append(opacity_before(run.system, few, NEARER * far))
+        known.append(photos_that_show(room, scene, few.origins + far[:, None] * few.directions) >= ENOUGH)
         seen, truth = run.render(camera).rgb.view(-1, 3), scene.val.image(view).view(-1, 3) / 255
         squares.append((seen - truth)[body < room.subject] ** 2)
     return {
