@@ -83,6 +83,13 @@ def test_experiment(experiment: str, small_scene: Path, tmp_path: Path):
     assert results["psnr"] > 0
 
 
+def test_captures_that_were_cut_out_train_on_random_backgrounds(small_scene: Path, tmp_path: Path):
+    cfg = composed(["+experiment=capture", f"dataset.path={small_scene}"], tmp_path)
+    system = take_a_step(cfg)
+    assert isinstance(system, NeRF3D)
+    assert system.renderer.random
+
+
 @pytest.mark.parametrize(
     ("group", "option"),
     [(group, path.stem) for group in GROUPS for path in sorted((conf_dir() / group).glob("*.yaml"))],

@@ -123,7 +123,7 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     field = build_field(cfg, Field, "three coordinates", bounds=frame.bounds)
     sampler = make(cfg, "sampler", bounds=frame.bounds)
     seen = {"half_size": float(frame.bounds.half_size.min()), "unbounded": frame.bounds.unbounded}
-    renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
+    renderer = make(cfg, "renderer", scene_background=frame.background, alpha=frame.alpha, **seen)
     corrections = None
     if cfg.get("refine") is not None and frame.cameras is not None:
         corrections = make(cfg, "refine", cameras=frame.cameras, bounds=frame.bounds)
@@ -138,6 +138,8 @@ class SceneFrame:
     background: tuple[float, float, float]
     cameras: Cameras | None = None
     """Of the training photos; None where there is nothing to train."""
+    alpha: bool = False
+    """Whether they have alpha."""
 
 
 @dataclass(frozen=True)
@@ -155,9 +157,9 @@ def frame_of(data: RayDataModule | PixelDataModule) -> Frame:
     """What a system takes from the data."""
     if isinstance(data, PixelDataModule):
         return PictureFrame(*data.scene.size)
-    bounds = data.scene.bounds
-    pixel = data.scene.train.cameras.pixel_width(bounds.centre)
-    return SceneFrame(replace(bounds, pixel=pixel or None), data.scene.background, data.scene.train.cameras)
+    bounds, train = data.scene.bounds, data.scene.train
+    pixel = train.cameras.pixel_width(bounds.centre)
+    return SceneFrame(replace(bounds, pixel=pixel or None), data.scene.background, train.cameras, train.channels == 4)
 
 
 def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, system: System) -> None:

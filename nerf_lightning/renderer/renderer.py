@@ -60,8 +60,10 @@ class VolumeRenderer(torch.nn.Module):
 
     Args:
         background: "scene" (the scene's own), "black", "white", "random" (a new colour for each training ray, the scene's
-            own in evaluation; wants images with alpha), or three numbers in [0, 1].
+            own in evaluation; wants images with alpha), "suited" (random where there is alpha, else the scene's own), or
+            three numbers in [0, 1].
         scene_background: the colour "scene" stands for.
+        alpha: whether the photos have alpha.
         distortion_loss_weight: of the penalty on fog in training, see `distortion_loss`; 0 does without.
         near_loss_weight: of the penalty on what stands near the cameras, see `near_loss`, when training begins; it fades out.
         view_loss_weight: of the penalty on what the direction adds to colours, see `view_loss`; "suited" takes
@@ -80,6 +82,7 @@ class VolumeRenderer(torch.nn.Module):
         self,
         background: str | list[float] = "scene",
         scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        alpha: bool = False,
         distortion_loss_weight: float = 0.0,
         near_loss_weight: float = 0.0,
         view_loss_weight: float | str = 0.0,
@@ -101,9 +104,9 @@ class VolumeRenderer(torch.nn.Module):
         self.penalises = any(penalties.values())
         self.half_size = half_size
         self.unbounded = unbounded
-        self.random = background == "random"
+        self.random = background == "random" or (background == "suited" and alpha)
         colour: Sequence[float]
-        if background in ("scene", "random"):
+        if background in ("scene", "random", "suited"):
             colour = scene_background
         elif isinstance(background, str):
             if background not in NAMED:
@@ -111,7 +114,7 @@ class VolumeRenderer(torch.nn.Module):
                     "renderer.background",
                     "",
                     repr(background),
-                    "scene, black, white, random or three numbers in [0, 1]",
+                    "scene, black, white, random, suited or three numbers in [0, 1]",
                 )
             colour = NAMED[background]
         else:

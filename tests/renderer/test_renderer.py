@@ -101,6 +101,13 @@ def test_random_backgrounds_need_a_generator():
     assert torch.equal(plain, torch.ones(2, 3))
 
 
+@pytest.mark.parametrize("alpha", [False, True])
+def test_the_suited_background_is_random_where_photos_have_alpha(alpha: bool):
+    renderer = VolumeRenderer("suited", SCENE, alpha)
+    assert renderer.random == alpha
+    assert torch.equal(renderer.backgrounds(2), torch.tensor(SCENE).expand(2, 3))
+
+
 @pytest.mark.parametrize(
     "background", ["green", "", [0.5], [0.1, 0.2, 0.3, 0.4], [0, 0, 1.5], [-0.1, 0, 0], [float("nan")] * 3]
 )
