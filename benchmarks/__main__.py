@@ -1,4 +1,4 @@
-"""python -m benchmarks: what methods, kernels, framework, captures, photos, 2D fields, sizes, shapes and videos cost and give.
+"""python -m benchmarks: what methods, kernels, framework, cameras, captures, photos, 2D fields, sizes, shapes and videos give.
 
 `python -m benchmarks device` tells whether the GPU at hand gives what the CPU gives, and how fast: its last line says it.
 """
@@ -15,6 +15,7 @@ import torch
 
 import nerf_lightning
 from benchmarks import (
+    cameras,
     capture,
     captures,
     device,
@@ -38,6 +39,7 @@ PARTS = (
     "kernels",
     "growth",
     "overhead",
+    "cameras",
     "capture",
     "captures",
     "photos",
@@ -75,9 +77,11 @@ def main() -> None:
     parser.add_argument("--budgets", default="60", help="seconds of training, separated by commas")
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument(
-        "--scenes", default="", help="of the part captures: more folders of photos, separated by commas"
+        "--scenes",
+        default="",
+        help="separated by commas; of the part captures: more folders of photos; of cameras: others than the built-in one",
     )
-    parser.add_argument("--recipes", default=",".join(captures.RECIPES), help="of the part captures: what to train")
+    parser.add_argument("--recipes", default="", help="of the parts cameras and captures: what to train")
     parser.add_argument("--device", default="auto", help="of the part device: auto, cpu, cuda or mps")
     parser.add_argument("--output", type=Path, default=Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S"))
     arguments = parser.parse_intermixed_args()  # overrides may stand behind options
@@ -92,7 +96,7 @@ def main() -> None:
         parser.error(str(error))
     budgets, seeds = [float(x) for x in arguments.budgets.split(",")], [int(x) for x in arguments.seeds.split(",")]
     experiments = arguments.experiments.split(",")
-    recipes = arguments.recipes.split(",")
+    recipes = [recipe for recipe in arguments.recipes.split(",") if recipe]
     scenes = [Path(scene) for scene in arguments.scenes.split(",") if scene]
     report: dict[str, Any] = {
         "machine": {
@@ -119,8 +123,12 @@ def main() -> None:
             tables, unequal = device.measure(chosen_device, overrides, budgets[0], seeds[0], arguments.output)
         elif part == "capture":
             tables = capture.measure(seeds, arguments.output)
+        elif part == "cameras":
+            tables = cameras.measure(overrides, seeds, scenes, recipes or list(cameras.RECIPES), arguments.output)
         elif part == "captures":
-            tables = captures.measure(overrides, budgets[0], seeds, scenes, recipes, arguments.output)
+            tables = captures.measure(
+                overrides, budgets[0], seeds, scenes, recipes or list(captures.RECIPES), arguments.output
+            )
         elif part == "photos":
             tables = photos.measure(seeds, arguments.output)
         elif part == "pictures":

@@ -1,17 +1,21 @@
 import json
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from blob import around_it
 from torch import Tensor
 
 from benchmarks import __main__ as command
-from benchmarks import alike, capture, cases, device, growth, methods, overhead, steps, trainings
+from benchmarks import alike, cameras, capture, cases, device, growth, methods, overhead, steps, trainings
 from benchmarks import kernels as timing
 from nerf_lightning import kernels
+from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.utils.device import CPU
 
 CURVE = [[2.0, 100, 20.0], [8.0, 400, 24.5], [10.5, 500, 26.0], [30.0, 1500, 29.0]]
@@ -71,6 +75,20 @@ def test_one_command_writes_table_and_json(tmp_path: Path, monkeypatch: pytest.M
     assert report["overhead"][0]["bare_ms"] > 0
     assert report["methods"][0]["method"] == "smoke_3d" and report["runs"][0]["status"] == "finished"
     assert "bare_ms" in (tmp_path / "table.txt").read_text() and "bare_ms" in capsys.readouterr().out
+
+
+def test_cameras_are_as_good_wherever_all_of_them_stand_together():
+    truth, centre = around_it(6, 8), torch.zeros(3)
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.4, 0.1], [0.4, 0.0, 0.2], [-0.1, -0.2, 0.0]]))
+    elsewhere = torch.eye(4)
+    elsewhere[:3, :3], elsewhere[:3, 3] = 1.7 * turn, torch.tensor([1.0, -2.0, 0.5])
+    together = replace(truth, c2w=in_other_frame(truth.c2w, elsewhere).float())
+    assert max(cameras.errors(together, truth, centre).values()) < 0.1
+    c2w = truth.c2w.clone()
+    angle = torch.tensor(0.1)
+    c2w[2, :3, :2] = c2w[2, :3, :2] @ torch.tensor([[angle.cos(), -angle.sin()], [angle.sin(), angle.cos()]])
+    found = cameras.errors(replace(truth, c2w=c2w), truth, centre)
+    assert found["degrees"] == pytest.approx(math.degrees(0.1) / 6, rel=1e-2) and found["moved_percent"] < 0.01
 
 
 def test_an_unknown_part_is_refused(monkeypatch: pytest.MonkeyPatch, capsys):

@@ -10,6 +10,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
+from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 Poses = Callable[[Float[Tensor, "V 4 4"]], Float[Tensor, "V 4 4"]]
@@ -43,8 +44,10 @@ def shuffled(scene: Scene, seed: int) -> Scene:
     return replace(scene, train=posed(scene.train, lambda c2w: c2w[order]))
 
 
-def with_pose_noise(scene: Scene, seed: int, degrees: float) -> Scene:
-    """Training cameras turned about random axes, by angles of that standard deviation."""
+def with_pose_noise(scene: Scene, seed: int, degrees: float, moved: float = 0.0) -> Scene:
+    """Training cameras turned about random axes, by angles of that standard deviation, and moved by lengths of another, given
+    as a share of their mean distance to the content's centre."""
+    centre = scene.bounds.centre
 
     def turn(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
         generator = step_generator(seed, Stream.STUDY, 1)
@@ -52,15 +55,34 @@ def with_pose_noise(scene: Scene, seed: int, degrees: float) -> Scene:
         cross = torch.zeros(len(c2w), 3, 3)
         cross[:, [2, 0, 1], [1, 2, 0]] = vectors
         c2w[:, :3, :3] = torch.linalg.matrix_exp(cross - cross.mT) @ c2w[:, :3, :3]
+        distance = float((c2w[:, :3, 3] - centre).norm(dim=1).mean())
+        c2w[:, :3, 3] += torch.randn(len(c2w), 3, generator=generator) * (moved * distance / 3**0.5)
         return c2w
 
     return replace(scene, train=posed(scene.train, turn))
 
 
-def with_exposure_drift(scene: Scene, seed: int, share: float) -> Scene:
-    """Training photos brighter or darker, by up to that share."""
-    gains = 1 + share * (2 * torch.rand(len(scene.train), 1, 1, 1, generator=step_generator(seed, Stream.STUDY, 2)) - 1)
-    return replace(scene, train=exposed(scene.train, lambda colours: colours * gains))
+def with_exposure_drift(scene: Scene, seed: int, share: float, tint: float = 0.0) -> Scene:
+    """Training photos brighter or darker, by up to that share, and their red, green and blue by up to another each."""
+    generator, count = step_generator(seed, Stream.STUDY, 2), len(scene.train)
+    gains = 1 + share * (2 * torch.rand(count, 1, 1, 1, generator=generator) - 1)
+    gains = gains * (1 + tint * (2 * torch.rand(count, 1, 1, 3, generator=generator) - 1))
+
+    def change(colours: Float[Tensor, "V H W C"]) -> Float[Tensor, "V H W C"]:
+        return torch.cat([colours[..., :3] * gains, colours[..., 3:]], dim=-1)
+
+    return replace(scene, train=exposed(scene.train, change))
+
+
+def with_wrong_poses(scene: Scene, seed: int, count: int) -> Scene:
+    """So many training photos, evenly spaced, with the pose of the next of them."""
+    wrong = evenly(len(scene.train), count)
+
+    def swap(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
+        c2w[wrong] = c2w[[*wrong[1:], wrong[0]]]
+        return c2w
+
+    return replace(scene, train=posed(scene.train, swap))
 
 
 def with_noise(scene: Scene, seed: int, spread: float) -> Scene:

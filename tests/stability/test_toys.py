@@ -104,6 +104,14 @@ def test_damage():
     trace_ = (turned.mT @ scene.train.cameras.c2w[:, :3, :3]).diagonal(dim1=1, dim2=2).sum(1)
     angles = ((trace_ - 1) / 2).clamp(-1, 1).acos() * 180 / math.pi
     assert float(angles.square().mean().sqrt()) == pytest.approx(5.0, rel=0.4)
+    moved = damage.with_pose_noise(scene, 0, 0.0, 0.05).train.cameras.centres - scene.train.cameras.centres
+    assert float(moved.square().sum(1).mean().sqrt()) == pytest.approx(0.05 * DISTANCE, rel=0.4)
+    wrong = damage.with_wrong_poses(scene, 0, 3).train.cameras.c2w != scene.train.cameras.c2w
+    assert int(wrong.flatten(1).any(1).sum()) == 3
+    tinted = damage.with_exposure_drift(toy(PILE, None, size=16), 0, 0.0, 0.1).train.images.float()
+    plain = toy(PILE, None, size=16).train.images.float()
+    shares = tinted[..., :3].sum((1, 2)) / plain[..., :3].sum((1, 2))
+    assert float((shares[:, 0] / shares[:, 1] - 1).abs().max()) > 0.02 and torch.equal(tinted[..., 3], plain[..., 3])
     drifted = damage.with_exposure_drift(scene, 0, 0.3)
     sums = [one.train.images.float().sum((1, 2, 3)) for one in (drifted, scene)]
     gains = sums[0] / sums[1]

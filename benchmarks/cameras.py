@@ -1,0 +1,119 @@
+"""Cameras and light that are not exact: what each method loses by them, and how much of it `refine` brings back."""
+
+import itertools
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+import nerf_lightning as nl
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.dataset import Scene
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.runs.data import seen_by_corrected
+from nerf_lightning.runs.folder import load_scene as content_of
+from nerf_lightning.stability import damage
+
+RECIPES = ("tensorf_medium", "voxels_medium", "hashgrid_medium")
+STEPS = 1500
+"""Of every training: seconds would let a busy machine decide."""
+FEW, WRONG = 12, 3
+"""Photos where there are few, and how many have another one's pose where some are wrong."""
+Damage = Callable[[Scene, int], Scene]
+
+
+def light(scene: Scene, seed: int) -> Scene:
+    return damage.with_exposure_drift(scene, seed, 0.3, 0.1)
+
+
+def poses(degrees: float, moved: float) -> Damage:
+    return lambda scene, seed: damage.with_pose_noise(scene, seed, degrees, moved)
+
+
+def both(scene: Scene, seed: int) -> Scene:
+    return light(poses(0.5, 0.01)(scene, seed), seed)
+
+
+def exact(scene: Scene, seed: int) -> Scene:
+    return scene
+
+
+CONDITIONS: dict[str, tuple[int | None, Damage]] = {
+    "exact": (None, exact),
+    "0.5 degrees, 1 %": (None, poses(0.5, 0.01)),
+    "2 degrees, 3 %": (None, poses(2.0, 0.03)),
+    "5 degrees, 5 %": (None, poses(5.0, 0.05)),
+    "light": (None, light),
+    "both, 3 wrong": (None, lambda scene, seed: damage.with_wrong_poses(both(scene, seed), seed, WRONG)),
+    "exact, 12 photos": (FEW, exact),
+    "both, 12 photos": (FEW, both),
+}
+"""How many photos there are, None for all, and what is done to them."""
+
+
+def similarity(found: Float[Tensor, "V 3"], truth: Float[Tensor, "V 3"]) -> tuple[float, Tensor, Tensor]:
+    """Scale, turn [3, 3] and shift [3] that bring points closest to others (Umeyama 1991, eq. 40 to 43)."""
+    mean, target = found.mean(0), truth.mean(0)
+    left, values, right = torch.linalg.svd((truth - target).mT @ (found - mean))
+    signs = torch.ones(3, dtype=found.dtype)
+    signs[2] = torch.linalg.det(left @ right).sign()
+    turn = left @ torch.diag(signs) @ right
+    scale = float((values * signs).sum() / (found - mean).square().sum())
+    return scale, turn, target - scale * turn @ mean
+
+
+def errors(found: Cameras, truth: Cameras, centre: Float[Tensor, "3"]) -> dict[str, float]:
+    """Mean angle in degrees and mean distance in percent of that to the content, between cameras whose common turn, scale and
+    shift has been taken off: a field does not know of those."""
+    found_c2w, true_c2w = found.c2w.double(), truth.c2w.double()
+    scale, turn, shift = similarity(found_c2w[:, :3, 3], true_c2w[:, :3, 3])
+    relative = true_c2w[:, :3, :3].mT @ turn @ found_c2w[:, :3, :3]
+    sine, cosine = (
+        (relative - relative.mT).flatten(1).norm(dim=1) / 8**0.5,
+        (relative.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2,
+    )
+    apart = (scale * found_c2w[:, :3, 3] @ turn.mT + shift - true_c2w[:, :3, 3]).norm(dim=1)
+    distance = (true_c2w[:, :3, 3] - centre.double()).norm(dim=1)
+    return {
+        "degrees": float(torch.atan2(sine, cosine).rad2deg().mean()),
+        "moved_percent": 100 * float((apart / distance).mean()),
+    }
+
+
+def measure(
+    overrides: list[str], seeds: list[int], scenes: list[Path], recipes: list[str], output: Path
+) -> dict[str, Any]:
+    """One line for each scene, condition and recipe, without and with `refine=auto`: medians over seeds."""
+    rows = []
+    for whole in [nl.load_scene(path) for path in scenes] or [bricks()]:
+        for condition, recipe, refine in itertools.product(CONDITIONS, recipes, ("null", "auto")):
+            views, spoil = CONDITIONS[condition]
+            truth = whole if views is None else damage.with_views(whole, 0, views)
+            found = []
+            for seed in seeds:
+                print(f"cameras: {whole.name}, {condition}, {recipe}, refine={refine}, seed {seed}", flush=True)
+                options = [f"refine={refine}", *overrides]
+                found.append(one(truth, spoil(truth, seed), recipe, options, seed, output / "cameras"))
+            about = {"scene": whole.name, "condition": condition, "recipe": recipe, "refine": refine}
+            rows.append(about | {key: median(row[key] for row in found) for key in found[0]})
+    return {"cameras": rows}
+
+
+def one(truth: Scene, spoilt: Scene, recipe: str, options: list[str], seed: int, folder: Path) -> dict[str, float]:
+    """The figures of one training on a spoilt scene: dB, the cameras' errors, and how many photos that are wrong were named."""
+    shutil.rmtree(folder, ignore_errors=True)
+    options = [*options, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "callbacks.heldout.at=[]"]
+    results = nl.train(spoilt, recipe, steps=STEPS, seed=seed, folder=folder, options=options).results
+    aligned = results["psnr"] if results["psnr_aligned"] is None else results["psnr_aligned"]
+    found = seen_by_corrected(spoilt, content_of(folder)[0]).train.cameras
+    figures = {
+        "psnr": results["psnr"],
+        "psnr_aligned": aligned,
+        "milliseconds_a_step": 1000 * results["train_seconds"] / STEPS,
+    }
+    return figures | errors(found, truth.train.cameras, truth.bounds.centre) | {"named": len(results["misfits"])}
