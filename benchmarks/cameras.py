@@ -20,8 +20,8 @@ from nerf_lightning.runs.folder import load_scene as content_of
 from nerf_lightning.stability import damage
 
 RECIPES = ("tensorf_medium", "voxels_medium", "hashgrid_medium")
-STEPS = 1500
-"""Of every training: seconds would let a busy machine decide."""
+STEPS = 2500
+"""Of every training, about a minute on two cores: seconds would let a busy machine decide."""
 FEW, WRONG = 12, 3
 """Photos where there are few, and how many have another one's pose where some are wrong."""
 Damage = Callable[[Scene, int], Scene]

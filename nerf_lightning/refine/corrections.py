@@ -19,14 +19,17 @@ PLACES = 512
 """Places in the box by which the motion of a camera is measured."""
 DAMPING = 1.0
 """See `whitening`. A turn and a move of a camera that undo each other in the photo are told apart slowly, and surely."""
-START = 0.05
+START = 0.02
 """Share of the training before which nothing is corrected: photos cannot fit a field that shows nothing yet."""
-TRIALS = (0.1, 0.2, 0.4)
-"""Shares of it at which `auto` tries what it does not correct yet: small faults show when the field is sharp."""
+TRIALS = (0.02, 0.04, 0.07, 0.1, 0.2, 0.4)
+"""Shares of it at which `auto` tries what it does not correct yet: large faults show while the field is smooth, as later it has
+explained them by fog; small ones show when it is sharp."""
+LIT = 0.04
+"""Share of it before which gains are not tried: a field that is still too dark everywhere wants gains."""
 HURRY, FAR, FASTER = 0.1, 4.0, 3.0
 """Poses move `FASTER` times as fast for a first share of the training, and then where they have moved far: with the root mean
 square of how far the content has moved in the photos, above `FAR` pixels. What is far off would else not arrive."""
-WORTHWHILE = {"poses": 0.01, "light": 0.02}
+WORTHWHILE = {"poses": 0.005, "light": 0.02}
 """Share by which most photos' squared error has to fall. Exact poses raise it; gains explain a little of all that is wrong."""
 FAR_OFF = 2.5
 """Degrees by which most cameras may have turned: from 2 degrees they come back, from 5 most do not."""
@@ -99,7 +102,7 @@ class Corrections(torch.nn.Module):
     def begin(self, progress: float, *names: str) -> None:
         """Corrects poses or light from now on."""
         for name in names:
-            self.since[name] = progress
+            self.since[name] = max(progress, START)
             self.get_parameter(PARAMETERS[name]).requires_grad_(True)
 
     def due(self, progress: float) -> bool:
@@ -110,7 +113,7 @@ class Corrections(torch.nn.Module):
     def note(self, progress: float, worth: dict[str, float]) -> None:
         """Takes in what a trial said: by what share the squared error would fall if poses, or light, were corrected."""
         self.tried = sum(progress >= share for share in TRIALS)
-        open_yet = [name for name in self.rates if name not in self.since]
+        open_yet = [name for name in self.rates if name not in self.since and (name != "light" or progress >= LIT)]
         self.worth |= {name: worth[name] for name in open_yet}
         self.begin(progress, *(name for name in open_yet if worth[name] > WORTHWHILE[name]))
 

@@ -6,7 +6,7 @@ from torch import Tensor
 from nerf_lightning.dataset import Views
 from nerf_lightning.system.metrics import mse_to_psnr
 from nerf_lightning.system.nerf3d import NeRF3D
-from nerf_lightning.system.trial import some_pixels, squared_errors
+from nerf_lightning.system.trial import seen_by, some_pixels, squared_errors
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 PIXELS = 256
@@ -25,7 +25,8 @@ def psnr_of_photos(system: NeRF3D, views: Views) -> list[float]:
     views = views.to(system.device)
     generator = step_generator(system.seed, Stream.STUDY, 2, system.device)
     pixels = some_pixels(views, range(len(views)), PIXELS, system.renderer.colour, generator)
-    squares = squared_errors(lambda rays, _: system.render(rays), system.corrections, pixels, len(views))
+    seen = seen_by(lambda rays, _: system.render(rays), system.corrections, pixels)
+    squares = squared_errors(seen, system.corrections, pixels, len(views))
     known = pixels.known.view(len(views), -1).sum(1)
     return [mse_to_psnr(mse) for mse in (squares / (3 * known)).tolist()]
 

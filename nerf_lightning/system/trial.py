@@ -51,11 +51,16 @@ def some_pixels(
     return Pixels(rays, view, over(views.pixels[places], backgrounds), backgrounds, views.mask[places])
 
 
-def squared_errors(see: See, corrections: Corrections | None, pixels: Pixels, photos: int) -> Float[Tensor, "V"]:
-    """Of each photo: the sum over its known pixels and their channels."""
+def seen_by(see: See, corrections: Corrections | None, pixels: Pixels) -> Rendered:
+    """What cameras see through these pixels, as corrected if they are."""
     with torch.no_grad():
         rays = pixels.rays if corrections is None else corrections.rays(pixels.rays, pixels.views)
-        seen = see(rays, pixels.behind)
+        return see(rays, pixels.behind)
+
+
+def squared_errors(seen: Rendered, corrections: Corrections | None, pixels: Pixels, photos: int) -> Float[Tensor, "V"]:
+    """Of each photo: the sum over its known pixels and their channels, in corrected light if it is."""
+    with torch.no_grad():
         rgb = seen.rgb
         if corrections is not None:
             rgb = corrections.lit(rgb, seen.opacity, pixels.behind, pixels.views)
@@ -65,23 +70,26 @@ def squared_errors(see: See, corrections: Corrections | None, pixels: Pixels, ph
 
 def derivatives(
     see: See, corrections: Corrections, pixels: Pixels, photos: int
-) -> tuple[Float[Tensor, "V N 1"], Float[Tensor, "V N 9"]]:
-    """What is left to explain of each pixel's channels, and how they follow their photo's `motions` and `log_gains`."""
+) -> tuple[Float[Tensor, "V P 1"], Float[Tensor, "V P 9"]]:
+    """What is left to explain of one channel of each pixel, red, green and blue in turn, and how it follows its photo's
+    `motions` and `log_gains`. All three channels would cost three times the gradient and say little more."""
     with torch.no_grad():
         rays = corrections.rays(pixels.rays, pixels.views)
     origins, directions = (x.detach().requires_grad_() for x in (rays.origins, rays.directions))
+    channel = (torch.arange(len(pixels.views), device=directions.device) % 3)[:, None]
     with torch.enable_grad():
         seen = see(Rays(origins, directions), pixels.behind)
         rgb = corrections.lit(seen.rgb, seen.opacity, pixels.behind, pixels.views, pixels.truth)
-        by = [torch.autograd.grad(rgb[:, c].sum(), (origins, directions), retain_graph=c < 2) for c in range(3)]
+        moves, turns = torch.autograd.grad(rgb.gather(1, channel).sum(), (origins, directions))
     with torch.no_grad():
-        moves, turns = (torch.stack(found, dim=1) for found in zip(*by, strict=True))
-        turns = torch.linalg.cross(directions[:, None].expand_as(turns), turns, dim=2)
-        by_motion = torch.cat([turns, moves], dim=2) @ corrections.scales.index_select(0, pixels.views)
+        turns = torch.linalg.cross(directions, turns, dim=1)
+        by_motion = torch.cat([turns, moves], dim=1)[:, None] @ corrections.scales.index_select(0, pixels.views)
         lit = rgb - (1 - seen.opacity)[:, None] * pixels.behind
+        by_gain = torch.zeros_like(lit).scatter(1, channel, lit.gather(1, channel))
         counted = pixels.known[:, None].float()
-        jacobian = torch.cat([by_motion, torch.diag_embed(lit)], dim=2) * counted[..., None]
-        return ((pixels.truth - rgb) * counted).view(photos, -1, 1), jacobian.view(photos, -1, 9)
+        jacobian = torch.cat([by_motion[:, 0], by_gain], dim=1) * counted
+        left = (pixels.truth - rgb).gather(1, channel) * counted
+        return left.view(photos, -1, 1), jacobian.view(photos, -1, 9)
 
 
 def least_squares(left: Float[Tensor, "V N 1"], jacobian: Float[Tensor, "V N K"]) -> Float[Tensor, "V K"]:
@@ -124,14 +132,14 @@ def worth(
     deciding, judging = (some_pixels(views, chosen, PIXELS, behind, generator) for _ in range(2))
     left, jacobian = derivatives(see, corrections, deciding, len(chosen))
 
-    def errors(motions: Tensor | None, log_gains: Tensor | None) -> Float[Tensor, "V"]:
+    def errors(motions: Tensor | None, log_gains: Tensor | None, seen: Rendered | None = None) -> Float[Tensor, "V"]:
         trial = changed(corrections, chosen, motions, log_gains)
-        return squared_errors(see, trial, judging, len(chosen))
+        return squared_errors(seen or seen_by(see, trial, judging), trial, judging, len(chosen))
 
-    both = least_squares(left, jacobian)
-    as_it_is, corrected = errors(None, None), errors(both[:, POSES], both[:, LIGHT])
+    both, given = least_squares(left, jacobian), seen_by(see, corrections, judging)
+    as_it_is, corrected = errors(None, None, given), errors(both[:, POSES], both[:, LIGHT])
     only_poses = errors(least_squares(left, jacobian[..., POSES]), None)
-    only_light = errors(None, least_squares(left, jacobian[..., LIGHT]))
+    only_light = errors(None, least_squares(left, jacobian[..., LIGHT]), given)
     shares = ((without - corrected) / as_it_is for without in (only_light, only_poses))  # nan where all is masked
     poses, light = (float(share.nanmedian().nan_to_num()) for share in shares)
     return {"poses": poses, "light": light}

@@ -11,7 +11,7 @@ from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.refine import Corrections
-from nerf_lightning.refine.corrections import FAR, FASTER, HURRY, RIPENED, START, TRIALS
+from nerf_lightning.refine.corrections import FAR, FASTER, HURRY, LIT, RIPENED, START, TRIALS
 from nerf_lightning.renderer import Rendered, VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system.fits import misfits
@@ -89,15 +89,17 @@ def test_least_squares_are_damped_and_leave_alone_what_has_no_effect():
 def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Views):
     corrections = Corrections(views.cameras, BOX, auto=True)
     assert corrections.factors(1.0) == [0.0, 0.0] and not corrections.since
-    assert not corrections.due(TRIALS[0] - 0.01) and corrections.due(TRIALS[0])
-    corrections.note(TRIALS[0], {"poses": 0.3, "light": 0.005})
+    assert not corrections.due(TRIALS[0] - 0.001) and corrections.due(TRIALS[0])
+    corrections.note(TRIALS[0], {"poses": 0.3, "light": 0.5})
+    assert TRIALS[0] < LIT, "too early for gains"
     assert corrections.motions.requires_grad and not corrections.log_gains.requires_grad
-    assert not corrections.due(TRIALS[1] - 0.01) and corrections.due(TRIALS[1])
-    assert corrections.factors(TRIALS[0]) == [FASTER, 0.0] and corrections.factors(1.0) == [Corrections.FINAL, 0.0]
+    assert not corrections.due(TRIALS[1] - 0.001) and corrections.due(TRIALS[1])
+    assert corrections.factors(START - 0.001) == [0.0, 0.0] and corrections.factors(START) == [FASTER, 0.0]
+    assert corrections.factors(1.0) == [Corrections.FINAL, 0.0]
     again = Corrections(views.cameras, BOX, auto=True)
     again.decide(corrections.decided())
     assert again.motions.requires_grad and again.decided() == corrections.decided()
-    corrections.note(TRIALS[2], {"poses": 0.0, "light": 0.005})
+    corrections.note(TRIALS[-1], {"poses": 0.0, "light": 0.005})
     assert not corrections.due(1.0)
     assert "light as given (corrections would lower most photos' error by 0.5%)" in corrections.told()
 
