@@ -91,13 +91,13 @@ def measure(
     """One line for each scene, condition and recipe, without and with `refine=auto`: medians over seeds."""
     rows = []
     for whole in [nl.load_scene(path) for path in scenes] or [bricks()]:
-        for condition, recipe, refine in itertools.product(CONDITIONS, recipes, ("null", "auto")):
+        for condition, recipe, refine in itertools.product(CONDITIONS, recipes, ("none", "auto")):
             views, spoil = CONDITIONS[condition]
             truth = whole if views is None else damage.with_views(whole, 0, views)
             found = []
             for seed in seeds:
                 print(f"cameras: {whole.name}, {condition}, {recipe}, refine={refine}, seed {seed}", flush=True)
-                options = [f"refine={refine}", *overrides]
+                options = [*([] if refine == "none" else [f"refine={refine}"]), *overrides]
                 found.append(one(truth, spoil(truth, seed), recipe, options, seed, output / "cameras"))
             about = {"scene": whole.name, "condition": condition, "recipe": recipe, "refine": refine}
             rows.append(about | {key: median(row[key] for row in found) for key in found[0]})
