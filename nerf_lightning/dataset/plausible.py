@@ -39,8 +39,12 @@ class Doubt:
     """Whether training cannot work at all."""
 
 
-def check_scene(scene: Scene) -> list[str]:
+def check_scene(scene: Scene, corrected: bool = False) -> list[str]:
     """Checks a scene before training and returns warnings.
+
+    Args:
+        scene: to train on.
+        corrected: whether training corrects poses: outlines that fit no body are worth a try then.
 
     Raises:
         InputError: no method can learn anything from the data.
@@ -48,7 +52,7 @@ def check_scene(scene: Scene) -> list[str]:
     warnings = []
     for check in (looking_away, border, misfits, repeats, overlap, cut_short):
         for doubt in check(scene):
-            if doubt.hopeless:
+            if doubt.hopeless and not (corrected and check is misfits):
                 expected = "photos and poses that fit each other"
                 raise InputError(scene.source, "", doubt.text, expected, "see the file's convention")
             warnings.append(doubt.text)

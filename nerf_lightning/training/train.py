@@ -83,7 +83,8 @@ def train(
     else:
         data = RayDataModule(scene, cfg.dataset.rays, cfg.dataset.samples, cfg.dataset.seed)
     data.enlarge(limits_of(cfg, device).batch)
-    doubts = check_scene(data.scene) if isinstance(data, RayDataModule) else []
+    corrected = bool((cfg.get("refine") or {}).get("poses"))
+    doubts = check_scene(data.scene, corrected) if isinstance(data, RayDataModule) else []
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt)
     system = build_system(cfg, frame_of(data), device)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.dataset import Scene, Views, load_npz, save_npz
+from nerf_lightning.dataset import Scene, Views, load_npz, plausible, save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.extent import border_colour
 from nerf_lightning.dataset.plausible import check_scene
@@ -75,6 +75,17 @@ def test_hopeless_scenes_are_refused(change: Change, words: str, pile: Scene):
 def test_photos_that_do_not_fit_are_warned_of(change: Change, pile: Scene):
     (doubt,) = check_scene(change(pile))
     assert "outlines that no body has" in doubt
+
+
+def test_outlines_that_hardly_fit_are_tried_where_poses_are_corrected(pile: Scene, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(plausible, "FITS", 0.97)
+    inexact = shuffled(pile, 0)
+    with pytest.raises(InputError, match="outlines that no body has"):
+        check_scene(inexact)
+    (doubt,) = check_scene(inexact, corrected=True)
+    assert "outlines that no body has" in doubt
+    with pytest.raises(InputError, match="backs to the point"):
+        check_scene(turned_to_opengl(pile, 0), corrected=True)
 
 
 def test_doubtful_scenes_are_warned_of(pile: Scene):
