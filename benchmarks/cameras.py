@@ -1,10 +1,11 @@
 """Cameras and light that are not exact: what each method loses by them, and how much of it `refine` brings back."""
 
 import itertools
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 
 import torch
@@ -12,7 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 import nerf_lightning as nl
-from nerf_lightning.cameras import Cameras
+from nerf_lightning.cameras import Cameras, in_other_frame
+from nerf_lightning.capture.poses.geometry import angle_between
 from nerf_lightning.dataset import Scene
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.runs.data import seen_by_corrected
@@ -56,33 +58,27 @@ CONDITIONS: dict[str, tuple[int | None, Damage]] = {
 """How many photos there are, None for all, and what is done to them."""
 
 
-def similarity(found: Float[Tensor, "V 3"], truth: Float[Tensor, "V 3"]) -> tuple[float, Tensor, Tensor]:
-    """Scale, turn [3, 3] and shift [3] that bring points closest to others (Umeyama 1991, eq. 40 to 43)."""
+def similarity(found: Float[Tensor, "V 3"], truth: Float[Tensor, "V 3"]) -> Float[Tensor, "4 4"]:
+    """The turn, scale and shift that bring points closest to others (Umeyama 1991, eq. 40 to 43)."""
     mean, target = found.mean(0), truth.mean(0)
     left, values, right = torch.linalg.svd((truth - target).mT @ (found - mean))
     signs = torch.ones(3, dtype=found.dtype)
     signs[2] = torch.linalg.det(left @ right).sign()
-    turn = left @ torch.diag(signs) @ right
-    scale = float((values * signs).sum() / (found - mean).square().sum())
-    return scale, turn, target - scale * turn @ mean
+    matrix = torch.eye(4, dtype=found.dtype)
+    matrix[:3, :3] = (values * signs).sum() / (found - mean).square().sum() * (left @ torch.diag(signs) @ right)
+    matrix[:3, 3] = target - matrix[:3, :3] @ mean
+    return matrix
 
 
 def errors(found: Cameras, truth: Cameras, centre: Float[Tensor, "3"]) -> dict[str, float]:
     """Mean angle in degrees and mean distance in percent of that to the content, between cameras whose common turn, scale and
     shift has been taken off: a field does not know of those."""
-    found_c2w, true_c2w = found.c2w.double(), truth.c2w.double()
-    scale, turn, shift = similarity(found_c2w[:, :3, 3], true_c2w[:, :3, 3])
-    relative = true_c2w[:, :3, :3].mT @ turn @ found_c2w[:, :3, :3]
-    sine, cosine = (
-        (relative - relative.mT).flatten(1).norm(dim=1) / 8**0.5,
-        (relative.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2,
-    )
-    apart = (scale * found_c2w[:, :3, 3] @ turn.mT + shift - true_c2w[:, :3, 3]).norm(dim=1)
-    distance = (true_c2w[:, :3, 3] - centre.double()).norm(dim=1)
-    return {
-        "degrees": float(torch.atan2(sine, cosine).rad2deg().mean()),
-        "moved_percent": 100 * float((apart / distance).mean()),
-    }
+    true = truth.c2w.double()
+    together = in_other_frame(found.c2w, similarity(found.c2w[:, :3, 3].double(), true[:, :3, 3]))
+    turned = [angle_between(a, b) for a, b in zip(together.numpy(), true.numpy(), strict=True)]
+    apart = (together - true)[:, :3, 3].norm(dim=1)
+    distance = (true[:, :3, 3] - centre.double()).norm(dim=1)
+    return {"degrees": math.degrees(fmean(turned)), "moved_percent": 100 * float((apart / distance).mean())}
 
 
 def measure(
@@ -105,7 +101,7 @@ def measure(
 
 
 def one(truth: Scene, spoilt: Scene, recipe: str, options: list[str], seed: int, folder: Path) -> dict[str, float]:
-    """The figures of one training on a spoilt scene: dB, the cameras' errors, and how many photos that are wrong were named."""
+    """The figures of one training on a spoilt scene: dB, the cameras' errors, and how many photos were named as unfit."""
     shutil.rmtree(folder, ignore_errors=True)
     options = [*options, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "callbacks.heldout.at=[]"]
     results = nl.train(spoilt, recipe, steps=STEPS, seed=seed, folder=folder, options=options).results

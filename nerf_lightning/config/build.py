@@ -122,8 +122,9 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
         return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
     field = build_field(cfg, Field, "three coordinates", bounds=frame.bounds)
     sampler = make(cfg, "sampler", bounds=frame.bounds)
-    seen = {"half_size": float(frame.bounds.half_size.min()), "unbounded": frame.bounds.unbounded}
-    renderer = make(cfg, "renderer", scene_background=frame.background, alpha=frame.alpha, **seen)
+    bounds = frame.bounds
+    seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
+    renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
     corrections = None
     if cfg.get("refine") is not None and frame.cameras is not None:
         corrections = make(cfg, "refine", cameras=frame.cameras, bounds=frame.bounds)

@@ -37,6 +37,8 @@ class Doubt:
     text: str
     hopeless: bool = False
     """Whether training cannot work at all."""
+    inexact: bool = False
+    """Whether correcting the poses may help."""
 
 
 def check_scene(scene: Scene, corrected: bool = False) -> list[str]:
@@ -52,7 +54,7 @@ def check_scene(scene: Scene, corrected: bool = False) -> list[str]:
     warnings = []
     for check in (looking_away, border, misfits, repeats, overlap, cut_short):
         for doubt in check(scene):
-            if doubt.hopeless and not (corrected and check is misfits):
+            if doubt.hopeless and not (corrected and doubt.inexact):
                 expected = "photos and poses that fit each other"
                 raise InputError(scene.source, "", doubt.text, expected, "see the file's convention")
             warnings.append(doubt.text)
@@ -107,7 +109,7 @@ def misfits(scene: Scene) -> Iterator[Doubt]:
             f"outlines that no body has: the photos together can explain {explained:.0%} of what each shows."
             " The poses may belong to other photos, be turned, or be inexact"
         )
-        yield Doubt(text, hopeless=explained < FITS)
+        yield Doubt(text, hopeless=explained < FITS, inexact=True)
 
 
 def hull_coverage(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Cameras, bounds: Bounds) -> float:

@@ -103,7 +103,7 @@ class Corrections(torch.nn.Module):
     def begin(self, progress: float, *names: str) -> None:
         """Corrects poses or light from now on."""
         for name in names:
-            self.since[name] = max(progress, START)
+            self.since[name] = progress
             self.get_parameter(PARAMETERS[name]).requires_grad_(True)
 
     def due(self, progress: float) -> bool:

@@ -63,13 +63,13 @@ class VolumeRenderer(torch.nn.Module):
             own in evaluation; wants images with alpha), "suited" (random where there is alpha, else the scene's own), or
             three numbers in [0, 1].
         scene_background: the colour "scene" stands for.
-        alpha: whether the photos have alpha.
         distortion_loss_weight: of the penalty on fog in training, see `distortion_loss`; 0 does without.
         near_loss_weight: of the penalty on what stands near the cameras, see `near_loss`, when training begins; it fades out.
         view_loss_weight: of the penalty on what the direction adds to colours, see `view_loss`; "suited" takes
             `SUITED_VIEW_WEIGHT`.
         half_size: of the scene's box, world units.
         unbounded: whether the scene has a background, see `Bounds`.
+        alpha: whether the photos have alpha.
 
     Raises:
         InputError: on any other background, or a negative weight.
@@ -82,12 +82,12 @@ class VolumeRenderer(torch.nn.Module):
         self,
         background: str | list[float] = "scene",
         scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        alpha: bool = False,
         distortion_loss_weight: float = 0.0,
         near_loss_weight: float = 0.0,
         view_loss_weight: float | str = 0.0,
         half_size: float = 1.0,
         unbounded: bool = False,
+        alpha: bool = False,
     ):
         super().__init__()
         if isinstance(view_loss_weight, str):

@@ -47,19 +47,18 @@ def shuffled(scene: Scene, seed: int) -> Scene:
 def with_pose_noise(scene: Scene, seed: int, degrees: float, moved: float = 0.0) -> Scene:
     """Training cameras turned about random axes, by angles of that standard deviation, and moved by lengths of another, given
     as a share of their mean distance to the content's centre."""
-    centre = scene.bounds.centre
 
-    def turn(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
+    def shake(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
         generator = step_generator(seed, Stream.STUDY, 1)
         vectors = torch.randn(len(c2w), 3, generator=generator) * (degrees / 180 * torch.pi / 3**0.5)
         cross = torch.zeros(len(c2w), 3, 3)
         cross[:, [2, 0, 1], [1, 2, 0]] = vectors
         c2w[:, :3, :3] = torch.linalg.matrix_exp(cross - cross.mT) @ c2w[:, :3, :3]
-        distance = float((c2w[:, :3, 3] - centre).norm(dim=1).mean())
+        distance = float((c2w[:, :3, 3] - scene.bounds.centre).norm(dim=1).mean())
         c2w[:, :3, 3] += torch.randn(len(c2w), 3, generator=generator) * (moved * distance / 3**0.5)
         return c2w
 
-    return replace(scene, train=posed(scene.train, turn))
+    return replace(scene, train=posed(scene.train, shake))
 
 
 def with_exposure_drift(scene: Scene, seed: int, share: float, tint: float = 0.0) -> Scene:

@@ -103,7 +103,7 @@ def test_random_backgrounds_need_a_generator():
 
 @pytest.mark.parametrize("alpha", [False, True])
 def test_the_suited_background_is_random_where_photos_have_alpha(alpha: bool):
-    renderer = VolumeRenderer("suited", SCENE, alpha)
+    renderer = VolumeRenderer("suited", SCENE, alpha=alpha)
     assert renderer.random == alpha
     assert torch.equal(renderer.backgrounds(2), torch.tensor(SCENE).expand(2, 3))
 
