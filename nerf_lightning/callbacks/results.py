@@ -20,6 +20,7 @@ from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
 from nerf_lightning.dataset import PictureBatch, Scene
+from nerf_lightning.refine import summary
 from nerf_lightning.system import NeRF2D, NeRF3D, System, aligned_psnr, misfits, mse_to_psnr, psnr_of_photos
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.machine import describe_machine
@@ -198,7 +199,7 @@ class Results(L.Callback):
             "warnings": self.warnings,
             "plateau": budget.stopped,
             "misfits": self.misfits,
-            "corrections": None if corrections is None else corrections.summary(),
+            "corrections": None if corrections is None else summary(corrections),
             "recoveries": [asdict(one) for one in guard.recoveries] if guard is not None else [],
             "status": status,
             "diagnosis": diagnosis,

@@ -117,6 +117,12 @@ class Cameras:
         """The same views, that many times as large; never smaller than a pixel."""
         return self.resized((self.sizes * factor).round().long().clamp_min(1))
 
+    def zoomed(self, factor: float) -> "Cameras":
+        """The same views with that many times the focal length, whose lenses bend the same places of a photo alike."""
+        K = self.K.clone()
+        K[:, :2, :2] *= factor
+        return replace(self, K=K, lenses=None if self.lenses is None else self.lenses.zoomed(factor))
+
     def pixel_width(self, place: Float[Tensor, "3"]) -> float:
         """Width of what one pixel shows at a place, world units: the median over the views."""
         return float(((self.centres - place).norm(dim=1) / self.K[:, 0, 0]).median())

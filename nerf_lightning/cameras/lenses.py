@@ -31,6 +31,10 @@ class Distortion(NamedTuple):
     """Thin prism: s1 r^2 to the right, s2 r^2 down."""
 
 
+POWERS = Distortion(k1=2, k2=4, k3=6, k4=8, d1=2, d2=4, d3=6, p1=1, p2=1, s1=1, s2=1)
+"""Of the distance from the axis, by which each bends a place in proportion to that distance."""
+
+
 @dataclass(frozen=True)
 class Lenses:
     """The distortion of V views, in OpenCV's and COLMAP's terms.
@@ -45,6 +49,11 @@ class Lenses:
 
     def __getitem__(self, index: slice | Tensor) -> "Lenses":
         return Lenses(self.coefficients[index], self.fisheye[index])
+
+    def zoomed(self, factor: float) -> "Lenses":
+        """Of cameras with that many times the focal length, which bend the same places of a photo alike: a place is bent by how
+        far it lies from the axis in focal lengths."""
+        return Lenses(self.coefficients * factor ** self.coefficients.new_tensor(POWERS), self.fisheye)
 
     def to(self, device: torch.device | str) -> "Lenses":
         return Lenses(self.coefficients.to(device), self.fisheye.to(device))

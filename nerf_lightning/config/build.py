@@ -127,7 +127,7 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
     corrections = None
     if cfg.get("refine") is not None and frame.cameras is not None:
-        corrections = make(cfg, "refine", cameras=frame.cameras, bounds=frame.bounds)
+        corrections = make(cfg, "refine", cameras=frame.cameras, bounds=frame.bounds, exposures=frame.exposures)
     return NeRF3D(field, sampler, renderer, **common, corrections=corrections)
 
 
@@ -141,6 +141,8 @@ class SceneFrame:
     """Of the training photos; None where there is nothing to train."""
     alpha: bool = False
     """Whether they have alpha."""
+    exposures: tuple[float, ...] = ()
+    """Light that they gathered, see `Views`."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,8 @@ def frame_of(data: RayDataModule | PixelDataModule) -> Frame:
         return PictureFrame(*data.scene.size)
     bounds, train = data.scene.bounds, data.scene.train
     pixel = train.cameras.pixel_width(bounds.centre)
-    return SceneFrame(replace(bounds, pixel=pixel or None), data.scene.background, train.cameras, train.channels == 4)
+    seen = train.cameras, train.channels == 4, train.exposures
+    return SceneFrame(replace(bounds, pixel=pixel or None), data.scene.background, *seen)
 
 
 def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, system: System) -> None:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from nerf_lightning.cameras import Cameras, Lenses
 from nerf_lightning.dataset.formats.decode import THREADS, image_header, read_pixels
+from nerf_lightning.dataset.formats.exif import stated_exposure
 from nerf_lightning.dataset.lens import Lens, rectify
 from nerf_lightning.dataset.masks import SURE, cut_out, read_mask, seem_inverted
 from nerf_lightning.dataset.optics import Optics
@@ -142,7 +143,10 @@ def read_shots(source: Path, shots: Sequence[Shot], reading: Reading) -> Views:
     of = sizes if reading.undistort else [(shot.optics.width, shot.optics.height) for shot in shots]
     cameras = Cameras(torch.from_numpy(K).float(), c2w.float(), torch.tensor(of), bent).resized(torch.tensor(small))
     counted = None if known is None or known.all() else Runs.of(torch.from_numpy(known))
-    return Views(torch.from_numpy(pixels), cameras, counted, tuple(shot.name for shot in shots))
+    stated = [stated_exposure(shot.photo) for shot in shots]
+    exposures = tuple(one for one in stated if one is not None)
+    names = tuple(shot.name for shot in shots)
+    return Views(torch.from_numpy(pixels), cameras, counted, names, exposures if len(exposures) == len(shots) else ())
 
 
 def what_masks_mean(shots: Sequence[Shot], reading: Reading) -> str | None:

@@ -53,6 +53,8 @@ class Views:
     """Pixels that count; None for all of them."""
     names: tuple[str, ...] = ()
     """Of the photos' files; empty where they have none."""
+    exposures: tuple[float, ...] = ()
+    """Light that each photo gathered, in any unit; empty unless all files state it."""
 
     @classmethod
     def of(cls, images: UInt8[Tensor, "V H W C"], cameras: Cameras) -> "Views":
@@ -131,7 +133,8 @@ class Views:
         if self.known is not None:
             known = Runs.of(torch.cat([self.mask[part] for part in chosen]) if chosen else self.mask[:0])
         names = tuple(self.names[view] for view in index.tolist()) if self.names else ()
-        return Views(pixels, self.cameras[index], known, names)
+        exposures = tuple(self.exposures[view] for view in index.tolist()) if self.exposures else ()
+        return Views(pixels, self.cameras[index], known, names, exposures)
 
     def spread(self, count: int) -> "Views":
         """At most `count` views, evenly spaced from the first to the last."""
@@ -139,4 +142,4 @@ class Views:
 
     def to(self, device: torch.device) -> "Views":
         known = None if self.known is None else self.known.to(device)
-        return Views(self.pixels.to(device), self.cameras.to(device), known, self.names)
+        return Views(self.pixels.to(device), self.cameras.to(device), known, self.names, self.exposures)

@@ -1,8 +1,7 @@
 """What is learned about each photo's camera and light."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
-from statistics import median
 from typing import Any
 
 import torch
@@ -11,34 +10,31 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.errors import InputError
+from nerf_lightning.refine.lens import LensCorrections
 from nerf_lightning.refine.poses import pixel_shifts, turned, whitening
-from nerf_lightning.utils.listing import first_few
 from nerf_lightning.utils.seeding import Stream, step_generator
 
+GAMMA = 2.2
+"""Of sRGB, about: pixels grow with the light to the power of 1 / GAMMA."""
 PLACES = 512
 """Places in the box by which the motion of a camera is measured."""
 DAMPING = 1.0
 """See `whitening`. A turn and a move of a camera that undo each other in the photo are told apart slowly, and surely."""
 START = 0.02
 """Share of the training before which nothing is corrected: photos cannot fit a field that shows nothing yet."""
-TRIALS = (0.02, 0.04, 0.07, 0.1, 0.2, 0.4)
-"""Shares of it at which `auto` tries what it does not correct yet: large faults show while the field is smooth, as later it has
-explained them by fog; small ones show when it is sharp."""
-LIT = 0.04
-"""Share of it before which gains are not tried: a field that is still too dark everywhere wants gains."""
+FIRST, GROWTH, LAST = 16, 1.5, 0.4
+"""Of the trials of `auto`: the step of the first, the factor from one to the next, and the share of the training that they end
+with. Large faults show while the field is smooth, as later it has explained them by fog; small ones when it is sharp."""
+LIT = 64
+"""Steps before which gains are not tried: a field that is still too dark everywhere wants gains."""
 HURRY, FAR, FASTER = 0.1, 4.0, 3.0
 """Poses move `FASTER` times as fast for a first share of the training, and then where they have moved far: with the root mean
 square of how far the content has moved in the photos, above `FAR` pixels. What is far off would else not arrive."""
 WORTHWHILE = {"poses": 0.01, "light": 0.05}
 """Share by which most photos' squared error has to fall. Exact poses raise it; gains explain a little of all that is wrong, and
 make the neutral look another than that of the photos."""
-FAR_OFF = 2.5
-"""Degrees by which most cameras may have turned: from 2 degrees they come back, from 5 most do not."""
-APART, NAMED = 4.0, 5
-"""Times the median by which a photo moves far more than the others, and how many of such are named."""
 RIPENED = 0.4
 """Share of the training that it takes, once poses are corrected, until the field has grown."""
-PARAMETERS = {"poses": "motions", "light": "log_gains"}
 
 
 class Corrections(torch.nn.Module):
@@ -47,8 +43,13 @@ class Corrections(torch.nn.Module):
     Args:
         cameras: of the V photos, as given.
         bounds: of the content.
+        exposures: light that each photo gathered, in any unit, as its file states; empty where that is not known. Gains start
+            from them; with `auto` only if that lowers the error.
         poses: whether cameras turn and move.
         light: whether photos have gains.
+        focal: whether, with poses, the focal length that all photos share is corrected.
+        affine: whether, with light, the colours of each photo are mixed and shifted too, besides their gains.
+        vignetting: whether, with light, photos may be darker toward their corners, all alike.
         pose_rate: learning rate of poses, in pixels that the content moves a step.
         light_rate: learning rate of the gains' logarithms.
         auto: whether each is corrected from the first trial on that shows that it helps, and else not; see `due` and `note`.
@@ -56,19 +57,24 @@ class Corrections(torch.nn.Module):
             of a field that is already there have their own.
 
     Raises:
-        InputError: where neither is to be corrected, or a rate is not above 0.
+        InputError: where neither is to be corrected, a part of what is not, or a rate is not above 0.
     """
 
     FINAL = 0.1
     """Factor on the rates at the end."""
     scales: Tensor
+    stated: Tensor
 
     def __init__(
         self,
         cameras: Cameras,
         bounds: Bounds,
+        exposures: Sequence[float] = (),
         poses: bool = True,
         light: bool = True,
+        focal: bool = False,
+        affine: bool = False,
+        vignetting: bool = False,
         pose_rate: float = 0.1,
         light_rate: float = 0.003,
         auto: bool = False,
@@ -77,6 +83,14 @@ class Corrections(torch.nn.Module):
         super().__init__()
         if not (poses or light):
             raise InputError("refine.poses", "", "false, with refine.light=false", "one of them", "or give refine=null")
+        for name, part, whole in (
+            ("focal", focal, poses),
+            ("affine", affine, light),
+            ("vignetting", vignetting, light),
+        ):
+            if part and not whole:
+                needed = "refine.poses" if name == "focal" else "refine.light"
+                raise InputError(f"refine.{name}", "", f"true, with {needed}=false", "false", f"or give {needed}=true")
         self.given_rates = pose_rate, light_rate
         for name, rate in (("pose_rate", pose_rate), ("light_rate", light_rate)):
             if not rate > 0:
@@ -88,35 +102,51 @@ class Corrections(torch.nn.Module):
         self.register_buffer("scales", whitening(shifts, DAMPING).float())
         self.motions = torch.nn.Parameter(torch.zeros(len(cameras), 6), requires_grad=False)
         self.log_gains = torch.nn.Parameter(torch.zeros(len(cameras), 3), requires_grad=False)
+        logs = torch.tensor(exposures).log() / GAMMA if exposures else torch.zeros(len(cameras))
+        self.register_buffer("stated", (logs - logs.mean())[:, None].expand(-1, 3).clone(), persistent=False)
+        self.mixing = torch.nn.Parameter(torch.zeros(len(cameras), 3, 4), requires_grad=False) if affine else None
+        self.lens = LensCorrections(cameras, focal, vignetting)
         self.centred = centred
         self.rates = {name: rate for name, rate, wanted in rates if wanted}
         self.auto = auto
         self.tried = 0
-        """Trials so far."""
+        """Trials so far, or that were missed."""
         self.worth: dict[str, float] = {}
         """What the last of them said, see `note`."""
         self.since: dict[str, float] = {}
         """What is corrected, and from which progress on."""
         if not auto:
             self.begin(START, *self.rates)
+            self.log_gains.data.copy_(self.stated * light)
 
     def begin(self, progress: float, *names: str) -> None:
         """Corrects poses or light from now on."""
         for name in names:
             self.since[name] = progress
-            self.get_parameter(PARAMETERS[name]).requires_grad_(True)
+            for parameter in self._of(name):
+                parameter.requires_grad_(True)
 
-    def due(self, progress: float) -> bool:
+    def _of(self, name: str) -> list[torch.nn.Parameter]:
+        """What is learned of poses, or of light."""
+        poses, light = (self.motions, self.lens.zoom), (self.log_gains, self.mixing, self.lens.darkening)
+        return [one for one in (poses if name == "poses" else light) if one is not None]
+
+    def due(self, step: int, progress: float) -> bool:
         """Whether it is time for a trial."""
         undecided = self.auto and len(self.since) < len(self.rates)
-        return undecided and self.tried < len(TRIALS) and progress >= TRIALS[self.tried]
+        return undecided and progress <= LAST and step >= FIRST * GROWTH**self.tried
 
-    def note(self, progress: float, worth: dict[str, float]) -> None:
-        """Takes in what a trial said: by what share the squared error would fall if poses, or light, were corrected."""
-        self.tried = sum(progress >= share for share in TRIALS)
-        open_yet = [name for name in self.rates if name not in self.since and (name != "light" or progress >= LIT)]
+    def note(self, step: int, progress: float, worth: dict[str, float]) -> None:
+        """Takes in what a trial said: by what share the squared error would fall if poses, or light, were corrected, or the
+        stated exposures were taken for gains."""
+        while step >= FIRST * GROWTH**self.tried:
+            self.tried += 1
+        open_yet = [name for name in self.rates if name not in self.since and (name != "light" or step >= LIT)]
         self.worth |= {name: worth[name] for name in open_yet}
-        self.begin(progress, *(name for name in open_yet if worth[name] > WORTHWHILE[name]))
+        chosen = [name for name in open_yet if worth[name] > WORTHWHILE[name]]
+        self.begin(progress, *chosen)
+        if "light" in chosen and worth["stated"] > 0:
+            self.log_gains.data.copy_(self.stated)
 
     def decided(self) -> dict[str, Any]:
         """What the state of the parameters does not say, for `decide`."""
@@ -131,12 +161,15 @@ class Corrections(torch.nn.Module):
     @property
     def groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups: what is or may be corrected, each with its learning rate."""
-        return [{"params": [self.get_parameter(PARAMETERS[name])], "lr": rate} for name, rate in self.rates.items()]
+        return [{"params": self._of(name), "lr": rate} for name, rate in self.rates.items()]
 
     def alike(self, cameras: Cameras, bounds: Bounds) -> "Corrections":
-        """With what is corrected here, for photos of the field that was trained with these."""
+        """With what is corrected here, for photos of the field that was trained with these: by the same lens."""
         poses, light = ("poses" in self.since), ("light" in self.since)
-        return Corrections(cameras, bounds, poses, light, *self.given_rates, centred=False)
+        affine, rates = light and self.mixing is not None, self.given_rates
+        other = Corrections(cameras, bounds, (), poses, light, False, affine, False, *rates, centred=False)
+        other.lens = self.lens.of(cameras)
+        return other
 
     def factors(self, progress: float) -> list[float]:
         """On the rates of `groups`, by progress in training: nothing at first, then from 1 down to `FINAL`."""
@@ -163,7 +196,7 @@ class Corrections(torch.nn.Module):
             return progress
         return min(progress, start + (grown_after - start) * (progress - start) / RIPENED)
 
-    def _own(self, values: Float[Tensor, "V K"]) -> Float[Tensor, "V K"]:
+    def _own(self, values: Float[Tensor, "V *K"]) -> Float[Tensor, "V *K"]:
         """Without their mean, if that is to be zero."""
         return values - values.mean(0) if self.centred else values
 
@@ -184,24 +217,37 @@ class Corrections(torch.nn.Module):
         if not self.motions.requires_grad:
             return rays
         turns, moves = (x.index_select(0, views) for x in self.turns_and_moves)
-        return Rays(rays.origins + moves, turned(rays.directions, turns))
+        return Rays(rays.origins + moves, turned(self.lens.zoomed(rays.directions, views), turns))
 
     def lit(
         self,
         rgb: Float[Tensor, "R 3"],
         opacity: Float[Tensor, "R"],
         backgrounds: Float[Tensor, "R 3"],
+        given: Rays,
         views: Int[Tensor, "R"],
         truth: Float[Tensor, "R 3"] | None = None,
     ) -> Float[Tensor, "R 3"]:
         """Rendered colours as these photos show them; what is behind stays as it is.
 
         Where a photo's own colours are given and are burnt out (1), those that are brighter still count as equal.
+
+        Args:
+            rgb, opacity: rendered.
+            backgrounds: colours behind.
+            given: the pixels' rays, by the cameras as given.
+            views: the photos.
+            truth: their own colours.
         """
         if not self.log_gains.requires_grad:
             return rgb
         behind = (1 - opacity)[:, None] * backgrounds
-        found = (rgb - behind) * self.gains.index_select(0, views) + behind
+        own = rgb - behind
+        shown = own * self.gains.index_select(0, views)
+        if self.mixing is not None:
+            matrix, shift = self._own(self.mixing).index_select(0, views).split((3, 1), dim=2)
+            shown = shown + (matrix * own[:, None]).sum(2) + shift[..., 0] * opacity[:, None]
+        found = shown * self.lens.shade(given.directions, views) + behind
         return found if truth is None else torch.where(truth >= 1, found.clamp_max(1), found)
 
     @torch.no_grad()
@@ -212,38 +258,5 @@ class Corrections(torch.nn.Module):
         for column in range(3):
             c2w[:, :3, column] = turned(c2w[:, :3, column], turns)
         c2w[:, :3, 3] += moves
-        return replace(given, c2w=c2w)
-
-    def told(self, name: Callable[[int], str] = "photo {}".format) -> str:
-        """In a line, what was found; `name` gives the names of photos."""
-        found, said = self.summary(), []
-        if "poses" in self.since:
-            turned_by, moved_by = max(found["turned_degrees"]), max(found["moved"])
-            said.append(f"cameras turned by up to {turned_by:.2f} degrees and moved by up to {moved_by:.3g}")
-            if apart := self.moved_apart():
-                said.append(f"far more than the others: {first_few([name(i) for i in apart], NAMED)}")
-            if (middle := median(found["turned_degrees"])) > FAR_OFF:
-                said.append(
-                    f"half of them by more than {middle:.1f} degrees, too far for all to have found their places"
-                )
-        if "light" in self.since:
-            said.append(f"exposure from {min(found['exposure']):.2f} to {max(found['exposure']):.2f}")
-        for part in self.rates:
-            if part not in self.since:
-                share = max(0.0, self.worth.get(part, 0.0))
-                said.append(f"{part} as given (corrections would lower most photos' error by {share:.1%})")
-        return "refine: " + "; ".join(said)
-
-    def moved_apart(self) -> list[int]:
-        """Photos whose content moved far, and many times as far as in the others; the farthest first."""
-        moved = self.motions.detach().norm(dim=1)
-        limit = max(FAR, APART * float(moved.median()))
-        return [int(i) for i in moved.argsort(descending=True) if moved[i] > limit]
-
-    @torch.no_grad()
-    def summary(self) -> dict[str, list[float]]:
-        """Of each photo: the angle it turned by in degrees, how far it moved in world units, and its mean gain."""
-        turns, moves = self.turns_and_moves
-        columns = turns.norm(dim=1).rad2deg(), moves.norm(dim=1), self.gains.log().mean(1).exp()
-        names = ("turned_degrees", "moved", "exposure")
-        return {name: [round(x, 5) for x in column.tolist()] for name, column in zip(names, columns, strict=True)}
+        factor = self.lens.focal_factor
+        return replace(given if factor is None else given.zoomed(float(factor)), c2w=c2w)

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -42,7 +43,7 @@ def seen_by_corrected(scene: Scene, content: Mapping[str, Any]) -> Scene:
     """A run's scene with its training cameras as the training has corrected them, if it has.
 
     Raises:
-        InputError: where those are not as many poses as there are photos.
+        InputError: where those are not as many poses as there are photos, or the factor on the focal length is none.
     """
     if "corrected" not in content:
         return scene
@@ -54,6 +55,11 @@ def seen_by_corrected(scene: Scene, content: Mapping[str, Any]) -> Scene:
         raise InputError(
             "scene.json", "corrected", str(error), expected, "have photos been added or removed?"
         ) from error
+    factor = content.get("focal_factor")
+    if factor is not None:
+        if not (isinstance(factor, int | float) and 0 < factor < math.inf):
+            raise InputError("scene.json", "focal_factor", repr(factor), "a number above 0, or null")
+        cameras = cameras.zoomed(factor)
     return replace(scene, train=replace(scene.train, cameras=replace(cameras, c2w=c2w)))
 
 

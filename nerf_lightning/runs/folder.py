@@ -70,11 +70,17 @@ def load_config(folder: Path) -> DictConfig:
     return OmegaConf.create(checked)
 
 
-def save_scene(data: RayDataModule | PixelDataModule, folder: Path, corrected: Cameras | None = None) -> None:
-    """Writes what rendering needs of the scene, without its photos, and the training cameras if training has corrected them."""
+def save_scene(
+    data: RayDataModule | PixelDataModule,
+    folder: Path,
+    corrected: Cameras | None = None,
+    focal_factor: float | None = None,
+) -> None:
+    """Writes what rendering needs of the scene, without its photos, and the training cameras if training has corrected them,
+    perhaps with a factor on their focal length."""
     content = scene_content(data)
     if corrected is not None:
-        content["corrected"] = corrected.c2w.tolist()
+        content |= {"corrected": corrected.c2w.tolist(), "focal_factor": focal_factor}
     write_json(folder / "scene.json", content)
 
 

@@ -39,7 +39,7 @@ def fitted(system: NeRF3D, views: Views, places: Int[Tensor, "P"], corrections: 
         behind = system.renderer.backgrounds(RAYS)
         seen = see(corrections.rays(given, view), behind)
         truth = over(views.pixels[some], behind)
-        rgb = corrections.lit(seen.rgb, seen.opacity, behind, view, truth)
+        rgb = corrections.lit(seen.rgb, seen.opacity, behind, given, view, truth)
         optimizer.zero_grad()
         torch.nn.functional.mse_loss(rgb, truth).backward()
         optimizer.step()
@@ -64,7 +64,7 @@ def aligned_psnr(system: NeRF3D, views: Views) -> list[float]:
             for view, part in enumerate(parts):
                 given, of = rays_through(views, part[1 - side])
                 seen, behind = system.render(corrections.rays(given, of)), system.renderer.backgrounds(len(of))
-                rgb = corrections.lit(seen.rgb, seen.opacity, behind, of).clamp(0, 1)
+                rgb = corrections.lit(seen.rgb, seen.opacity, behind, given, of).clamp(0, 1)
                 squares[view] += float((rgb - over(views.pixels[part[1 - side]], behind)).square().sum())
                 counts[view] += rgb.numel()
     return [mse_to_psnr(mse) for mse in (squares / counts.clamp_min(1)).tolist()]

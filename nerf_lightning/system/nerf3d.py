@@ -77,7 +77,7 @@ class NeRF3D(System):
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
         if self.corrections is not None:
-            if self.corrections.due(self.progress):
+            if self.corrections.due(self.global_step, self.progress):
                 self.try_corrections()
             factors = self.corrections.factors(self.progress)
             ours = self.parameter_groups[-len(factors) :]  # the last, see `learned`; there is at least one
@@ -130,7 +130,7 @@ class NeRF3D(System):
             step_generator(self.seed, Stream.TRIAL, self.global_step, self.device),
         )
         found = worth(self.as_it_is(), views, self.renderer.colour, self.corrections, generator)
-        self.corrections.note(self.progress, found)
+        self.corrections.note(self.global_step, self.progress, found)
 
     def rehearse(self, batch: RayBatch) -> None:
         """Runs a step on a copy with the clock stopped: compiling for a new size does not count as training."""
@@ -157,7 +157,7 @@ class NeRF3D(System):
         truth, rgb = over(batch.pixels, backgrounds), rendered.rgb
         if corrections is not None:
             assert batch.views is not None
-            rgb = corrections.lit(rgb, rendered.opacity, backgrounds, batch.views, truth)
+            rgb = corrections.lit(rgb, rendered.opacity, backgrounds, batch.rays, batch.views, truth)
         # A ray without all of its samples must not be learned from.
         rgb = rgb if samples.whole is None else torch.where(samples.whole[:, None], rgb, truth)
         loss = torch.nn.functional.mse_loss(rgb, truth)

@@ -63,7 +63,7 @@ def squared_errors(seen: Rendered, corrections: Corrections | None, pixels: Pixe
     with torch.no_grad():
         rgb = seen.rgb
         if corrections is not None:
-            rgb = corrections.lit(rgb, seen.opacity, pixels.behind, pixels.views)
+            rgb = corrections.lit(rgb, seen.opacity, pixels.behind, pixels.rays, pixels.views)
         rgb = rgb.clamp(0, 1)
         return ((rgb - pixels.truth).square().sum(1) * pixels.known).view(photos, -1).sum(1)
 
@@ -79,7 +79,7 @@ def derivatives(
     channel = (torch.arange(len(pixels.views), device=directions.device) % 3)[:, None]
     with torch.enable_grad():
         seen = see(Rays(origins, directions), pixels.behind)
-        rgb = corrections.lit(seen.rgb, seen.opacity, pixels.behind, pixels.views, pixels.truth)
+        rgb = corrections.lit(seen.rgb, seen.opacity, pixels.behind, pixels.rays, pixels.views, pixels.truth)
         moves, turns = torch.autograd.grad(rgb.gather(1, channel).sum(), (origins, directions))
     with torch.no_grad():
         turns = torch.linalg.cross(directions, turns, dim=1)
@@ -118,8 +118,8 @@ def worth(
     see: See, views: Views, behind: Float[Tensor, "3"], corrections: Corrections, generator: Generator
 ) -> dict[str, float]:
     """By what share of itself a photo's squared error falls on pixels that did not decide, if a field that stays as it is may
-    be seen by corrected cameras ("poses") and in corrected light ("light"), each besides the other: the median over photos,
-    since a few in which something moved say nothing of the others.
+    be seen by corrected cameras ("poses") and in corrected light ("light"), each besides the other, or in light by the stated
+    exposures alone ("stated"): the median over photos, since a few in which something moved say nothing of the others.
 
     Args:
         see: renders.
@@ -140,6 +140,7 @@ def worth(
     as_it_is, corrected = errors(None, None, given), errors(both[:, POSES], both[:, LIGHT])
     only_poses = errors(least_squares(left, jacobian[..., POSES]), None)
     only_light = errors(None, least_squares(left, jacobian[..., LIGHT]), given)
-    shares = ((without - corrected) / as_it_is for without in (only_light, only_poses))  # nan where all is masked
-    poses, light = (float(share.nanmedian().nan_to_num()) for share in shares)
-    return {"poses": poses, "light": light}
+    stated = errors(None, corrections.stated[chosen], given)
+    fallen = {"poses": only_light - corrected, "light": only_poses - corrected, "stated": as_it_is - stated}
+    shares = {name: by / as_it_is for name, by in fallen.items()}  # nan where all is masked
+    return {name: float(share.nanmedian().nan_to_num()) for name, share in shares.items()}

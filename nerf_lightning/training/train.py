@@ -29,6 +29,7 @@ from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field
+from nerf_lightning.refine import summary, told
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, load_scene, read_checkpoint, save_config, save_scene
 from nerf_lightning.system import NeRF2D, NeRF3D, System
@@ -106,10 +107,11 @@ def train(
         if isinstance(system, NeRF3D) and system.corrections is not None:
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
             if "poses" in system.corrections.since:
-                save_scene(data, folder, system.corrections.cameras(data.scene.train.cameras))
+                cameras = system.corrections.cameras(data.scene.train.cameras)
+                save_scene(data, folder, cameras, summary(system.corrections)["focal_factor"])
             found = results.summary["psnr_aligned"]
             aligned = "" if found is None else f"; {found:.2f} dB held out with held-out photos corrected too"
-            print(system.corrections.told(data.scene.train.name) + aligned)
+            print(told(system.corrections, data.scene.train.name) + aligned)
         if results.misfits:
             named = first_few([f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results.misfits], NAMED)
             print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}")

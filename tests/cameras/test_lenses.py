@@ -52,6 +52,16 @@ def test_rays_are_those_of_opencv(name: str):
     assert (np.sum(rays * expected, axis=1) > 0).all() and angle.max() < 1e-5
 
 
+@pytest.mark.parametrize("name", [name for name, (_, fisheye) in MODELS.items() if not fisheye])
+def test_another_focal_length_bends_the_same_places_alike(name: str):
+    row, col = places(500)
+    given, zoomed = (
+        cameras.rays(torch.zeros_like(row), row, col).directions
+        for cameras in (cameras_with(name), cameras_with(name).zoomed(1.2))
+    )
+    torch.testing.assert_close(zoomed[:, :2] / zoomed[:, 2:] * 1.2, given[:, :2] / given[:, 2:], atol=1e-5, rtol=0)
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_projecting_leads_back_to_the_pixel(name: str):
     cameras, (row, col) = cameras_with(name), places(500)

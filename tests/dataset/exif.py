@@ -5,7 +5,14 @@ from PIL.TiffImagePlugin import IFDRational
 
 
 def tags(
-    orientation: int = 1, make: str = "", model: str = "", focal: float | IFDRational = 0.0, focal_35mm: int = 0
+    orientation: int = 1,
+    make: str = "",
+    model: str = "",
+    focal: float | IFDRational = 0.0,
+    focal_35mm: int = 0,
+    seconds: float | IFDRational = 0.0,
+    aperture: float = 0.0,
+    speed: int = 0,
 ) -> bytes:
     """EXIF, without the tags that are empty or 0; focal lengths in millimetres."""
     exif = Image.Exif()
@@ -16,6 +23,9 @@ def tags(
         (exif, 0x0110, model),
         (details, 0x920A, focal),
         (details, 0xA405, focal_35mm),
+        (details, 0x829A, seconds),
+        (details, 0x829D, aperture),
+        (details, 0x8827, speed),
     ):
         if value:
             place[tag] = value

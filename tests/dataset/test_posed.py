@@ -5,12 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from nerf_lightning.cameras import Cameras, focus_point, orbit_around
 from nerf_lightning.dataset import Views, open_scene
+from nerf_lightning.dataset.formats.exif import stated_exposure
 from nerf_lightning.dataset.posed import framed
 from tests.dataset.colmap_files import photos, write_transforms
+from tests.dataset.exif import tags
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 
@@ -52,3 +55,20 @@ def test_a_walk_along_a_wall_is_sampled_from_the_lens_on(tmp_path: Path):
         names = photos(tmp_path / name, views)
         write_transforms(tmp_path / name / "transforms.json", views, names, w=16, h=12)
         assert open_scene(str(tmp_path / name)).bounds.near == (near if near is None else pytest.approx(near))
+
+
+@pytest.mark.parametrize("silent", [None, 3])
+def test_photos_state_the_light_that_they_gathered_or_none_does(silent: int | None, tmp_path: Path):
+    K = torch.tensor([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]]).repeat(9, 1, 1)
+    c2w = orbit_around(torch.zeros(3), UP, 2.0, 0.4, 9)
+    views = Views.of(torch.zeros(9, 12, 16, 3, dtype=torch.uint8), Cameras.of_size(K, c2w, 16, 12))
+    names = photos(tmp_path, views, ".jpg")
+    for i, name in enumerate(names):
+        exif = tags(seconds=2.0**-i, aperture=2.0, speed=0 if i == silent else 100)
+        Image.new("RGB", (16, 12)).save(tmp_path / name, exif=exif)
+    write_transforms(tmp_path / "transforms.json", views, names, w=16, h=12)
+    scene = open_scene(str(tmp_path), holdout=4)
+    stated = {name: 25 * 2.0**-i for i, name in enumerate(names)} if silent is None else {}
+    for part in (scene.train, scene.val):
+        assert part.exposures == pytest.approx(tuple(stated[name] for name in part.names if stated))
+    assert stated_exposure(tmp_path / "transforms.json") is None

@@ -17,7 +17,7 @@ from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.export.verb import export
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
-from nerf_lightning.refine import Corrections
+from nerf_lightning.refine import Corrections, summary, told
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, load_scene
@@ -28,6 +28,11 @@ from nerf_lightning.training.train import train
 VIEWS, SIZE = 5, 12
 """Photos, and pixels along a side of each."""
 STEPS = 300
+
+
+def everything(cameras: Cameras) -> Corrections:
+    """All that can be corrected."""
+    return Corrections(cameras, BOX, focal=True, affine=True, vignetting=True)
 
 
 @pytest.fixture
@@ -51,8 +56,9 @@ def test_at_the_start_nothing_is_corrected_and_means_stay_zero(cameras: Cameras)
 
 
 def test_corrected_rays_are_those_of_the_corrected_cameras(cameras: Cameras):
-    corrections = Corrections(cameras, BOX)
+    corrections = everything(cameras)
     torch.nn.init.normal_(corrections.motions, std=2)
+    corrections.lens.zoom.data -= 1
     pixels = some_pixels(50)
     found = corrections.rays(cameras.rays(*pixels), pixels[0])
     expected = corrections.cameras(cameras).rays(*pixels)
@@ -62,30 +68,28 @@ def test_corrected_rays_are_those_of_the_corrected_cameras(cameras: Cameras):
 
 def test_cameras_that_were_far_off_are_said_to_be_so(cameras: Cameras):
     corrections = Corrections(cameras, BOX, light=False)
-    for size, told in ((0.1, False), (100.0, True)):
+    for size, far in ((0.1, False), (100.0, True)):
         torch.nn.init.normal_(corrections.motions, std=size)
-        assert ("too far for all to have found their places" in corrections.told()) == told
+        assert ("too far for all to have found their places" in told(corrections)) == far
 
 
 def test_gains_leave_the_background_alone(cameras: Cameras):
     corrections, views = Corrections(cameras, BOX, poses=False), torch.arange(VIEWS)
     torch.nn.init.normal_(corrections.log_gains)
     behind, opacity = torch.rand(VIEWS, 3), torch.tensor([0, 0.5, 1, 1, 1])
-    red = torch.tensor([0.5, 0, 0]).expand(VIEWS, 3)
-    found = corrections.lit(opacity[:, None] * red + (1 - opacity)[:, None] * behind, opacity, behind, views)
+    red, given = torch.tensor([0.5, 0, 0]).expand(VIEWS, 3), cameras.rays(views, views, views)
+    found = corrections.lit(opacity[:, None] * red + (1 - opacity)[:, None] * behind, opacity, behind, given, views)
     torch.testing.assert_close(found, opacity[:, None] * red * corrections.gains + (1 - opacity)[:, None] * behind)
 
 
-def test_cameras_and_gains_are_found_again_with_a_known_field(cameras: Cameras):
-    """Photos of a known ball, by cameras that stand elsewhere than was said, in changing light."""
-    truth, corrections = Corrections(cameras, BOX), Corrections(cameras, BOX)
-    torch.nn.init.normal_(truth.motions, std=0.5), torch.nn.init.normal_(truth.log_gains, std=0.1)
+def learned(corrections: Corrections, truth: Corrections, cameras: Cameras) -> None:
+    """From photos of a known ball, by cameras and in light as `truth` says."""
     sampler, renderer, behind = UniformSampler(BOX, 32), VolumeRenderer("black"), torch.zeros(200, 3)
 
     def seen(by: Corrections, pixels: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        rays = by.rays(cameras.rays(*pixels), pixels[0])
+        rays = by.rays(given := cameras.rays(*pixels), pixels[0])
         found = renderer(rays, sampler(rays.detach(), lambda x: x[:, 0]), blob)
-        return by.lit(found.rgb, found.opacity, behind, pixels[0])
+        return by.lit(found.rgb, found.opacity, behind, given, pixels[0])
 
     optimizer = torch.optim.Adam(corrections.groups)
     for step in range(STEPS):
@@ -95,6 +99,13 @@ def test_cameras_and_gains_are_found_again_with_a_known_field(cameras: Cameras):
         optimizer.zero_grad()
         (seen(corrections, pixels) - seen(truth, pixels).detach()).square().mean().backward()
         optimizer.step()
+
+
+def test_cameras_and_gains_are_found_again_with_a_known_field(cameras: Cameras):
+    """Photos by cameras that stand elsewhere than was said, in changing light."""
+    truth, corrections = Corrections(cameras, BOX), Corrections(cameras, BOX)
+    torch.nn.init.normal_(truth.motions, std=0.5), torch.nn.init.normal_(truth.log_gains, std=0.1)
+    learned(corrections, truth, cameras)
     before, after = (
         by.cameras(cameras).c2w - truth.cameras(cameras).c2w for by in (Corrections(cameras, BOX), corrections)
     )
@@ -103,6 +114,50 @@ def test_cameras_and_gains_are_found_again_with_a_known_field(cameras: Cameras):
         float((by.gains - truth.gains).abs().max().detach()) for by in (corrections, Corrections(cameras, BOX))
     )
     assert left < 0.2 * wrong
+
+
+def test_what_the_lens_and_the_colours_of_each_photo_have_is_found_again(cameras: Cameras):
+    truth, corrections = everything(cameras), everything(cameras)
+    truth.lens.zoom.data += 0.5
+    truth.lens.darkening.data += 0.4
+    torch.nn.init.normal_(truth.mixing, std=0.1)
+    learned(corrections, truth, cameras)
+    assert told(corrections).count(f"; focal length times {summary(corrections)['focal_factor']}"[:-2]) == 1
+    wrong = everything(cameras)
+    for name in ("focal_factor", "corner_brightness"):
+        left, before = (abs(summary(by)[name] - summary(truth)[name]) for by in (corrections, wrong))
+        assert left < 0.3 * before
+    # A photo's gains are the diagonal of how it mixes colours.
+    found, meant, none = (by.mixing[:, :, :3] + torch.diag_embed(by.gains) for by in (corrections, truth, wrong))
+    mean = (found - meant).mean(0)
+    assert bool((found - meant - mean).norm() < 0.4 * (none - meant).norm())
+
+
+def test_held_out_photos_have_the_same_lens_and_colours_of_their_own(cameras: Cameras):
+    corrections, given = everything(cameras), cameras.rays(*(pixels := some_pixels(50)))
+    corrections.lens.zoom.data += 3
+    corrections.lens.darkening.data += 0.5
+    other = corrections.alike(cameras, BOX)
+    torch.testing.assert_close(
+        other.rays(given, pixels[0]).directions,
+        corrections.cameras(cameras).rays(*pixels).directions,
+        atol=1e-5,
+        rtol=0,
+    )
+    assert torch.equal(
+        other.lens.shade(given.directions, pixels[0]), corrections.lens.shade(given.directions, pixels[0])
+    )
+    assert not any(parameter.requires_grad for parameter in other.lens.parameters()) and other.mixing is not None
+
+
+def test_corners_are_darker_and_the_centre_is_not():
+    K = torch.tensor([[60.0, 0, 50], [0, 60, 40], [0, 0, 1]])
+    camera = Cameras.of_size(K[None], torch.eye(4)[None], 100, 80)
+    lens = everything(camera).lens
+    lens.darkening.data = torch.tensor([0.3, 0.2])
+    ends = torch.tensor([[0.0, 0, 1], [50 / 60, 40 / 60, 1]])
+    found = lens.shade(torch.nn.functional.normalize(ends, dim=1), torch.zeros(2, dtype=torch.long))
+    torch.testing.assert_close(found[:, 0], torch.tensor([1.0, float(lens.corner.detach())]))
 
 
 FIELDS = {
@@ -118,17 +173,18 @@ def loss(field: Field, corrections: Corrections, rays: Rays, views: Tensor, samp
     seen = VolumeRenderer("black").to(way.device, way.dtype)(
         corrections.rays(rays, views), samples, lambda x, _: field(x, samples.directions(rays))
     )
-    return (corrections.lit(seen.rgb, seen.opacity, torch.zeros_like(way), views) * way).sum()
+    return (corrections.lit(seen.rgb, seen.opacity, torch.zeros_like(way), rays, views) * way).sum()
 
 
 @pytest.mark.parametrize("name", FIELDS)
 def test_gradients_through_every_field(name: str, cameras: Cameras):
     """Against differences in double precision; then those of the fast version against those of the reference."""
     pixels, way = some_pixels(40), torch.randn(40, 3)
-    given, views, field, corrections = cameras.rays(*pixels), pixels[0], FIELDS[name](), Corrections(cameras, BOX)
+    given, views, field, corrections = cameras.rays(*pixels), pixels[0], FIELDS[name](), everything(cameras)
     for parameter in field.parameters():
         parameter.data += 0.1 * torch.randn_like(parameter)
-    torch.nn.init.normal_(corrections.motions, std=0.1), torch.nn.init.normal_(corrections.log_gains, std=0.1)
+    for parameter in corrections.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
     samples, learned = UniformSampler(BOX, 12)(given, lambda x: x[:, 0]), list(corrections.parameters())
     by = {}
     for choice in ("auto", "reference"):
@@ -159,7 +215,8 @@ def test_a_run_says_what_it_corrected_and_is_rendered_without_its_photos(tmp_pat
     train(composed(["+experiment=smoke_3d", "refine=both", *few], tmp_path))
     assert "refine: cameras turned by up to" in capsys.readouterr().out
     found = json.loads((tmp_path / "results.json").read_text())["corrections"]
-    assert {key: len(value) for key, value in found.items()} == {"turned_degrees": 4, "moved": 4, "exposure": 4}
+    assert [len(found[key]) for key in ("turned_degrees", "moved", "exposure")] == [4, 4, 4]
+    assert found["focal_factor"] is None and found["corner_brightness"] is None
     assert max(found["turned_degrees"]) > 0 and min(found["exposure"]) < 1 < max(found["exposure"])
     assert nl.load_run(tmp_path, "cpu").system.corrections is None
     again = [
@@ -188,18 +245,24 @@ def test_cameras_that_moved_far_more_than_the_others_are_named(cameras: Cameras)
     corrections = Corrections(cameras, BOX)
     with torch.no_grad():
         corrections.motions[:, 0] = 1.5
-    assert "far more" not in corrections.told()
+    assert "far more" not in told(corrections)
     with torch.no_grad():
         corrections.motions[1, 3], corrections.motions[2, 4] = 7.0, -9.0
-    assert "; far more than the others: IMG_2, IMG_1; " in corrections.told("IMG_{}".format)
+    assert "; far more than the others: IMG_2, IMG_1; " in told(corrections, "IMG_{}".format)
     with torch.no_grad():
         corrections.motions *= 0.1
-    assert "far more" not in corrections.told()
+    assert "far more" not in told(corrections)
 
 
 @pytest.mark.parametrize(
     ("options", "key"),
-    [({"poses": False, "light": False}, "refine.poses"), ({"pose_rate": 0.0}, "refine.pose_rate")],
+    [
+        ({"poses": False, "light": False}, "refine.poses"),
+        ({"pose_rate": 0.0}, "refine.pose_rate"),
+        ({"poses": False, "focal": True}, "refine.focal.*refine.poses=false.*give refine.poses=true"),
+        ({"light": False, "affine": True}, "refine.affine.*refine.light=false"),
+        ({"light": False, "vignetting": True}, "refine.vignetting.*refine.light=false"),
+    ],
 )
 def test_what_corrects_nothing_is_refused(options: dict, key: str, cameras: Cameras):
     with pytest.raises(InputError, match=key):

@@ -10,8 +10,8 @@ from torch import Tensor
 from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
-from nerf_lightning.refine import Corrections
-from nerf_lightning.refine.corrections import FAR, FASTER, HURRY, LIT, RIPENED, START, TRIALS
+from nerf_lightning.refine import Corrections, told
+from nerf_lightning.refine.corrections import FAR, FASTER, FIRST, GAMMA, GROWTH, HURRY, LAST, LIT, RIPENED, START
 from nerf_lightning.renderer import Rendered, VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system.fits import misfits
@@ -89,19 +89,39 @@ def test_least_squares_are_damped_and_leave_alone_what_has_no_effect():
 def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Views):
     corrections = Corrections(views.cameras, BOX, auto=True)
     assert corrections.factors(1.0) == [0.0, 0.0] and not corrections.since
-    assert not corrections.due(TRIALS[0] - 0.001) and corrections.due(TRIALS[0])
-    corrections.note(TRIALS[0], {"poses": 0.3, "light": 0.5})
-    assert TRIALS[0] < LIT, "too early for gains"
+    assert not corrections.due(FIRST - 1, START) and corrections.due(FIRST, START)
+    assert not corrections.due(FIRST, LAST + 0.01), "too late"
+    corrections.note(FIRST, START, {"poses": 0.3, "light": 0.5, "stated": 0.0})
+    assert FIRST < LIT, "too early for gains"
     assert corrections.motions.requires_grad and not corrections.log_gains.requires_grad
-    assert not corrections.due(TRIALS[1] - 0.001) and corrections.due(TRIALS[1])
+    assert not corrections.due(int(GROWTH * FIRST) - 1, START) and corrections.due(int(GROWTH * FIRST), START)
     assert corrections.factors(START - 0.001) == [0.0, 0.0] and corrections.factors(START) == [FASTER, 0.0]
     assert corrections.factors(1.0) == [Corrections.FINAL, 0.0]
     again = Corrections(views.cameras, BOX, auto=True)
     again.decide(corrections.decided())
     assert again.motions.requires_grad and again.decided() == corrections.decided()
-    corrections.note(TRIALS[-1], {"poses": 0.0, "light": 0.005})
-    assert not corrections.due(1.0)
-    assert "light as given (corrections would lower most photos' error by 0.5%)" in corrections.told()
+    corrections.note(10 * LIT, START, {"poses": 0.0, "light": 0.005, "stated": 0.0})
+    assert not corrections.due(10 * LIT, START) and corrections.due(int(10 * LIT * GROWTH), START)
+    assert "light as given (corrections would lower most photos' error by 0.5%)" in told(corrections)
+
+
+def test_gains_start_from_exposures_that_explain_the_photos_and_not_from_others(views: Views):
+    exposures = [2.0**view for view in range(VIEWS)]
+    gains = torch.tensor(exposures).log() / GAMMA
+    gains = (gains - gains.mean())[:, None].expand(VIEWS, 3)
+    lit = Views.of((views.images * gains.exp()[:, :1, None, None] / 4).clamp(0, 255).to(torch.uint8), views.cameras)
+    for photos, brightness, fits in ((lit, 0.25, True), (views, 1.0, False)):
+
+        def darker(rays: Rays, behind: Tensor, brightness: float = brightness) -> Rendered:
+            return replace(seen := see(rays, behind), rgb=seen.rgb * brightness)
+
+        corrections = Corrections(views.cameras, BOX, exposures=exposures, auto=True)
+        found = worth(darker, photos, BLACK, corrections, torch.Generator().manual_seed(1))
+        assert (found["stated"] > 0.5) == fits
+        corrections.note(LIT, START, found | {"light": 1.0})
+        torch.testing.assert_close(corrections.log_gains.data, gains * fits)
+    assert torch.equal(Corrections(views.cameras, BOX, exposures=exposures).log_gains.data, corrections.stated)
+    assert not Corrections(views.cameras, BOX, exposures=exposures, light=False).log_gains.any()
 
 
 def test_photos_far_worse_than_the_others_stand_out():

@@ -1,10 +1,7 @@
 """Which photos were taken through the same lens, and what they tell about it (EXIF)."""
 
-import importlib.util
 import math
-import struct
 import tempfile
-import warnings
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -13,14 +10,14 @@ from typing import Any
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-MAKE, MODEL, DETAILS, FOCAL, FOCAL_35MM = 0x010F, 0x0110, 0x8769, 0x920A, 0xA405
+from nerf_lightning.dataset.formats.exif import DAMAGED, DETAILS, exif_tags
+
+MAKE, MODEL, FOCAL, FOCAL_35MM = 0x010F, 0x0110, 0x920A, 0xA405
 """Numbers of EXIF tags."""
 DIAGONAL_35MM = math.hypot(36, 24)
 """Of a 35 mm film's picture in millimetres: equivalent focal lengths are about pictures of the same diagonal (CIPA DCG-001)."""
 PLAUSIBLE = 0.1, 10.0
 """Focal lengths in longest sides; COLMAP takes no others."""
-DAMAGED = (OSError, ValueError, SyntaxError, KeyError, TypeError, OverflowError, ZeroDivisionError, struct.error)
-"""What Pillow raises for broken tags, or for a picture of a kind that it does not know."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ def shot(path: Path, width: int, height: int) -> Shot:
         path: of the photo.
         width, height: of the upright photo, pixels.
     """
-    tags = _tags(path)
+    tags = exif_tags(path)
     make, model = (" ".join(str(tags.get(tag, "")).replace("\0", " ").split()) for tag in (MAKE, MODEL))
     return Shot(width, height, make, model, _millimetres(tags.get(FOCAL)), _millimetres(tags.get(FOCAL_35MM)))
 
@@ -73,21 +70,6 @@ def _of_known_sensor(shot: Shot) -> float | None:
         Image.new("L", (shot.width, shot.height)).save(blank, exif=exif.tobytes())
         camera = pycolmap.infer_camera_from_image(blank)
     return float(camera.mean_focal_length()) if camera.has_prior_focal_length else None
-
-
-def _tags(path: Path) -> dict[int, Any]:
-    if importlib.util.find_spec("pillow_heif"):
-        import pillow_heif
-
-        pillow_heif.register_heif_opener()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # remarks on tags that nothing here asks for
-            with Image.open(path) as image:
-                exif = image.getexif()
-                return {**exif, **exif.get_ifd(DETAILS)}
-    except (*DAMAGED, Image.DecompressionBombError):
-        return {}
 
 
 def _millimetres(value: Any) -> float:
