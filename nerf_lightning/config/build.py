@@ -131,6 +131,11 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     return NeRF3D(field, sampler, renderer, **common, corrections=corrections)
 
 
+def corrects_poses(cfg: DictConfig) -> bool:
+    """Whether training corrects the poses, or may."""
+    return bool((cfg.get("refine") or {}).get("poses"))
+
+
 @dataclass(frozen=True)
 class SceneFrame:
     """What a 3D system takes from its scene: where it is, and the colour behind it."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.refine.lens import LensCorrections
-from nerf_lightning.refine.poses import pixel_shifts, turned, whitening
+from nerf_lightning.refine.poses import drifts, pixel_shifts, spanned, turned, whitening
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 GAMMA = 2.2
@@ -63,6 +63,7 @@ class Corrections(torch.nn.Module):
     FINAL = 0.1
     """Factor on the rates at the end."""
     scales: Tensor
+    common: Tensor
     stated: Tensor
 
     def __init__(
@@ -99,7 +100,10 @@ class Corrections(torch.nn.Module):
         corners = torch.rand(PLACES, 3, dtype=torch.float64, generator=step_generator(0, Stream.STUDY, 0))
         places = bounds.centre.cpu().double() + bounds.half_size.cpu().double() * (2 * corners - 1)
         shifts = pixel_shifts(cameras.centres.cpu().double(), cameras.K[:, 0, 0].cpu().double(), places)
-        self.register_buffer("scales", whitening(shifts, DAMPING).float())
+        scales = whitening(shifts, DAMPING)
+        common = torch.linalg.solve(scales, drifts(cameras.centres.cpu().double(), bounds.centre.cpu().double()))
+        self.register_buffer("scales", scales.float())
+        self.register_buffer("common", spanned(common.flatten(0, 1)).float(), persistent=False)
         self.motions = torch.nn.Parameter(torch.zeros(len(cameras), 6), requires_grad=False)
         self.log_gains = torch.nn.Parameter(torch.zeros(len(cameras), 3), requires_grad=False)
         logs = torch.tensor(exposures).log() / GAMMA if exposures else torch.zeros(len(cameras))
@@ -203,8 +207,11 @@ class Corrections(torch.nn.Module):
     @property
     def turns_and_moves(self) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3"]]:
         """Of each camera: about its centre (world axes, radians), and of it (world units)."""
-        motions = (self.scales * self.motions[:, None]).sum(2)  # no matrix product, which half precision would round
-        turns, moves = self._own(motions).split(3, dim=1)
+        own = self.motions
+        if self.centred:
+            own = own - (self.common * (self.common * own.flatten()[:, None]).sum(0)).sum(1).view_as(own)
+        motions = (self.scales * own[:, None]).sum(2)  # no matrix product, which half precision would round
+        turns, moves = motions.split(3, dim=1)
         return turns, moves
 
     @property

@@ -4,6 +4,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+TINY = 1e-3
+"""Share of the mean squared distance that is added to all, for cameras in the middle of the content."""
+TOLD = 1e-6
+"""Vectors whose own part is smaller than this, as a share of their length, are made of others."""
 SMALL = 1e-6
 """Squared angle below which a series stands in for the factors of a turn, so that gradients exist at 0 too."""
 
@@ -48,6 +52,28 @@ def pixel_shifts(
     return focals[:, None, None, None] * (axes - ray * ray.mT) @ torch.cat([turn, -axes], dim=3) / distance
 
 
+def drifts(centres: Float[Tensor, "V 3"], place: Float[Tensor, "3"]) -> Float[Tensor, "V 6 10"]:
+    """Motions of all cameras together that photos do not tell, or hardly: of cameras and content as a whole, and of the content
+    alone, which far cameras follow by turning.
+
+    Args:
+        centres: of the cameras, world frame.
+        place: the middle of the content, world frame.
+
+    Returns:
+        For each camera a turn and a move as in `pixel_shifts`; a column for each of three shifts, three turns and the growth of
+        everything, and for three shifts of the content.
+    """
+    axes = torch.eye(3, dtype=centres.dtype, device=centres.device).expand(len(centres), 3, 3)
+    none, away = torch.zeros_like(axes), (centres - place)[:, :, None]
+    square = away.square().sum(1, keepdim=True)
+    square = (square + TINY * square.mean()).clamp_min(torch.finfo(square.dtype).tiny)
+    across = torch.linalg.cross(axes, away.expand_as(axes), dim=1)
+    turns = torch.cat([none, axes, none[..., :1], across / square], dim=2)
+    moves = torch.cat([axes, across, away, none], dim=2)
+    return torch.cat([turns, moves], dim=1)
+
+
 def whitening(shifts: Float[Tensor, "V P 3 6"], damping: float) -> Float[Tensor, "V 6 6"]:
     """For each photo the matrix that turns a vector of unit length into a motion that shifts places by about a pixel.
 
@@ -61,3 +87,10 @@ def whitening(shifts: Float[Tensor, "V P 3 6"], damping: float) -> Float[Tensor,
     square = square + damping * torch.diag_embed(square.diagonal(dim1=1, dim2=2))
     values, vectors = torch.linalg.eigh(square)
     return vectors @ torch.diag_embed(values.rsqrt()) @ vectors.mT
+
+
+def spanned(vectors: Float[Tensor, "N K"]) -> Float[Tensor, "N B"]:
+    """An orthonormal basis of what some columns span."""
+    lengths = vectors.norm(dim=0).clamp_min(torch.finfo(vectors.dtype).tiny)
+    basis, sizes, _ = torch.linalg.svd(vectors / lengths, full_matrices=False)
+    return basis[:, sizes > TOLD]

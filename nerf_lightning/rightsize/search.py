@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.config.build import build_data, device_of
+from nerf_lightning.config.build import build_data, corrects_poses, device_of
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.dataset.plausible import check_scene
@@ -83,7 +83,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     use_kernels(cfg.kernels)
     data = build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)
-    for doubt in check_scene(data.scene) if isinstance(data, RayDataModule) else []:
+    for doubt in check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []:
         print(f"{data.scene.name}: {doubt}", flush=True)
     rungs: list[Rung] = []
     noise = seconds = 0.0

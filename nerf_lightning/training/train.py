@@ -19,6 +19,7 @@ from nerf_lightning.config.build import (
     build_system,
     build_trainer,
     check_background,
+    corrects_poses,
     device_of,
     frame_of,
     resolved,
@@ -84,8 +85,7 @@ def train(
     else:
         data = RayDataModule(scene, cfg.dataset.rays, cfg.dataset.samples, cfg.dataset.seed)
     data.enlarge(limits_of(cfg, device).batch)
-    corrected = bool((cfg.get("refine") or {}).get("poses"))
-    doubts = check_scene(data.scene, corrected) if isinstance(data, RayDataModule) else []
+    doubts = check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt)
     system = build_system(cfg, frame_of(data), device)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from nerf_lightning.refine.poses import pixel_shifts, turned, whitening
+from nerf_lightning.refine.poses import drifts, pixel_shifts, spanned, turned, whitening
 
 
 def cross(turns: Tensor) -> Tensor:
@@ -30,6 +30,30 @@ def test_shifts_are_those_of_cameras_that_turned_and_moved():
     expected = 90 * (torch.nn.functional.normalize(after, dim=2) - torch.nn.functional.normalize(before, dim=2))
     found = (pixel_shifts(centres, focals.double(), places) @ motions[:, None, :, None]).squeeze(3)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-9)
+
+
+def test_drifts_leave_what_cameras_see_as_it_is_if_the_content_drifts_along():
+    centres, place = 3 * torch.nn.functional.normalize(torch.randn(5, 3).double(), dim=1), torch.randn(3).double()
+    centres, places = centres + place, place + 0.2 * torch.randn(50, 3).double()
+    found, shifts = drifts(centres, place), pixel_shifts(centres, torch.full((5,), 90.0).double(), places)
+    axes = torch.eye(3).double().expand(50, 3, 3)
+    turns = torch.linalg.cross(axes, (places - place)[:, :, None].expand(50, 3, 3), dim=1)
+    content = torch.cat([axes, turns, (places - place)[:, :, None], axes], dim=2)
+    follows = (
+        pixel_shifts(centres, torch.full((5,), 90.0).double(), places)[..., 3:] @ -content
+    )  # as a move of the camera, turned
+    left = (shifts @ found[:, None] + follows).square().mean((1, 2)).sqrt() / follows.square().mean((1, 2)).sqrt()
+    torch.testing.assert_close(left[:, :7], torch.zeros(5, 7).double(), atol=1e-9, rtol=0)
+    assert (left[:, 7:] < 0.2).all(), "far cameras see hardly more than a shift"
+
+
+def test_a_basis_holds_what_it_is_made_of_once():
+    vectors = torch.randn(20, 3).double()
+    basis = spanned(
+        torch.cat([1e-5 * vectors, vectors @ torch.randn(3, 2).double(), torch.zeros(20, 1).double()], dim=1)
+    )
+    torch.testing.assert_close(basis.mT @ basis, torch.eye(3).double())
+    torch.testing.assert_close(basis @ (basis.mT @ vectors), vectors)
 
 
 def test_a_whitened_motion_of_any_kind_shifts_places_by_about_a_pixel():
