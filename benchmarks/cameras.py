@@ -45,17 +45,27 @@ def exact(scene: Scene, seed: int) -> Scene:
     return scene
 
 
-CONDITIONS: dict[str, tuple[int | None, Damage]] = {
-    "exact": (None, exact),
-    "0.5 degrees, 1 %": (None, poses(0.5, 0.01)),
-    "2 degrees, 3 %": (None, poses(2.0, 0.03)),
-    "5 degrees, 5 %": (None, poses(5.0, 0.05)),
-    "light": (None, light),
-    "both, 3 wrong": (None, lambda scene, seed: damage.with_wrong_poses(both(scene, seed), seed, WRONG)),
-    "exact, 12 photos": (FEW, exact),
-    "both, 12 photos": (FEW, both),
+def long_lens(scene: Scene, seed: int) -> Scene:
+    return damage.with_focal_length(scene, seed, 1.03)
+
+
+def dark_corners(scene: Scene, seed: int) -> Scene:
+    return damage.with_dark_corners(light(scene, seed), seed, 0.5)
+
+
+CONDITIONS: dict[str, tuple[int | None, Damage, list[str]]] = {
+    "exact": (None, exact, []),
+    "0.5 degrees, 1 %": (None, poses(0.5, 0.01), []),
+    "2 degrees, 3 %": (None, poses(2.0, 0.03), []),
+    "5 degrees, 5 %": (None, poses(5.0, 0.05), []),
+    "light": (None, light, []),
+    "light, dark corners": (None, dark_corners, ["refine.vignetting=true"]),
+    "focal length 3 % too long": (None, long_lens, ["refine.focal=true"]),
+    "both, 3 wrong": (None, lambda scene, seed: damage.with_wrong_poses(both(scene, seed), seed, WRONG), []),
+    "exact, 12 photos": (FEW, exact, []),
+    "both, 12 photos": (FEW, both, []),
 }
-"""How many photos there are, None for all, and what is done to them."""
+"""How many photos there are, None for all, what is done to them, and what is corrected besides."""
 
 
 def similarity(found: Float[Tensor, "V 3"], truth: Float[Tensor, "V 3"]) -> Float[Tensor, "4 4"]:
@@ -88,12 +98,12 @@ def measure(
     rows = []
     for whole in [nl.load_scene(path) for path in scenes] or [bricks()]:
         for condition, recipe, refine in itertools.product(CONDITIONS, recipes, ("none", "auto")):
-            views, spoil = CONDITIONS[condition]
+            views, spoil, besides = CONDITIONS[condition]
             truth = whole if views is None else damage.with_views(whole, 0, views)
             found = []
             for seed in seeds:
                 print(f"cameras: {whole.name}, {condition}, {recipe}, refine={refine}, seed {seed}", flush=True)
-                options = [*([] if refine == "none" else [f"refine={refine}"]), *overrides]
+                options = [*([] if refine == "none" else [f"refine={refine}", *besides]), *overrides]
                 found.append(one(truth, spoil(truth, seed), recipe, options, seed, output / "cameras"))
             about = {"scene": whole.name, "condition": condition, "recipe": recipe, "refine": refine}
             rows.append(about | {key: median(row[key] for row in found) for key in found[0]})

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.refine.lens import LensCorrections
-from nerf_lightning.refine.poses import drifts, pixel_shifts, spanned, turned, whitening
+from nerf_lightning.refine.poses import drifts, pixel_shifts, spanned, turned, whitening, without
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 GAMMA = 2.2
@@ -53,8 +53,8 @@ class Corrections(torch.nn.Module):
         pose_rate: learning rate of poses, in pixels that the content moves a step.
         light_rate: learning rate of the gains' logarithms.
         auto: whether each is corrected from the first trial on that shows that it helps, and else not; see `due` and `note`.
-        centred: whether the means over the photos stay zero, so that a scene neither drifts away nor grows brighter; photos
-            of a field that is already there have their own.
+        centred: whether what all photos have in common stays as it is, so that a scene neither drifts away nor grows brighter;
+            photos of a field that is already there have their own.
 
     Raises:
         InputError: where neither is to be corrected, a part of what is not, or a rate is not above 0.
@@ -207,9 +207,7 @@ class Corrections(torch.nn.Module):
     @property
     def turns_and_moves(self) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3"]]:
         """Of each camera: about its centre (world axes, radians), and of it (world units)."""
-        own = self.motions
-        if self.centred:
-            own = own - (self.common * (self.common * own.flatten()[:, None]).sum(0)).sum(1).view_as(own)
+        own = without(self.motions, self.common) if self.centred else self.motions
         motions = (self.scales * own[:, None]).sum(2)  # no matrix product, which half precision would round
         turns, moves = motions.split(3, dim=1)
         return turns, moves

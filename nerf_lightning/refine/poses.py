@@ -94,3 +94,8 @@ def spanned(vectors: Float[Tensor, "N K"]) -> Float[Tensor, "N B"]:
     lengths = vectors.norm(dim=0).clamp_min(torch.finfo(vectors.dtype).tiny)
     basis, sizes, _ = torch.linalg.svd(vectors / lengths, full_matrices=False)
     return basis[:, sizes > TOLD]
+
+
+def without(vectors: Float[Tensor, "V K"], basis: Float[Tensor, "VK B"]) -> Float[Tensor, "V K"]:
+    """What is left of vectors, taken as one long one, off an orthonormal basis."""
+    return vectors - (basis * (basis * vectors.flatten()[:, None]).sum(0)).sum(1).view_as(vectors)

@@ -73,6 +73,23 @@ def with_exposure_drift(scene: Scene, seed: int, share: float, tint: float = 0.0
     return replace(scene, train=exposed(scene.train, change))
 
 
+def with_focal_length(scene: Scene, seed: int, factor: float) -> Scene:
+    """All photos, held-out ones too, said to have that many times their focal length."""
+    train, val = (replace(views, cameras=views.cameras.zoomed(factor)) for views in (scene.train, scene.val))
+    return replace(scene, train=train, val=val)
+
+
+def with_dark_corners(scene: Scene, seed: int, share: float) -> Scene:
+    """All photos, held-out ones too, darker by that share in the corners, elsewhere by the squared distance to the centre."""
+
+    def change(colours: Float[Tensor, "V H W C"]) -> Float[Tensor, "V H W C"]:
+        row, column = ((torch.arange(size) + 0.5) / size * 2 - 1 for size in colours.shape[1:3])
+        square = (row[:, None].square() + column.square()) / 2
+        return torch.cat([colours[..., :3] * (1 - share * square[..., None]), colours[..., 3:]], dim=-1)
+
+    return replace(scene, train=exposed(scene.train, change), val=exposed(scene.val, change))
+
+
 def with_wrong_poses(scene: Scene, seed: int, count: int) -> Scene:
     """So many training photos, evenly spaced, with the pose of the next of them."""
     wrong = evenly(len(scene.train), count)

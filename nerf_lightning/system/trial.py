@@ -12,6 +12,7 @@ from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.rays import rays_through
 from nerf_lightning.refine import Corrections
+from nerf_lightning.refine.poses import spanned, without
 from nerf_lightning.renderer import Rendered, over
 from nerf_lightning.utils.evenly import evenly
 
@@ -103,14 +104,17 @@ def least_squares(left: Float[Tensor, "V N 1"], jacobian: Float[Tensor, "V N K"]
 def changed(
     corrections: Corrections, chosen: Sequence[int], motions: Tensor | None, log_gains: Tensor | None
 ) -> Corrections:
-    """Corrections with these changes of some photos; all others change by their mean, which `centred` takes off."""
+    """Corrections with these changes of some photos, but for what those have in common."""
     trial = copy.deepcopy(corrections)
     with torch.no_grad():
-        for parameter, change in ((trial.motions, motions), (trial.log_gains, log_gains)):
-            if change is not None:
-                parameter.requires_grad_(True)
-                parameter.add_(change.mean(0))
-                parameter[chosen] += change - change.mean(0)
+        if motions is not None:
+            trial.motions.requires_grad_(True)
+            trial.motions[chosen] += without(
+                motions, spanned(corrections.common.unflatten(0, (-1, 6))[chosen].flatten(0, 1))
+            )
+        if log_gains is not None:
+            trial.log_gains.requires_grad_(True)
+            trial.log_gains[chosen] += log_gains - log_gains.mean(0)
     return trial
 
 

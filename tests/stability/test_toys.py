@@ -109,9 +109,17 @@ def test_damage():
     wrong = damage.with_wrong_poses(scene, 0, 3).train.cameras.c2w != scene.train.cameras.c2w
     assert int(wrong.flatten(1).any(1).sum()) == 3
     tinted = damage.with_exposure_drift(toy(PILE, None, size=16), 0, 0.0, 0.1).train.images.float()
-    plain = toy(PILE, None, size=16).train.images.float()
+    whole = toy(PILE, None, size=16)
+    plain, held_out = whole.train.images.float(), whole.val.images.float()
     shares = tinted[..., :3].sum((1, 2)) / plain[..., :3].sum((1, 2))
     assert float((shares[:, 0] / shares[:, 1] - 1).abs().max()) > 0.02 and torch.equal(tinted[..., 3], plain[..., 3])
+    dark = damage.with_dark_corners(whole, 0, 0.5).val.images.float()
+    side = (torch.arange(16) + 0.5) / 8 - 1
+    shade = 1 - 0.25 * (side[:, None].square() + side.square())
+    assert held_out.amax() > 100 and float(shade.min()) < 0.6
+    torch.testing.assert_close(dark[..., :3], held_out[..., :3] * shade[..., None], atol=0.51, rtol=0)
+    for part in (damage.with_focal_length(scene, 0, 1.1).train, damage.with_focal_length(scene, 0, 1.1).val):
+        torch.testing.assert_close(part.cameras.K[:, 0, 0], 1.1 * scene.train.cameras.K[:1, 0, 0].expand(len(part)))
     drifted = damage.with_exposure_drift(scene, 0, 0.3)
     sums = [one.train.images.float().sum((1, 2, 3)) for one in (drifted, scene)]
     gains = sums[0] / sums[1]
