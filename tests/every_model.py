@@ -40,7 +40,7 @@ ANOTHER = "siren, another seed"
 STEPS = 14
 
 
-aligned.STEPS = 2  # held-out photos are not what is compared
+aligned.TOGETHER = aligned.APART = 1  # held-out photos are not what is compared
 
 
 class Stop(Exception):
@@ -48,6 +48,7 @@ class Stop(Exception):
 
 
 @patch.dict(corrections.WORTHWHILE, poses=-1.0, light=-1.0)  # refine=auto begins with its first trial
+@patch.multiple(corrections, FIRST=2, LIT=2)
 def fingerprints(folder: Path, stop: int) -> dict[str, str]:
     save = Checkpoints.on_train_batch_end
 

@@ -92,7 +92,6 @@ class Corrections(torch.nn.Module):
             if part and not whole:
                 needed = "refine.poses" if name == "focal" else "refine.light"
                 raise InputError(f"refine.{name}", "", f"true, with {needed}=false", "false", f"or give {needed}=true")
-        self.given_rates = pose_rate, light_rate
         for name, rate in (("pose_rate", pose_rate), ("light_rate", light_rate)):
             if not rate > 0:
                 raise InputError(f"refine.{name}", "", str(rate), "above 0")
@@ -168,10 +167,10 @@ class Corrections(torch.nn.Module):
         return [{"params": self._of(name), "lr": rate} for name, rate in self.rates.items()]
 
     def alike(self, cameras: Cameras, bounds: Bounds) -> "Corrections":
-        """With what is corrected here, for photos of the field that was trained with these: by the same lens."""
+        """With what is corrected here, for photos of the field that was trained with these: by the same lens, and with gains
+        alone."""
         poses, light = ("poses" in self.since), ("light" in self.since)
-        affine, rates = light and self.mixing is not None, self.given_rates
-        other = Corrections(cameras, bounds, (), poses, light, False, affine, False, *rates, centred=False)
+        other = Corrections(cameras, bounds, poses=poses, light=light, centred=False)
         other.lens = self.lens.of(cameras)
         return other
 

@@ -1,5 +1,7 @@
 """Held-out photos whose own cameras and light are corrected too: half of a photo decides, the other half is scored."""
 
+import copy
+
 import torch
 from jaxtyping import Int
 from torch import Tensor
@@ -10,11 +12,16 @@ from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import over
 from nerf_lightning.system.metrics import mse_to_psnr
 from nerf_lightning.system.nerf3d import NeRF3D
+from nerf_lightning.system.trial import LIGHT, POSES, derivatives, least_squares, seen_by, some_pixels, squared_errors
 from nerf_lightning.utils.progress import tracked
 from nerf_lightning.utils.seeding import Stream, step_generator
 
-STEPS, RAYS = 200, 2048
-"""In which the corrections of all held-out photos are found, and rays in each."""
+COLUMNS = (0.0, 0.5), (0.5, 1.0)
+"""Shares of them that make the left and the right half."""
+PIXELS = 4096
+"""Of each photo's half, that decide in a step."""
+TOGETHER, APART = 4, 6
+"""Least-squares steps of all cameras together, and then of each alone. More would follow the faults of the field in that half."""
 
 
 def halves(views: Views, view: int) -> tuple[Int[Tensor, "L"], Int[Tensor, "R"]]:
@@ -26,23 +33,34 @@ def halves(views: Views, view: int) -> tuple[Int[Tensor, "L"], Int[Tensor, "R"]]
     return first, second
 
 
-def fitted(system: NeRF3D, views: Views, places: Int[Tensor, "P"], corrections: Corrections) -> None:
-    """Finds corrections with which a field, that stays as it is, fits these pixels best."""
-    see, optimizer = system.as_it_is(), torch.optim.Adam(corrections.groups, betas=(0.9, 0.99))
-    started = [group["lr"] for group in optimizer.param_groups]
+def fitted(system: NeRF3D, views: Views, half: int, corrections: Corrections) -> None:
+    """Finds corrections with which a field, that stays as it is, fits this half of the photos best."""
+    see, behind, photos = system.as_it_is(), system.renderer.colour, range(len(views))
     generator = step_generator(system.seed, Stream.STUDY, 1, system.device)
-    for step in tracked(range(STEPS), STEPS, "aligning held-out photos"):
-        for group, rate in zip(optimizer.param_groups, started, strict=True):
-            group["lr"] = rate * corrections.FINAL ** (step / STEPS)
-        some = places[torch.randint(len(places), (RAYS,), generator=generator, device=places.device)]
-        given, view = rays_through(views, some)
-        behind = system.renderer.backgrounds(RAYS)
-        seen = see(corrections.rays(given, view), behind)
-        truth = over(views.pixels[some], behind)
-        rgb = corrections.lit(seen.rgb, seen.opacity, behind, given, view, truth)
-        optimizer.zero_grad()
-        torch.nn.functional.mse_loss(rgb, truth).backward()
-        optimizer.step()
+    poses, light = ("poses" in corrections.since), ("light" in corrections.since)
+    together = TOGETHER if poses else 0
+    for step in tracked(range(together + APART), together + APART, "aligning held-out photos"):
+        pixels = some_pixels(views, photos, PIXELS, behind, generator, COLUMNS[half])
+        left, jacobian = derivatives(see, corrections, pixels, len(views))
+        change = torch.zeros_like(jacobian[:, 0])
+        if step < together:
+            common = corrections.common.unflatten(0, (-1, 6))
+            shared = least_squares(left.flatten(0, 1)[None], (jacobian[..., POSES] @ common).flatten(0, 1)[None])
+            change[:, POSES] = (common @ shared.mT)[..., 0]
+            if light:
+                change[:, LIGHT] = least_squares(left, jacobian[..., LIGHT])
+        else:
+            own = slice(POSES.start if poses else LIGHT.start, LIGHT.stop if light else POSES.stop)
+            change[:, own] = least_squares(left, jacobian[..., own])
+        other = copy.deepcopy(corrections)
+        other.motions.data += change[:, POSES]
+        other.log_gains.data += change[:, LIGHT]
+        before, after = (
+            squared_errors(seen_by(see, by, pixels), by, pixels, len(views)) for by in (corrections, other)
+        )
+        better = (after < before)[:, None]
+        for parameter, changed in ((corrections.motions, other.motions), (corrections.log_gains, other.log_gains)):
+            parameter.data = torch.where(better, changed.data, parameter.data)
 
 
 @torch.inference_mode(False)  # a trainer's test is without gradients
@@ -59,7 +77,7 @@ def aligned_psnr(system: NeRF3D, views: Views) -> list[float]:
     squares, counts = torch.zeros(len(views), dtype=torch.float64), torch.zeros(len(views))
     for side in (0, 1):
         corrections = system.corrections.alike(views.cameras, system.sampler.bounds).to(system.device)
-        fitted(system, views, torch.cat([part[side] for part in parts]), corrections)
+        fitted(system, views, side, corrections)
         with torch.no_grad():
             for view, part in enumerate(parts):
                 given, of = rays_through(views, part[1 - side])

@@ -40,13 +40,22 @@ class Pixels(NamedTuple):
 
 
 def some_pixels(
-    views: Views, chosen: Sequence[int], count: int, behind: Float[Tensor, "3"], generator: Generator
+    views: Views,
+    chosen: Sequence[int],
+    count: int,
+    behind: Float[Tensor, "3"],
+    generator: Generator,
+    columns: tuple[float, float] = (0.0, 1.0),
 ) -> Pixels:
-    """Random pixels of some photos, as many of each, drawn with replacement."""
+    """Random pixels of some photos, as many of each, drawn with replacement from these shares of their columns."""
     photos = torch.tensor(chosen, device=behind.device)
-    share = torch.rand(len(chosen), count, generator=generator, device=behind.device)
-    first, last = views.starts[photos, None], views.starts[photos + 1, None] - 1
-    places = torch.minimum(first + (share * (last - first + 1)).long(), last).flatten()
+    down, across = torch.rand(2, len(chosen), count, generator=generator, device=behind.device)
+    width = views.widths[photos, None]
+    height = views.starts.diff()[photos, None] // width
+    row = torch.minimum((down * height).long(), height - 1)
+    first, end = ((side * width).long() for side in columns)
+    column = torch.minimum(first + (across * (end - first)).long(), end - 1)
+    places = (views.starts[photos, None] + row * width + column).flatten()
     rays, view = rays_through(views, places)
     backgrounds = behind.expand(len(places), 3)
     return Pixels(rays, view, over(views.pixels[places], backgrounds), backgrounds, views.mask[places])
@@ -122,8 +131,8 @@ def worth(
     see: See, views: Views, behind: Float[Tensor, "3"], corrections: Corrections, generator: Generator
 ) -> dict[str, float]:
     """By what share of itself a photo's squared error falls on pixels that did not decide, if a field that stays as it is may
-    be seen by corrected cameras ("poses") and in corrected light ("light"), each besides the other, or in light by the stated
-    exposures alone ("stated"): the median over photos, since a few in which something moved say nothing of the others.
+    be seen by corrected cameras ("poses") and in corrected light ("light"), each with or without the other, or in light by the
+    stated exposures alone ("stated"): the median over photos, since a few in which something moved say nothing of the others.
 
     Args:
         see: renders.
@@ -145,6 +154,10 @@ def worth(
     only_poses = errors(least_squares(left, jacobian[..., POSES]), None)
     only_light = errors(None, least_squares(left, jacobian[..., LIGHT]), given)
     stated = errors(None, corrections.stated[chosen], given)
-    fallen = {"poses": only_light - corrected, "light": only_poses - corrected, "stated": as_it_is - stated}
+    fallen = {
+        "poses": torch.minimum(as_it_is, only_light) - torch.minimum(only_poses, corrected),
+        "light": torch.minimum(as_it_is, only_poses) - torch.minimum(only_light, corrected),
+        "stated": as_it_is - stated,
+    }
     shares = {name: by / as_it_is for name, by in fallen.items()}  # nan where all is masked
     return {name: float(share.nanmedian().nan_to_num()) for name, share in shares.items()}
