@@ -21,7 +21,7 @@ COLUMNS = (0.0, 0.5), (0.5, 1.0)
 PIXELS = 4096
 """Of each photo's half, that decide in a step."""
 TOGETHER, APART = 4, 6
-"""Least-squares steps of all cameras together, and then of each alone. More would follow the faults of the field in that half."""
+"""Least-squares steps of all cameras together, and then of each alone. More would follow the faults of the field there."""
 
 
 def halves(views: Views, view: int) -> tuple[Int[Tensor, "L"], Int[Tensor, "R"]]:
