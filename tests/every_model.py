@@ -29,7 +29,10 @@ PICTURE = [
 MODELS = {
     "hashgrid": [*SCENE, "refine=auto", "model.levels=3", "model.finest=32", "model.log2_entries=10", "model.width=16"],
     "voxels": [*SCENE, "recipe=voxels_small", "model.coarsest=8", "model.finest=16", "model.grown=1"],
-    "tensorf": [*SCENE, "refine=both", "recipe=tensorf_small", "model.coarsest=8", "model.finest=16", "model.grown=1"],
+    "tensorf": [
+        *(*SCENE, "refine=both", "refine.focal=true", "refine.affine=true", "refine.vignetting=true"),
+        *("recipe=tensorf_small", "model.coarsest=8", "model.finest=16", "model.grown=1"),
+    ],
     "mlp": [*SCENE, "recipe=mlp_small", "model.width=16"],
     "hashgrid2d": PICTURE,
     "picture_mlp": [*PICTURE, "model.width=32"],
