@@ -22,7 +22,7 @@ DAMPING = 1.0
 """See `whitening`. A turn and a move of a camera that undo each other in the photo are told apart slowly, and surely."""
 START = 0.02
 """Share of the training before which nothing is corrected: photos cannot fit a field that shows nothing yet."""
-FIRST, GROWTH, LAST = 16, 1.5, 0.4
+FIRST, GROWTH, LAST = 24, 2, 0.4
 """Of the trials of `auto`: the step of the first, the factor from one to the next, and the share of the training that they end
 with. Large faults show while the field is smooth, as later it has explained them by fog; small ones when it is sharp."""
 LIT = 64
@@ -139,12 +139,16 @@ class Corrections(torch.nn.Module):
         undecided = self.auto and len(self.since) < len(self.rates)
         return undecided and progress <= LAST and step >= FIRST * GROWTH**self.tried
 
+    def open_at(self, step: int) -> list[str]:
+        """What a trial at this step decides on."""
+        return [name for name in self.rates if name not in self.since and (name != "light" or step >= LIT)]
+
     def note(self, step: int, progress: float, worth: dict[str, float]) -> None:
         """Takes in what a trial said: by what share the squared error would fall if poses, or light, were corrected, or the
         stated exposures were taken for gains."""
         while step >= FIRST * GROWTH**self.tried:
             self.tried += 1
-        open_yet = [name for name in self.rates if name not in self.since and (name != "light" or step >= LIT)]
+        open_yet = self.open_at(step)
         self.worth |= {name: worth[name] for name in open_yet}
         chosen = [name for name in open_yet if worth[name] > WORTHWHILE[name]]
         self.begin(progress, *chosen)

@@ -129,7 +129,8 @@ class NeRF3D(System):
             self.data.scene.train.to(self.device),
             step_generator(self.seed, Stream.TRIAL, self.global_step, self.device),
         )
-        found = worth(self.as_it_is(), views, self.renderer.colour, self.corrections, generator)
+        light = "light" in self.corrections.open_at(self.global_step)
+        found = worth(self.as_it_is(), views, self.renderer.colour, self.corrections, generator, light)
         self.corrections.note(self.global_step, self.progress, found)
 
     def rehearse(self, batch: RayBatch) -> None:

@@ -128,7 +128,12 @@ def changed(
 
 
 def worth(
-    see: See, views: Views, behind: Float[Tensor, "3"], corrections: Corrections, generator: Generator
+    see: See,
+    views: Views,
+    behind: Float[Tensor, "3"],
+    corrections: Corrections,
+    generator: Generator,
+    light: bool = True,
 ) -> dict[str, float]:
     """By what share of itself a photo's squared error falls on pixels that did not decide, if a field that stays as it is may
     be seen by corrected cameras ("poses") and in corrected light ("light"), each with or without the other, or in light by the
@@ -140,6 +145,7 @@ def worth(
         behind: the colour behind the scene.
         corrections: those that there are already; they are not changed.
         generator: of the pixels.
+        light: whether to ask about light too; poses alone take less time.
     """
     chosen = evenly(len(views), PHOTOS)
     deciding, judging = (some_pixels(views, chosen, PIXELS, behind, generator) for _ in range(2))
@@ -149,15 +155,18 @@ def worth(
         trial = changed(corrections, chosen, motions, log_gains)
         return squared_errors(seen or seen_by(see, trial, judging), trial, judging, len(chosen))
 
-    both, given = least_squares(left, jacobian), seen_by(see, corrections, judging)
-    as_it_is, corrected = errors(None, None, given), errors(both[:, POSES], both[:, LIGHT])
+    given = seen_by(see, corrections, judging)
+    as_it_is = errors(None, None, given)
     only_poses = errors(least_squares(left, jacobian[..., POSES]), None)
-    only_light = errors(None, least_squares(left, jacobian[..., LIGHT]), given)
-    stated = errors(None, corrections.stated[chosen], given)
-    fallen = {
-        "poses": torch.minimum(as_it_is, only_light) - torch.minimum(only_poses, corrected),
-        "light": torch.minimum(as_it_is, only_poses) - torch.minimum(only_light, corrected),
-        "stated": as_it_is - stated,
-    }
+    fallen = {"poses": as_it_is - only_poses}
+    if light:
+        both = least_squares(left, jacobian)
+        corrected = errors(both[:, POSES], both[:, LIGHT])
+        only_light = errors(None, least_squares(left, jacobian[..., LIGHT]), given)
+        fallen = {
+            "poses": torch.minimum(as_it_is, only_light) - torch.minimum(only_poses, corrected),
+            "light": torch.minimum(as_it_is, only_poses) - torch.minimum(only_light, corrected),
+            "stated": as_it_is - errors(None, corrections.stated[chosen], given),
+        }
     shares = {name: by / as_it_is for name, by in fallen.items()}  # nan where all is masked
     return {name: float(share.nanmedian().nan_to_num()) for name, share in shares.items()}

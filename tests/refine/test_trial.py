@@ -98,8 +98,8 @@ def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Vi
     assert corrections.factors(1.0) == [0.0, 0.0] and not corrections.since
     assert not corrections.due(FIRST - 1, START) and corrections.due(FIRST, START)
     assert not corrections.due(FIRST, LAST + 0.01), "too late"
-    corrections.note(FIRST, START, {"poses": 0.3, "light": 0.5, "stated": 0.0})
-    assert FIRST < LIT, "too early for gains"
+    assert FIRST < LIT and corrections.open_at(FIRST) == ["poses"], "too early for gains"
+    corrections.note(FIRST, START, {"poses": 0.3})
     assert corrections.motions.requires_grad and not corrections.log_gains.requires_grad
     assert not corrections.due(int(GROWTH * FIRST) - 1, START) and corrections.due(int(GROWTH * FIRST), START)
     assert corrections.factors(START - 0.001) == [0.0, 0.0] and corrections.factors(START) == [FASTER, 0.0]
@@ -110,6 +110,16 @@ def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Vi
     corrections.note(10 * LIT, START, {"poses": 0.0, "light": 0.005, "stated": 0.0})
     assert not corrections.due(10 * LIT, START) and corrections.due(int(10 * LIT * GROWTH), START)
     assert "light as given (corrections would lower most photos' error by 0.5%)" in told(corrections)
+
+
+def test_a_trial_of_poses_alone_says_the_same_where_light_is_exact(views: Views):
+    shifted = Views.of(spoilt(views.images, 2), views.cameras)
+    corrections = Corrections(views.cameras, BOX, auto=True)
+    alone, with_light = (
+        worth(see, shifted, BLACK, corrections, torch.Generator().manual_seed(1), light) for light in (False, True)
+    )
+    assert set(alone) == {"poses"} and alone["poses"] > 0.1
+    assert alone["poses"] == pytest.approx(with_light["poses"], abs=0.1)
 
 
 def test_gains_start_from_exposures_that_explain_the_photos_and_not_from_others(views: Views):
