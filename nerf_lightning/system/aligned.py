@@ -18,7 +18,7 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 
 COLUMNS = (0.0, 0.5), (0.5, 1.0)
 """Shares of them that make the left and the right half."""
-PIXELS = 4096
+PIXELS = 2048
 """Of each photo's half, that decide in a step."""
 TOGETHER, APART = 4, 6
 """Least-squares steps of all cameras together, and then of each alone. More would follow the faults of the field there."""
@@ -35,13 +35,15 @@ def halves(views: Views, view: int) -> tuple[Int[Tensor, "L"], Int[Tensor, "R"]]
 
 def fitted(system: NeRF3D, views: Views, half: int, corrections: Corrections) -> None:
     """Finds corrections with which a field, that stays as it is, fits this half of the photos best."""
-    see, behind, photos = system.as_it_is(), system.renderer.colour, range(len(views))
+    see, behind = system.as_it_is(), system.renderer.colour
     generator = step_generator(system.seed, Stream.STUDY, 1, system.device)
     poses, light = ("poses" in corrections.since), ("light" in corrections.since)
     together = TOGETHER if poses else 0
     for step in tracked(range(together + APART), together + APART, "aligning held-out photos"):
-        pixels = some_pixels(views, photos, PIXELS, behind, generator, COLUMNS[half])
-        left, jacobian = derivatives(see, corrections, pixels, len(views))
+        # Photo by photo, as there may be many of them.
+        photos = [some_pixels(views, [i], PIXELS, behind, generator, COLUMNS[half]) for i in range(len(views))]
+        found = [derivatives(see, corrections, pixels, 1) for pixels in photos]
+        left, jacobian = (torch.cat(parts) for parts in zip(*found, strict=True))
         change = torch.zeros_like(jacobian[:, 0])
         if step < together:
             common = corrections.common.unflatten(0, (-1, 6))
@@ -56,7 +58,8 @@ def fitted(system: NeRF3D, views: Views, half: int, corrections: Corrections) ->
         other.motions.data += change[:, POSES]
         other.log_gains.data += change[:, LIGHT]
         before, after = (
-            squared_errors(seen_by(see, by, pixels), by, pixels, len(views)) for by in (corrections, other)
+            torch.cat([squared_errors(seen_by(see, by, pixels), by, pixels, 1) for pixels in photos])
+            for by in (corrections, other)
         )
         better = (after < before)[:, None]
         for parameter, changed in ((corrections.motions, other.motions), (corrections.log_gains, other.log_gains)):
