@@ -25,8 +25,9 @@ START = 0.02
 FIRST, GROWTH, LAST = 24, 2, 0.4
 """Of the trials of `auto`: the step of the first, the factor from one to the next, and the share of the training that they end
 with. Large faults show while the field is smooth, as later it has explained them by fog; small ones when it is sharp."""
-LIT = 64
-"""Steps before which gains are not tried: a field that is still too dark everywhere wants gains."""
+EARLY, TWICE = 64, 2
+"""Steps before which gains are not tried, as a field that is still too dark everywhere wants gains; and how many times as much
+poses have to explain before: a field that is still blurred follows any motion a little."""
 HURRY, FAR, FASTER = 0.1, 4.0, 3.0
 """Poses move `FASTER` times as fast for a first share of the training, and then where they have moved far: with the root mean
 square of how far the content has moved in the photos, above `FAR` pixels. What is far off would else not arrive."""
@@ -141,16 +142,20 @@ class Corrections(torch.nn.Module):
 
     def open_at(self, step: int) -> list[str]:
         """What a trial at this step decides on."""
-        return [name for name in self.rates if name not in self.since and (name != "light" or step >= LIT)]
+        return [name for name in self.rates if name not in self.since and (name != "light" or step >= EARLY)]
+
+    def helps(self, step: int, worth: dict[str, float]) -> list[str]:
+        """What would, by a trial at this step that said this."""
+        times = TWICE if step < EARLY else 1
+        return [name for name in self.open_at(step) if worth[name] > times * WORTHWHILE[name]]
 
     def note(self, step: int, progress: float, worth: dict[str, float]) -> None:
         """Takes in what a trial said: by what share the squared error would fall if poses, or light, were corrected, or the
         stated exposures were taken for gains."""
         while step >= FIRST * GROWTH**self.tried:
             self.tried += 1
-        open_yet = self.open_at(step)
-        self.worth |= {name: worth[name] for name in open_yet}
-        chosen = [name for name in open_yet if worth[name] > WORTHWHILE[name]]
+        chosen = self.helps(step, worth)
+        self.worth |= {name: worth[name] for name in self.open_at(step)}
         self.begin(progress, *chosen)
         if "light" in chosen and worth["stated"] > 0:
             self.log_gains.data.copy_(self.stated)

@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
+from functools import partial
 from typing import Any
 
 import torch
@@ -123,15 +124,20 @@ class NeRF3D(System):
         return see
 
     def try_corrections(self) -> None:
-        """Corrects cameras and light from now on, if that would help."""
-        assert self.corrections is not None  # asked for by the caller
+        """Corrects cameras and light from now on, if that would help, also by the mean with a second trial on other pixels."""
+        corrections = self.corrections
+        assert corrections is not None  # asked for by the caller
         views, generator = (
             self.data.scene.train.to(self.device),
             step_generator(self.seed, Stream.TRIAL, self.global_step, self.device),
         )
-        light = "light" in self.corrections.open_at(self.global_step)
-        found = worth(self.as_it_is(), views, self.renderer.colour, self.corrections, generator, light)
-        self.corrections.note(self.global_step, self.progress, found)
+        light = "light" in corrections.open_at(self.global_step)
+        ask = partial(worth, self.as_it_is(), views, self.renderer.colour, corrections, generator, light)
+        found = ask()
+        if corrections.helps(self.global_step, found):
+            again = ask()
+            found = {name: (found[name] + again[name]) / 2 for name in found}
+        corrections.note(self.global_step, self.progress, found)
 
     def rehearse(self, batch: RayBatch) -> None:
         """Runs a step on a copy with the clock stopped: compiling for a new size does not count as training."""

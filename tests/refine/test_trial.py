@@ -11,7 +11,20 @@ from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.refine import Corrections, told
-from nerf_lightning.refine.corrections import FAR, FASTER, FIRST, GAMMA, GROWTH, HURRY, LAST, LIT, RIPENED, START
+from nerf_lightning.refine.corrections import (
+    EARLY,
+    FAR,
+    FASTER,
+    FIRST,
+    GAMMA,
+    GROWTH,
+    HURRY,
+    LAST,
+    RIPENED,
+    START,
+    TWICE,
+    WORTHWHILE,
+)
 from nerf_lightning.renderer import Rendered, VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system.fits import misfits
@@ -98,7 +111,9 @@ def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Vi
     assert corrections.factors(1.0) == [0.0, 0.0] and not corrections.since
     assert not corrections.due(FIRST - 1, START) and corrections.due(FIRST, START)
     assert not corrections.due(FIRST, LAST + 0.01), "too late"
-    assert FIRST < LIT and corrections.open_at(FIRST) == ["poses"], "too early for gains"
+    assert FIRST < EARLY and corrections.open_at(FIRST) == ["poses"], "too early for gains"
+    enough = {"poses": 1.5 * WORTHWHILE["poses"], "light": 0.0}
+    assert TWICE > 1.5 and not corrections.helps(FIRST, enough) and corrections.helps(EARLY, enough) == ["poses"]
     corrections.note(FIRST, START, {"poses": 0.3})
     assert corrections.motions.requires_grad and not corrections.log_gains.requires_grad
     assert not corrections.due(int(GROWTH * FIRST) - 1, START) and corrections.due(int(GROWTH * FIRST), START)
@@ -107,8 +122,8 @@ def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Vi
     again = Corrections(views.cameras, BOX, auto=True)
     again.decide(corrections.decided())
     assert again.motions.requires_grad and again.decided() == corrections.decided()
-    corrections.note(10 * LIT, START, {"poses": 0.0, "light": 0.005, "stated": 0.0})
-    assert not corrections.due(10 * LIT, START) and corrections.due(int(10 * LIT * GROWTH), START)
+    corrections.note(10 * EARLY, START, {"poses": 0.0, "light": 0.005, "stated": 0.0})
+    assert not corrections.due(10 * EARLY, START) and corrections.due(int(10 * EARLY * GROWTH), START)
     assert "light as given (corrections would lower most photos' error by 0.5%)" in told(corrections)
 
 
@@ -135,7 +150,7 @@ def test_gains_start_from_exposures_that_explain_the_photos_and_not_from_others(
         corrections = Corrections(views.cameras, BOX, exposures=exposures, auto=True)
         found = worth(darker, photos, BLACK, corrections, torch.Generator().manual_seed(1))
         assert (found["stated"] > 0.5) == fits
-        corrections.note(LIT, START, found | {"light": 1.0})
+        corrections.note(EARLY, START, found | {"light": 1.0})
         torch.testing.assert_close(corrections.log_gains.data, gains * fits)
     assert torch.equal(Corrections(views.cameras, BOX, exposures=exposures).log_gains.data, corrections.stated)
     assert not Corrections(views.cameras, BOX, exposures=exposures, light=False).log_gains.any()
