@@ -144,9 +144,9 @@ class Corrections(torch.nn.Module):
         """What a trial at this step decides on."""
         return [name for name in self.rates if name not in self.since and (name != "light" or step >= EARLY)]
 
-    def helps(self, step: int, worth: dict[str, float]) -> list[str]:
-        """What would, by a trial at this step that said this."""
-        times = TWICE if step < EARLY else 1
+    def helps(self, step: int, worth: dict[str, float], share: float = 1.0) -> list[str]:
+        """What would, by trials at this step that said this; or might, as it explains this share of what it has to."""
+        times = share * (TWICE if step < EARLY else 1)
         return [name for name in self.open_at(step) if worth[name] > times * WORTHWHILE[name]]
 
     def note(self, step: int, progress: float, worth: dict[str, float]) -> None:

@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import partial
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -21,6 +22,8 @@ from nerf_lightning.system.system import CHUNK, MakeOptimizer, Schedule, StepSta
 from nerf_lightning.system.trial import See, worth
 from nerf_lightning.utils.seeding import Stream, step_generator
 
+MIGHT, DRAWS = 0.5, 4
+"""Share of what corrections have to explain from which on this many draws of pixels decide, by their mean."""
 RAYS = 8
 """Rays sampled at once: one for this many samples of `chunk`."""
 
@@ -124,7 +127,7 @@ class NeRF3D(System):
         return see
 
     def try_corrections(self) -> None:
-        """Corrects cameras and light from now on, if that would help, also by the mean with a second trial on other pixels."""
+        """Corrects cameras and light from now on, if that would help; where it might, more pixels are asked."""
         corrections = self.corrections
         assert corrections is not None  # asked for by the caller
         views, generator = (
@@ -134,9 +137,9 @@ class NeRF3D(System):
         light = "light" in corrections.open_at(self.global_step)
         ask = partial(worth, self.as_it_is(), views, self.renderer.colour, corrections, generator, light)
         found = ask()
-        if corrections.helps(self.global_step, found):
-            again = ask()
-            found = {name: (found[name] + again[name]) / 2 for name in found}
+        if corrections.helps(self.global_step, found, MIGHT):
+            several = [found, *(ask() for _ in range(DRAWS - 1))]
+            found = {name: fmean(one[name] for one in several) for name in found}
         corrections.note(self.global_step, self.progress, found)
 
     def rehearse(self, batch: RayBatch) -> None:

@@ -114,6 +114,7 @@ def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Vi
     assert FIRST < EARLY and corrections.open_at(FIRST) == ["poses"], "too early for gains"
     enough = {"poses": 1.5 * WORTHWHILE["poses"], "light": 0.0}
     assert TWICE > 1.5 and not corrections.helps(FIRST, enough) and corrections.helps(EARLY, enough) == ["poses"]
+    assert corrections.helps(FIRST, enough, 0.5) == ["poses"] and not corrections.helps(FIRST, enough, 0.8)
     corrections.note(FIRST, START, {"poses": 0.3})
     assert corrections.motions.requires_grad and not corrections.log_gains.requires_grad
     assert not corrections.due(int(GROWTH * FIRST) - 1, START) and corrections.due(int(GROWTH * FIRST), START)
