@@ -137,8 +137,8 @@ class Corrections(torch.nn.Module):
 
     def due(self, step: int, progress: float) -> bool:
         """Whether it is time for a trial."""
-        undecided = self.auto and len(self.since) < len(self.rates)
-        return undecided and progress <= LAST and step >= FIRST * GROWTH**self.tried
+        in_time = progress <= LAST and step >= FIRST * GROWTH**self.tried
+        return self.auto and in_time and bool(self.open_at(step))
 
     def open_at(self, step: int) -> list[str]:
         """What a trial at this step decides on."""

@@ -111,6 +111,7 @@ def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Vi
     assert corrections.factors(1.0) == [0.0, 0.0] and not corrections.since
     assert not corrections.due(FIRST - 1, START) and corrections.due(FIRST, START)
     assert not corrections.due(FIRST, LAST + 0.01), "too late"
+    assert not Corrections(views.cameras, BOX, poses=False, auto=True).due(FIRST, START), "too early for gains"
     assert FIRST < EARLY and corrections.open_at(FIRST) == ["poses"], "too early for gains"
     enough = {"poses": 1.5 * WORTHWHILE["poses"], "light": 0.0}
     assert TWICE > 1.5 and not corrections.helps(FIRST, enough) and corrections.helps(EARLY, enough) == ["poses"]
