@@ -118,7 +118,7 @@ def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Vi
     assert corrections.helps(FIRST, enough, 0.5) == ["poses"] and not corrections.helps(FIRST, enough, 0.8)
     corrections.note(FIRST, START, {"poses": 0.3})
     assert corrections.motions.requires_grad and not corrections.log_gains.requires_grad
-    assert not corrections.due(int(GROWTH * FIRST) - 1, START) and corrections.due(int(GROWTH * FIRST), START)
+    assert not corrections.due(EARLY - 1, START) and corrections.due(EARLY, START)
     assert corrections.factors(START - 0.001) == [0.0, 0.0] and corrections.factors(START) == [FASTER, 0.0]
     assert corrections.factors(1.0) == [Corrections.FINAL, 0.0]
     again = Corrections(views.cameras, BOX, auto=True)
