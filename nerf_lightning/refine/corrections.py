@@ -260,7 +260,9 @@ class Corrections(torch.nn.Module):
         if self.mixing is not None:
             matrix, shift = self._own(self.mixing).index_select(0, views).split((3, 1), dim=2)
             shown = shown + (matrix * own[:, None]).sum(2) + shift[..., 0] * opacity[:, None]
-        found = shown * self.lens.shade(given.directions, views) + behind
+        if self.lens.darkening is not None:
+            shown = shown * self.lens.shade(given.directions, views)
+        found = shown + behind
         return found if truth is None else torch.where(truth >= 1, found.clamp_max(1), found)
 
     @torch.no_grad()

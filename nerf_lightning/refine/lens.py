@@ -67,9 +67,8 @@ class LensCorrections(torch.nn.Module):
 
         exp(-a r^2 - b r^4), where r is the tangent of the angle to the axis, 1 in the farthest corner.
         """
+        assert self.darkening is not None  # asked for by the caller
         ahead = (directions * self.axes.index_select(0, views)).sum(1, keepdim=True)
-        if self.darkening is None:
-            return torch.ones_like(ahead)
         square = (ahead.square().clamp_min(torch.finfo(ahead.dtype).eps).reciprocal() - 1) / self.reach
         first, second = self.darkening
         return torch.exp(-square * (first + square * second))
