@@ -1,13 +1,17 @@
 """The chart as one HTML file that opens without a network and shows each point's configuration."""
 
 import json
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from nerf_lightning.chart.advice import in_bytes
 from nerf_lightning.chart.comparison import COSTS, Comparison
 from nerf_lightning.chart.points import Point
 from nerf_lightning.chart.references import Reference
+from nerf_lightning.runs.index import FIELD_PAGE
 from nerf_lightning.utils.machine import crowding
 
 TEMPLATE = """<!DOCTYPE html>
@@ -23,6 +27,7 @@ svg {{ width: 100%; max-width: 1500px; height: auto; display: block; margin: aut
 p {{ max-width: 1400px; margin: .6em auto; color: #555; }}
 #card {{ position: fixed; display: none; box-sizing: border-box; max-width: min(760px, 96vw); padding: 10px 14px;
   background: white; border: 1px solid #888; border-radius: 6px; box-shadow: 2px 3px 12px #0004; pointer-events: none; }}
+#card.kept {{ pointer-events: auto; }} #card a {{ display: block; margin: 6px 0; }}
 #card b {{ display: block; margin-bottom: 4px; font-size: 15px; }}
 #card dl {{ margin: 0; display: grid; grid-template-columns: max-content auto; gap: 0 10px; }}
 #card dl + dl {{ margin-top: 8px; padding-top: 8px; border-top: 1px solid #ccc; font-size: 11px;
@@ -57,6 +62,12 @@ function show(name, place) {{
   const title = document.createElement("b");
   title.textContent = points[name].title;
   card.append(title, list(points[name].figures));
+  if (points[name].page) {{
+    const link = document.createElement("a");
+    link.href = points[name].page; link.target = "_blank"; link.rel = "noopener"; link.textContent = "turn the result";
+    card.append(link);
+  }}
+  card.classList.toggle("kept", kept !== null);
   if (points[name].options.length) card.append(list(points[name].options));
   card.style.display = "block";
   const box = card.getBoundingClientRect(), gap = 16;
@@ -88,25 +99,26 @@ document.addEventListener("keydown", event => {{ if (event.key === "Escape") {{ 
 """
 
 
-def chart_page(svg: str, comparisons: Sequence[Comparison]) -> str:
+def chart_page(svg: str, comparisons: Sequence[Comparison], folder: Path) -> str:
     """The page.
 
     Args:
         svg: what `chart_figure` drew of the same comparisons.
         comparisons: what it shows.
+        folder: where the page will be: a point whose run has a page of its own links to that.
     """
     told: dict[str, dict[str, Any]] = {}
     for row, one in enumerate(comparisons):
         for number, point in enumerate(one.points):
             marks = [f"{cost.name}-{row}-{number}" for cost in COSTS]
-            told[f"{row}-{number}"] = {"marks": marks, **_card(point, one.on_frontier(number))}
+            told[f"{row}-{number}"] = {"marks": marks, **_card(point, one.on_frontier(number), folder)}
         for number, reference in enumerate(one.references):
             told[f"published-{row}-{number}"] = {"marks": [f"published-{row}-{number}"], **_published(reference)}
     data = json.dumps(told).replace("<", "\\u003c")  # so that nothing in it can end the script
     return TEMPLATE.format(svg=svg[svg.index("<svg") :], points=data)
 
 
-def _card(point: Point, fronts: Sequence[str]) -> dict[str, Any]:
+def _card(point: Point, fronts: Sequence[str], folder: Path) -> dict[str, Any]:
     seeds = ", ".join(
         f"{run.results.get('seed')}: {'no figure' if run.psnr is None else f'{run.psnr:.2f} dB'}"
         + ("" if run.status == "finished" else f" ({run.status})")
@@ -125,7 +137,9 @@ def _card(point: Point, fronts: Sequence[str]) -> dict[str, Any]:
     ]
     left_out = [key for key in point.configuration if key.startswith("trainer.") or key.endswith("_partial_")]
     options = [(key, str(value)) for key, value in point.configuration.items() if key not in left_out]
-    return {"title": point.label, "figures": figures, "options": options}
+    page = point.typical.folder / FIELD_PAGE
+    address = quote(Path(os.path.relpath(page, folder)).as_posix()) if page.is_file() else None
+    return {"title": point.label, "figures": figures, "options": options, "page": address}
 
 
 def _load(point: Point) -> str:
@@ -141,4 +155,4 @@ def _published(reference: Reference) -> dict[str, Any]:
         ("measured on", f"{reference.scene}, {reference.conditions}"),
         ("source", reference.source),
     ]
-    return {"title": reference.name, "figures": figures, "options": []}
+    return {"title": reference.name, "figures": figures, "options": [], "page": None}

@@ -36,7 +36,7 @@ def write_report(
     figure = chart_figure(comparisons, bad)
     write_png(output / "chart.png", pixels_of(figure))
     svg = as_svg(figure)
-    for name, text in (("chart.svg", svg), ("chart.html", chart_page(svg, comparisons))):
+    for name, text in (("chart.svg", svg), ("chart.html", chart_page(svg, comparisons, output))):
         with atomic(output / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
     write_csv(output / "chart.csv", comparisons, [run for run in runs if run.folder not in charted])

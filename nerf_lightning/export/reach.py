@@ -11,6 +11,7 @@ from nerf_lightning.cameras import Cameras
 from nerf_lightning.model.layers.pruning import widened
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.utils.progress import tracked
 
 NOTHING = 1e-3
 """Opacity below which a step is empty."""
@@ -28,22 +29,27 @@ def occupied_cells(system: System) -> Cells | None:
     return system.sampler.occupied.view(*[system.sampler.resolution] * 3)
 
 
-@torch.no_grad()
 def seen_cells(system: System, cameras: Cameras) -> Cells | None:
-    """The occupied cells that are visible to the cameras, and their neighbours.
-
-    Rays are as close to each other at the content as cells are.
-    """
+    """The occupied cells that are visible to the cameras, and their neighbours."""
     occupied = occupied_cells(system)
     if occupied is None:
         return None
     assert isinstance(system, NeRF3D)  # as it has cells
-    bounds, n = system.sampler.bounds, len(occupied)
-    cell = 2 * float(bounds.half_size.max()) / n
+    return widened(visible_cells(system, cameras, len(occupied))) & occupied
+
+
+@torch.no_grad()
+def visible_cells(system: NeRF3D, cameras: Cameras, n: int) -> Cells:
+    """The cells of a grid of n^3 over the bounds in which some camera sees something.
+
+    Rays are as close to each other at the content as cells are.
+    """
+    bounds = system.field.bounds
+    cell = (4 if bounds.unbounded else 2) * bounds.longest / n
     times = min(FINEST, math.ceil(cameras.pixel_width(bounds.centre.cpu()) / cell))
     fine = cameras.scaled(times)
     seen = torch.zeros(n**3, dtype=torch.bool, device=system.device)
-    for view in range(len(fine)):
+    for view in tracked(range(len(fine)), len(fine), "views"):
         rays = fine.view_rays(view)
         for start in range(0, len(rays), system.chunk_rays):
             chunk = rays[start : start + system.chunk_rays].to(system.device)
@@ -52,7 +58,7 @@ def seen_cells(system: System, cameras: Cameras) -> Cells | None:
             opacity = 1 - torch.exp(-system.field.density(positions) * samples.dt)
             x, y, z = (bounds.to_unit(positions[opacity > NOTHING]) * n).long().clamp(0, n - 1).unbind(1)
             seen[(x * n + y) * n + z] = True
-    return widened(seen.view(n, n, n)) & occupied
+    return seen.view(n, n, n)
 
 
 def confined_to(system: System, cells: Cells | None) -> System:

@@ -10,7 +10,7 @@ import torch
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.reach import confined_to, occupied_cells, seen_cells
+from nerf_lightning.export.reach import Cells, confined_to, occupied_cells, seen_cells
 from nerf_lightning.runs.compact import decode, encode
 from nerf_lightning.runs.folder import scene_content
 from nerf_lightning.system import System
@@ -59,6 +59,7 @@ def smallest(
     config: dict[str, Any],
     most_loss: float,
     precision: str | None = None,
+    seen: Cells | None = None,
 ) -> Compact:
     """Encodes a system in the fewest bytes within the allowed loss: what its photos' cameras see, or everything.
 
@@ -68,12 +69,14 @@ def smallest(
         config: of its run, as plain values.
         most_loss: dB on held-out views.
         precision: "byte" or "half"; None takes the smaller one that is allowed.
+        seen: the occupied cells that its photos' cameras see, where they are known.
 
     Raises:
         InputError: where every precision asked for loses more.
     """
     before = held_out_psnr(system, data)
-    seen = seen_cells(system, some_cameras(data)) if isinstance(data, RayDataModule) else None
+    if seen is None and isinstance(data, RayDataModule):
+        seen = seen_cells(system, some_cameras(data))
     confined = [confined_to(system, cells) for cells in ([None] if seen is None else [seen, occupied_cells(system)])]
     scene = scene_content(data)
     tried: list[Compact] = []

@@ -10,11 +10,13 @@ from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.mesh import mesh_file, points_file, voxels_file
 from nerf_lightning.export.options import ExportOptions
+from nerf_lightning.export.pages import paged, side_by_side
 from nerf_lightning.export.photos import write_photos
 from nerf_lightning.export.smallest import MOST_VIEWS, PRECISIONS, smallest, some_cameras
 from nerf_lightning.export.volume import volume_of
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, load_scene, plain_config
+from nerf_lightning.runs.index import FIELD_PAGE
 from nerf_lightning.runs.open import SceneRun, beside, open_run, open_scene_run
 from nerf_lightning.utils.device import the_device
 from nerf_lightning.utils.evenly import evenly
@@ -28,6 +30,7 @@ NAMES = {
     ("ply", "mesh"): "mesh.ply",
     ("glb", "mesh"): "mesh.glb",
     ("ply", "points"): "points.ply",
+    ("html", "mesh"): FIELD_PAGE,
     ("transforms", "mesh"): "posed",
 }
 """Default names of the output, by format and content."""
@@ -51,6 +54,8 @@ def export(options: ExportOptions) -> None:
     if options.box is not None and not (len(options.box) == 6 and all(map(lt, options.box[:3], options.box[3:]))):
         raise InputError("config", "box", str(options.box), "the lower, then the upper corner: [x,y,z,x,y,z]")
     source = Path(options.run).expanduser()
+    if options.format == "html" and source.is_dir() and not (source / "config.yaml").exists():
+        return side_by_side(options, source, device)
     output = beside(source) / NAMES[options.format, options.content]
     if options.output is not None:
         output = Path(options.output).expanduser()
@@ -58,7 +63,8 @@ def export(options: ExportOptions) -> None:
         return posed(options, source, output)
     if options.format in ("ply", "glb"):
         require("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
-    content, words = (compacted if options.format == "compact" else shaped)(options, source, device)
+    made = {"compact": compacted, "html": paged}.get(options.format, shaped)
+    content, words = made(options, source, device)
     with atomic(output) as temporary:
         temporary.write_bytes(content)
     print(f"{output}: {words}")

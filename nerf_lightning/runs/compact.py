@@ -49,10 +49,7 @@ def encode(system: System, precision: str, config: dict[str, Any], scene: dict[s
             codes[whole] = {"code": code, "shape": list(tensor.shape)}
             arrays |= _coded(whole, tensor.detach().cpu().numpy(), code)
     header = {"format": FORMAT, "version": VERSION, "config": config, "scene": scene, "arrays": codes}
-    arrays["header"] = np.frombuffer(json.dumps(header, allow_nan=False).encode(), np.uint8)
-    file = io.BytesIO()
-    np.savez_compressed(file, **arrays)
-    return file.getvalue()
+    return _packed(header, arrays)
 
 
 def parts(system: System) -> dict[str, dict[str, Tensor]]:
@@ -130,6 +127,28 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
     except (KeyError, RuntimeError) as error:
         raise InputError(path, "", str(error), "the weights of the model it names") from error
     return RunFolder(cfg, system.eval().to(device), orbit, to_source, scene)
+
+
+def without_folders(content: bytes) -> bytes:
+    """The content of a compact file to be given away: of each path on this machine only its last name is left."""
+
+    def bare(node: Any) -> Any:
+        if isinstance(node, dict):
+            return {key: bare(value) for key, value in node.items()}
+        if isinstance(node, list):
+            return [bare(value) for value in node]
+        return Path(node).name if isinstance(node, str) and Path(node).is_absolute() else node
+
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        arrays: Arrays = {key: file[key] for key in file.files}
+    header = bare(json.loads(arrays["header"].tobytes()))
+    return _packed(header, {key: array for key, array in arrays.items() if key != "header"})
+
+
+def _packed(header: dict[str, Any], arrays: Arrays) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays, header=np.frombuffer(json.dumps(header, allow_nan=False).encode(), np.uint8))
+    return file.getvalue()
 
 
 def _of(part: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

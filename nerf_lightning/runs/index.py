@@ -16,6 +16,9 @@ from nerf_lightning.errors import InputError
 FINISHED = ("finished", "collapsed")
 """Status of completed runs."""
 
+FIELD_PAGE = "field.html"
+"""The name of a run's web page in its folder, as the export verb writes it and charts look for it."""
+
 
 @dataclass(frozen=True)
 class Run:

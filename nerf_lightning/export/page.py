@@ -1,0 +1,183 @@
+"""A field as one web page: its compact file, a ray marcher for the browser's graphics, and what a person's hands do with it."""
+
+import base64
+import hashlib
+import html
+import json
+import re
+from collections.abc import Sequence
+from importlib.resources import files
+from typing import Any
+from urllib.parse import quote
+
+import imageio.v3 as imageio
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from nerf_lightning.cameras import Cameras, focus_point
+from nerf_lightning.model import TensoRFField, VoxelField
+from nerf_lightning.model.layers.activation import SoftenableReLU, shifted_softplus
+from nerf_lightning.runs.folder import RunFolder
+from nerf_lightning.sampler import OccupancySampler
+from nerf_lightning.system import NeRF3D
+
+SCRIPTS = ("common.js", "compact.js", "textures.js", "camera.js", "renderer.js", "page.js")
+PICTURE_SCRIPTS = ("common.js", "picture.js")
+FAR = 1e9
+"""Where a ray ends that nothing else ends, world units."""
+LEAST = 1e-4
+"""Share of a pixel below which a sample's colour is not asked for: a few dozen such change no byte."""
+FRUSTUM = 0.06
+"""Depth of a photo's pyramid, as a share of the cameras' distance to what they look at."""
+WORD = re.compile(r"[^\w.-]+")
+
+
+def part(name: str) -> str:
+    """A source of the page, without the comments and indents that only its readers need."""
+    text = files(__package__).joinpath("web", name).read_text(encoding="utf-8")
+    if name.endswith(".html"):
+        return text
+    lines = (re.sub(r"(^|\s\s+)//.*$", "", line).strip() for line in text.splitlines())
+    return "\n".join(filter(None, lines))
+
+
+def activation_of(field: TensoRFField | VoxelField) -> int:
+    """The map from raw output to density, by its number in march.glsl: exp, relu, softplus."""
+    made = field.activation if isinstance(field, TensoRFField) else torch.exp
+    if isinstance(made, SoftenableReLU):
+        return 2 if bool(made.soft) else 1
+    return 2 if made is shifted_softplus else 0
+
+
+def poses(cameras: Cameras) -> dict[str, Any]:
+    """Camera-to-world matrices as rows of three, 32-bit, and lenses: one if all are alike, else of each."""
+    rows = cameras.c2w[:, :3].contiguous().numpy().astype("<f4")
+    lenses = [
+        [width, height, K[0][0], K[1][1], K[0][2], K[1][2]]
+        for (width, height), K in zip(cameras.sizes.tolist(), cameras.K.tolist(), strict=True)
+    ]
+    alike = all(lens == lenses[0] for lens in lenses)
+    return {"poses": base64.b64encode(rows.tobytes()).decode(), "lenses": lenses[:1] if alike else lenses}
+
+
+def described(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
+    """What the page needs to know of a field besides its compact file.
+
+    Args:
+        system: with planes and lines or voxels, and an occupancy grid.
+        orbit: the views that the turntable shows.
+    """
+    field, sampler = system.field, system.sampler
+    assert isinstance(field, TensoRFField | VoxelField) and isinstance(sampler, OccupancySampler)
+    bounds = sampler.bounds.to("cpu")
+    near, far = bounds.near, bounds.far
+    if near is None:
+        near = 0.02 * bounds.longest if bounds.unbounded else 0.0
+    if far is None:
+        far = 50.0 * bounds.longest if bounds.unbounded else FAR
+    return {
+        "kind": "planes" if isinstance(field, TensoRFField) else "voxels",
+        "terms": field.terms,
+        "activation": activation_of(field),
+        "density_rate": field.density_rate if isinstance(field, VoxelField) else 1.0,
+        "least": LEAST,
+        "background": system.renderer.colour.tolist(),
+        "bounds": {
+            "low": bounds.aabb[0].tolist(),
+            "size": (2 * bounds.half_size).tolist(),
+            "unit": bounds.longest,
+            "unbounded": bounds.unbounded,
+            "near": max(near, 0.0),
+            "far": far,
+        },
+        "sampler": {
+            "samples": sampler.samples,
+            "step": sampler.step_length,
+            "cells": sampler.resolution,
+            "stop": sampler.early_stop_eps,
+        },
+        "focus": focus_point(orbit.c2w).tolist(),
+        "up": upward(orbit).tolist(),
+        "orbit": poses(orbit),
+    }
+
+
+def upward(orbit: Cameras) -> Float[Tensor, "3"]:
+    """What is up in an orbit's pictures, world frame."""
+    return torch.nn.functional.normalize(-orbit.c2w[:, :3, 1].mean(0), dim=0)
+
+
+def photos_of(cameras: Cameras, names: Sequence[str], focus: Float[Tensor, "3"]) -> dict[str, Any]:
+    """Photos to look through, and how deep to draw their pyramids."""
+    if not len(cameras):
+        return {"names": [], "poses": "", "lenses": [], "depth": 0.0}
+    depth = FRUSTUM * float((cameras.centres - focus).norm(dim=1).median())
+    return {"names": list(names), "depth": depth, **poses(cameras)}
+
+
+def field_page(
+    compact: bytes,
+    run: RunFolder,
+    name: str,
+    facts: Sequence[tuple[str, str]],
+    photos: Cameras | None = None,
+    names: Sequence[str] = (),
+) -> str:
+    """The page's HTML. Nothing in it is fetched from anywhere, and nothing that a run's files say is executed.
+
+    Args:
+        compact: a compact file.
+        run: what it holds, with a field and a sampler that `described` knows.
+        name: of the scene.
+        facts: about the field, by name.
+        photos: cameras to look through.
+        names: of those.
+    """
+    assert isinstance(run.system, NeRF3D) and run.orbit is not None  # a scene's
+    about = described(run.system, run.orbit)
+    shown = run.orbit[torch.arange(0)] if photos is None else photos
+    about |= {
+        "name": name,
+        "file": WORD.sub("_", name) or "field",
+        "facts": [list(fact) for fact in facts],
+        "photos": photos_of(shown, names, torch.tensor(about["focus"])),
+    }
+    return filled(
+        "page", SCRIPTS, shader=part("march.glsl"), about=told(about), compact=base64.b64encode(compact).decode()
+    )
+
+
+def picture_page(picture: UInt8[np.ndarray, "H W 3"], name: str, facts: Sequence[tuple[str, str]]) -> str:
+    """The page of a picture's field: the field's picture, without loss, and facts about it."""
+    about = {"name": name, "facts": [list(fact) for fact in facts]}
+    packed = imageio.imwrite("<bytes>", picture, extension=".webp", lossless=True)
+    return filled("picture", PICTURE_SCRIPTS, about=told(about), picture=base64.b64encode(packed).decode())
+
+
+def gallery_page(title: str, pages: Sequence[tuple[str, str, str]]) -> str:
+    """Pages side by side, whose views turn together: of each its address, its name, and a line about it."""
+    figures = "\n".join(
+        f'<figure><iframe sandbox="allow-scripts" title="{html.escape(name)}" src="{html.escape(quote(address))}">'
+        f"</iframe><figcaption><b>{html.escape(name)}</b>{html.escape(line)}</figcaption></figure>"
+        for address, name, line in pages
+    )
+    return filled("gallery", ("gallery.js",), title=html.escape(title), figures=figures)
+
+
+def filled(name: str, scripts: Sequence[str], **values: str) -> str:
+    """A template with its style, its scripts, and the content policy that allows those alone."""
+    style, script = part("gallery.css" if name == "gallery" else "page.css"), "\n".join(map(part, scripts))
+    values |= {"style": style, "script": script, "style_hash": hash_of(style), "script_hash": hash_of(script)}
+    return part(f"{name}.html").format(**values)
+
+
+def told(about: dict[str, Any]) -> str:
+    """JSON in which nothing can end the script element that holds it."""
+    return json.dumps(about, allow_nan=False).replace("<", "\\u003c")
+
+
+def hash_of(text: str) -> str:
+    """As a page's content policy names what may be used of it."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

@@ -1,0 +1,65 @@
+// A camera as three axes and a place, as in cameras/transforms.py: right, down and ahead, in the world frame.
+
+const add = (a, b, by = 1) => [a[0] + by * b[0], a[1] + by * b[1], a[2] + by * b[2]];
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const scaled = (a, by) => [a[0] * by, a[1] * by, a[2] * by];
+const unitLength = a => scaled(a, 1 / (Math.hypot(...a) || 1));
+const between = (a, b, share) => a.map((x, i) => x + share * (b[i] - x));
+const turned = (a, axis, angle) =>          // Rodrigues' rotation
+  add(add(scaled(a, Math.cos(angle)), cross(axis, a), Math.sin(angle)), axis, dot(axis, a) * (1 - Math.cos(angle)));
+
+const STEEPEST = 0.995;                     // cosine between ahead and up at which turning stops
+class Camera {
+  // lens: width, height, fx, fy, cx, cy in pixels of the picture it was made for; target: what it turns around.
+  constructor(right, down, ahead, eye, lens, target) { Object.assign(this, { right, down, ahead, eye, lens, target }); }
+
+  // Rows 3 x 4 of a camera-to-world matrix; it turns around the place on its axis that is nearest to the focus.
+  static from(rows, lens, focus) {
+    const column = i => [rows[i], rows[4 + i], rows[8 + i]], ahead = column(2), eye = column(3);
+    const far = dot(add(focus, eye, -1), ahead), away = Math.hypot(...add(focus, eye, -1));
+    return new Camera(column(0), column(1), ahead, eye, lens, add(eye, ahead, far > 0.1 * away ? far : away));
+  }
+  get distance() { return Math.hypot(...add(this.eye, this.target, -1)); }
+
+  // The lens on a canvas that holds its whole picture.
+  lensOn(width, height) {
+    const [w, h, fx, fy, cx, cy] = this.lens, by = Math.min(width / w, height / h);
+    return [fx * by, fy * by, (cx - w / 2) * by + width / 2, (cy - h / 2) * by + height / 2];
+  }
+
+  // What march.glsl calls across, down and ahead.
+  axes(width, height) {
+    const [fx, fy, cx, cy] = this.lensOn(width, height), across = scaled(this.right, 1 / fx), down = scaled(this.down, 1 / fy);
+    return [across, down, add(add(this.ahead, across, -cx), down, -cy)];
+  }
+
+  // Where a place appears on a canvas, or null behind the camera.
+  project(place, width, height) {
+    const [fx, fy, cx, cy] = this.lensOn(width, height), away = add(place, this.eye, -1), depth = dot(away, this.ahead);
+    return depth > 1e-6 ? [cx + fx * dot(away, this.right) / depth, cy + fy * dot(away, this.down) / depth] : null;
+  }
+  turn(yaw, pitch, up) {
+    for (const [axis, angle] of [[up, yaw], [this.right, pitch]]) {
+      const steep = dot(turned(this.ahead, axis, angle), up);
+      if (axis !== up && Math.abs(steep) > STEEPEST && Math.abs(steep) > Math.abs(dot(this.ahead, up))) continue;
+      for (const name of ["right", "down", "ahead"]) this[name] = unitLength(turned(this[name], axis, angle));
+      this.eye = add(this.target, turned(add(this.eye, this.target, -1), axis, angle));
+    }
+  }
+  approach(factor) { this.eye = add(this.target, add(this.eye, this.target, -1), factor); }
+
+  // By pixels of the canvas: what is at the target's distance follows the pointer.
+  slide(x, y, width, height) {
+    const [fx, fy] = this.lensOn(width, height), depth = this.distance;
+    const move = add(scaled(this.right, -x * depth / fx), this.down, -y * depth / fy);
+    this.eye = add(this.eye, move);
+    this.target = add(this.target, move);
+  }
+  toward(other, share) {
+    const ahead = unitLength(between(this.ahead, other.ahead, share)), right = between(this.right, other.right, share);
+    const upright = unitLength(add(right, ahead, -dot(right, ahead)));
+    const [eye, lens, target] = ["eye", "lens", "target"].map(name => between(this[name], other[name], share));
+    return new Camera(upright, cross(ahead, upright), ahead, eye, lens, target);
+  }
+}

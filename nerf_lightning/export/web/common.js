@@ -1,0 +1,33 @@
+// What the pages of scenes and of pictures share.
+"use strict";
+
+const $ = id => document.getElementById(id);
+const about = JSON.parse($("about").textContent);
+const middle = points => points.reduce((a, b) => [a[0] + b[0] / points.length, a[1] + b[1] / points.length], [0, 0]);
+const apart = ([a, b]) => b ? Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1])) : 1;
+
+function keys(acts) {
+  addEventListener("keydown", event => {
+    if (event.ctrlKey || event.metaKey || event.altKey || /INPUT|SELECT|DIALOG/.test(event.target.tagName) || !(event.key in acts)) return;
+    acts[event.key]();
+    event.preventDefault();
+  });
+}
+
+function fullScreen() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else document.documentElement.requestFullscreen?.().catch(() => {});
+}
+
+// Name and facts, as text: whatever they hold, nothing of it is read as HTML.
+function tell() {
+  document.title = $("title").textContent = about.name;
+  for (const [key, text] of about.facts) {
+    const term = document.createElement("dt"), told = document.createElement("dd");
+    term.textContent = key;
+    told.textContent = text;
+    $("list").append(term, told);
+  }
+  $("full").addEventListener("click", fullScreen);
+  $("information").addEventListener("click", () => $("facts").showModal());
+}

@@ -1,0 +1,7 @@
+// What one page says of its camera, the others hear.
+"use strict";
+addEventListener("message", event => {
+  if (event.data?.kind !== "nerf_lightning camera") return;
+  for (const frame of document.querySelectorAll("iframe"))
+    if (frame.contentWindow !== event.source) frame.contentWindow.postMessage(event.data, "*");
+});

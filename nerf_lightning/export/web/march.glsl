@@ -1,0 +1,222 @@
+// One ray a pixel, as sampler/occupancy.py and renderer/volumetric.py do it; names are theirs. The page puts #version and
+// constants before this: PLANES or VOXELS, UNBOUNDED, TERMS, ... Places are in the unit cube, distances in world units.
+precision highp float;
+precision highp int;
+precision highp sampler3D;
+precision highp sampler2DArray;
+precision highp usampler3D;
+
+uniform vec3 eye, across, down, ahead;      // pixel (u, v) looks along u across + v down + ahead (Cameras.pixel_axes)
+uniform float height;                       // pixels: row 0 is at the top, gl_FragCoord.y = 0 at the bottom
+uniform vec4 background;                    // rgb, and 0 where it is transparent
+uniform vec3 keepLow, keepHigh;             // the crop box, unit cube
+uniform vec2 shades;                        // distances shown as white and as black
+uniform int shown;                          // 0 colour, 1 depth, 2 opacity, 3 depth as a number
+uniform usampler3D gaps;                    // cells to the nearest occupied one (largest of the three axes), 0 in it
+out vec4 pixel;
+
+const float NONE = 1e9;
+
+float density(float raw) {                  // layers/activation.py, then from 1 / half-size to 1 / world unit
+#if ACTIVATION == 0
+  return exp(min(raw, 15.0)) / UNIT;
+#elif ACTIVATION == 1
+  return max(raw, 0.0) / UNIT;
+#else
+  return (raw > 20.0 ? raw - 1.0 : log(1.0 + exp(raw - 1.0))) / UNIT;
+#endif
+}
+
+vec3 sigmoid(vec3 x) { return 1.0 / (1.0 + exp(-x)); }
+
+float harmonics[16];                        // of this ray's direction (kernels/harmonics.py)
+void seenAlong(vec3 d) {
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+  harmonics[0] = 0.28209479;
+  harmonics[1] = -0.48860251 * y;
+  harmonics[2] = 0.48860251 * z;
+  harmonics[3] = -0.48860251 * x;
+  harmonics[4] = 1.09254843 * x * y;
+  harmonics[5] = -1.09254843 * y * z;
+  harmonics[6] = 0.31539157 * (3.0 * zz - 1.0);
+  harmonics[7] = -1.09254843 * x * z;
+  harmonics[8] = 0.54627422 * (xx - yy);
+  harmonics[9] = 0.59004359 * y * (yy - 3.0 * xx);
+  harmonics[10] = 2.89061144 * x * y * z;
+  harmonics[11] = 0.45704580 * y * (1.0 - 5.0 * zz);
+  harmonics[12] = 0.37317633 * z * (5.0 * zz - 3.0);
+  harmonics[13] = 0.45704580 * x * (1.0 - 5.0 * zz);
+  harmonics[14] = 1.44530572 * z * (xx - yy);
+  harmonics[15] = 0.59004359 * x * (3.0 * yy - xx);
+}
+
+#ifdef PLANES
+// Sums of planes times lines (kernels/planes.py). Layer m * groups + g holds channels 4g to 4g+3 of mode m; a channel coded as
+// bytes lies between `low` and `low + span`, which the filter may be asked for first, as both are linear.
+uniform sampler2DArray densityPlanes, densityLines, colourPlanes, colourLines;
+uniform vec4 densityRanges[4 * DENSITY_GROUPS], colourRanges[4 * COLOUR_GROUPS];   // planes' low, span, lines' low, span
+#ifdef NETWORK_BLOCK
+layout(std140) uniform Network { vec4 network[NETWORK]; };
+#define W(i) network[i]
+#else
+uniform highp sampler2D networkTexture;
+#define W(i) texelFetch(networkTexture, ivec2((i) & 1023, (i) >> 10), 0)
+#endif
+const int INPUTS = 3 * COLOUR_GROUPS, STRIDE = 1 + TERMS + 4 * INPUTS + 3;         // vec4s for each four neurons
+
+vec3 inTexture(vec3 unit, float side) { return (clamp(unit, 0.0, 1.0) * (side - 1.0) + 0.5) / side; }
+vec2 inPlane(vec3 at, int mode) { return mode == 0 ? at.zy : mode == 1 ? at.zx : at.yx; }
+
+float rawDensity(vec3 unit) {
+  vec3 at = inTexture(unit, float(DENSITY_SIDE));
+  float total = 0.0;
+  for (int mode = 0; mode < 3; mode++) for (int g = 0; g < DENSITY_GROUPS; g++) {
+    float layer = float(mode * DENSITY_GROUPS + g);
+    vec4 plane = densityRanges[4 * g] + densityRanges[4 * g + 1] * texture(densityPlanes, vec3(inPlane(at, mode), layer));
+    vec4 line = densityRanges[4 * g + 2] + densityRanges[4 * g + 3] * texture(densityLines, vec3(at[mode], 0.5, layer));
+    total += dot(plane, line);
+  }
+  return total;
+}
+
+vec4 alongRay[NEURONS];                     // what bias and direction give each four neurons: the same all along the ray
+void prepare() {
+  for (int j = 0; j < NEURONS; j++) {
+    vec4 sum = W(j * STRIDE);
+    for (int term = 0; term < TERMS; term++) sum += harmonics[term] * W(j * STRIDE + 1 + term);
+    alongRay[j] = sum;
+  }
+}
+
+vec3 colourAt(vec3 unit) {
+  vec3 at = inTexture(unit, float(COLOUR_SIDE));
+  vec4 products[INPUTS];
+  for (int mode = 0; mode < 3; mode++) for (int g = 0; g < COLOUR_GROUPS; g++) {
+    int layer = mode * COLOUR_GROUPS + g;
+    vec4 plane = colourRanges[4 * g] + colourRanges[4 * g + 1] * texture(colourPlanes, vec3(inPlane(at, mode), float(layer)));
+    vec4 line = colourRanges[4 * g + 2] + colourRanges[4 * g + 3] * texture(colourLines, vec3(at[mode], 0.5, float(layer)));
+    products[layer] = plane * line;
+  }
+  vec3 logits = W(NEURONS * STRIDE).rgb;
+  for (int j = 0; j < NEURONS; j++) {       // a hidden layer with ReLU, four neurons at a time (kernels/mlp.py)
+    int w = j * STRIDE + 1 + TERMS;
+    vec4 hidden = alongRay[j];
+    for (int i = 0; i < INPUTS; i++, w += 4) hidden += mat4(W(w), W(w + 1), W(w + 2), W(w + 3)) * products[i];
+    hidden = max(hidden, 0.0);
+    logits += vec3(dot(W(w), hidden), dot(W(w + 1), hidden), dot(W(w + 2), hidden));
+  }
+  return sigmoid(logits);
+}
+#else
+// A sparse grid (kernels/voxels.py) as bricks of 8 x 8 x 8 vertices, of which neighbours share a side: the filter never leaves a
+// brick. Part 0 of the atlas holds log-density and colour, part 1 + b what harmonic 1 + b adds to red, green and blue.
+uniform usampler3D bricks;                  // where in the atlas each brick is; alpha 0: nowhere, nothing is kept there
+uniform sampler3D atlas;
+uniform vec3 atlasSize;                     // texels
+uniform float partDepth;                    // texels along z from one part of the atlas to the next
+uniform vec4 ranges[2 * (1 + TERMS)];       // low and span of each part
+const int BRICK = 7;
+
+vec3 brickPlace = vec3(0.0);
+vec4 part(int p) { return ranges[2 * p] + ranges[2 * p + 1] * texture(atlas, (brickPlace + vec3(0, 0, float(p) * partDepth)) / atlasSize); }
+
+vec3 firstColour;
+float rawDensity(vec3 unit) {
+  vec3 place = clamp(unit, 0.0, 1.0) * float(SIDE - 1);
+  ivec3 brick = min(ivec3(place) / BRICK, BRICKS - 1);
+  uvec4 slot = texelFetch(bricks, brick.zyx, 0);
+  if (slot.a == 0u) return -NONE;
+  brickPlace = vec3(slot.xyz) * float(BRICK + 1) + place - vec3(brick * BRICK) + 0.5;
+  vec4 found = part(0);
+  firstColour = found.gba;
+  return DENSITY_RATE * found.r;
+}
+
+void prepare() {}
+
+vec3 colourAt(vec3 unit) {                  // where rawDensity was asked last
+  vec3 logits = firstColour;
+  for (int b = 1; b <= TERMS; b++) logits += harmonics[b] * part(b).rgb;
+  return sigmoid(logits);
+}
+#endif
+
+vec3 unitOf(vec3 place) {                   // Bounds.to_unit
+  vec3 unit = (place - LOW) / SIZE;
+#ifdef UNBOUNDED
+  vec3 local = 2.0 * unit - 1.0;
+  float norm = max(max(abs(local.x), abs(local.y)), max(abs(local.z), 1.0));
+  return (2.0 - 1.0 / norm) * (local / norm) * 0.25 + 0.5;
+#else
+  return unit;
+#endif
+}
+
+#ifdef UNBOUNDED
+float warp(float t, vec2 inside) {          // cameras/bounds.py: samples are even in what it gives
+  float before = max((inside.x - t) / UNIT, 0.0), behind = max((t - inside.y) / UNIT, 0.0);
+  return 1.0 / (1.0 + before) - 1.0 / (1.0 + behind) + (clamp(t, inside.x, inside.y) - inside.x) / UNIT;
+}
+float unwarp(float y, vec2 inside) {        // its inverse
+  float within = (inside.y - inside.x) / UNIT;
+  if (y < 0.0) return inside.x - UNIT * (1.0 / (1.0 + max(y, -1.0 + 1e-6)) - 1.0);
+  if (y > within) return inside.y + UNIT * (1.0 / (1.0 - min(y - within, 1.0 - 1e-6)) - 1.0);
+  return inside.x + UNIT * y;
+}
+#endif
+
+void main() {
+  vec3 towards = normalize(gl_FragCoord.x * across + (height - gl_FragCoord.y) * down + ahead);
+  vec3 safe = mix(towards, vec3(1e-9), lessThan(abs(towards), vec3(1e-9)));
+  vec3 one = (LOW - eye) / safe, other = (LOW + SIZE - eye) / safe, first = min(one, other), last = max(one, other);
+  vec2 inside = vec2(max(first.x, max(first.y, first.z)), min(last.x, min(last.y, last.z)));
+#ifdef UNBOUNDED
+  float near = NEAR, far = max(FAR, NEAR);
+  if (inside.x >= inside.y) inside = vec2(dot(LOW + 0.5 * SIZE - eye, towards));
+  float warpedNear = warp(near, inside), warpedFar = warp(far, inside), edge = near;
+#else
+  float near = max(inside.x, NEAR), far = min(inside.y, FAR);
+#endif
+  seenAlong(towards);
+  prepare();
+
+  vec3 summed = vec3(0);
+  float light = 1.0, opacity = 0.0, reach = 0.0;          // light that still gets through: transmittance
+  for (int k = 0; k <= SAMPLES; k++) {
+#ifdef UNBOUNDED
+    float start = edge;
+    edge = unwarp(mix(warpedNear, warpedFar, min((float(k) + 0.5) / float(SAMPLES), 1.0)), inside);
+    float end = edge;
+#else
+    float start = near + max(float(k) - 0.5, 0.0) * STEP, end = min(near + (float(k) + 0.5) * STEP, far);
+#endif
+    if (end <= start) break;
+    float t = 0.5 * (start + end);
+    vec3 unit = unitOf(eye + t * towards);
+    ivec3 cell = clamp(ivec3(unit * float(CELLS)), 0, CELLS - 1);
+    int gap = int(texelFetch(gaps, cell.zyx, 0).r);
+    if (gap > 0) {
+#ifndef UNBOUNDED                                         // leap to the end of the empty cube around this cell
+      vec3 wall = vec3(cell) + mix(vec3(1 - gap), vec3(gap), greaterThan(safe, vec3(0)));
+      vec3 leave = (LOW + wall / float(CELLS) * SIZE - eye) / safe;
+      k = max(k, int(ceil((min(leave.x, min(leave.y, leave.z)) - near) / STEP)) - 1);
+#endif
+      continue;
+    }
+    if (any(lessThan(unit, keepLow)) || any(greaterThan(unit, keepHigh))) continue;
+    float through = exp(-density(rawDensity(unit)) * (end - start)), weight = light * (1.0 - through);
+    if (weight > LEAST && shown == 0) summed += weight * colourAt(unit);
+    if (opacity < 0.5 && opacity + weight >= 0.5) reach = t;   // the median, as before a background
+    opacity += weight;
+    light *= through;
+    if (light < STOP) break;
+  }
+
+  if (shown == 0) pixel = vec4(summed + (1.0 - opacity) * background.rgb * background.a, opacity + (1.0 - opacity) * background.a);
+  else if (shown == 1) pixel = vec4(vec3(reach > 0.0 ? clamp((shades.y - reach) / (shades.y - shades.x), 0.05, 1.0) : 0.0), 1);
+  else if (shown == 2) pixel = vec4(vec3(opacity), 1);
+  else {                                                  // thousandths of UNIT, in three bytes
+    uint number = uint(clamp(reach / UNIT * 1000.0, 0.0, 16777215.0));
+    pixel = vec4(uvec3(number >> 16, (number >> 8) & 255u, number & 255u), 255u) / 255.0;
+  }
+}

@@ -1,0 +1,248 @@
+// The page: what a person's mouse, fingers and keys do, and what the controls show.
+
+const QUALITY = [[0.2, 6], [0.35, 12], [0.5, 20], [0.75, 30], [1, 45]];  // share of the screen's pixels at rest, milliseconds while moving
+const REST = 160, ROUND = 14000;            // milliseconds without a move before the fine picture, and of a turn of the turntable
+const CAMERA = "nerf_lightning camera";     // the kind of message by which pages side by side turn together
+
+function posesOf(text, lenses) {
+  const rows = new Float32Array(fromBase64(text).buffer), poses = [];
+  for (let i = 0; i < rows.length; i += 12) poses.push(Camera.from(rows.subarray(i, i + 12), lenses[i / 12] ?? lenses[0], about.focus));
+  return poses;
+}
+
+class Page {
+  constructor(renderer) {
+    this.renderer = renderer;
+    this.canvas = renderer.canvas;
+    this.orbit = posesOf(about.orbit.poses, about.orbit.lenses);
+    this.photos = posesOf(about.photos.poses, about.photos.lenses);
+    this.camera = Object.assign(Object.create(Camera.prototype), this.orbit[0]);
+    this.up = about.up;
+    this.turning = window.parent === window && !matchMedia("(prefers-reduced-motion: reduce)").matches;
+    this.turnedFor = 0;                     // milliseconds
+    this.moved = -REST;
+    this.atRest = Promise.resolve();
+    this.hold();
+    this.keys();
+    this.controls();
+    new ResizeObserver(() => this.resize()).observe(this.canvas);
+    this.resize();
+  }
+
+  // Something changed: a coarse picture next, and a fine one when it rests.
+  changed(by = "touch") {
+    this.moved = performance.now();
+    this.dirty = true;
+    if (by === "touch") { this.turntable(false); this.flight = null; }
+    if (by !== "message" && by !== "turntable" && window.parent !== window) parent.postMessage({ kind: CAMERA, camera: { ...this.camera } }, "*");
+    if (!this.resting) this.atRest = new Promise(resolve => { this.resting = resolve; });
+    this.wake();
+  }
+
+  wake() { this.frame ??= requestAnimationFrame(now => { this.frame = null; this.tick(now); }); }
+
+  tick(now) {
+    const { renderer, camera } = this, [share, milliseconds] = QUALITY[$("quality").value];
+    const passed = Math.min(100, now - (this.last ?? now));
+    this.last = now;
+    if (renderer.gl.isContextLost()) return;
+    if (this.flight) this.fly(now);
+    else if (this.turning) this.onOrbit(this.turnedFor += passed);
+    if (this.dirty) {
+      this.dirty = false;
+      renderer.draw(this.camera, milliseconds, share);
+      this.drawPhotos();
+      this.canvas.dataset.drawn = "coarse";
+    } else if (now - this.moved > REST && !renderer.refine(camera, share)) {
+      this.canvas.dataset.drawn = "fine";
+      this.resting?.();
+      this.resting = this.last = null;
+      return;                               // nothing happens until something changes
+    }
+    this.wake();
+  }
+
+  onOrbit(time) {
+    const at = time / ROUND * this.orbit.length, count = this.orbit.length, one = this.orbit[Math.floor(at) % count];
+    this.camera = one.toward(this.orbit[(Math.floor(at) + 1) % count], at % 1);
+    this.changed("turntable");
+  }
+
+  fly(now) {
+    const { from, to, began } = this.flight, share = Math.min(1, (now - began) / 500), eased = share * share * (3 - 2 * share);
+    this.camera = from.toward(to, eased);
+    if (share === 1) this.flight = null;
+    this.changed("flight");
+  }
+
+  flyTo(to) {
+    this.changed();
+    this.flight = { from: this.camera, to, began: performance.now() };
+  }
+
+  turntable(on) {
+    this.turning = on;
+    $("turn").setAttribute("aria-pressed", on);
+    if (on) this.changed("turntable");
+  }
+
+  resize() {
+    const ratio = Math.min(devicePixelRatio, 2), [width, height] = this.fixed ?? [this.canvas.clientWidth * ratio, this.canvas.clientHeight * ratio].map(Math.round);
+    if (!width || !height) return;
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+    this.changed("resize");
+  }
+
+  at(event) {
+    const box = this.canvas.getBoundingClientRect();
+    return [(event.clientX - box.left) * this.canvas.width / box.width, (event.clientY - box.top) * this.canvas.height / box.height];
+  }
+
+  // Mouse, pen and fingers: one turns, two or the right button move and come closer.
+  hold() {
+    const { canvas } = this, down = new Map();
+    const release = event => down.delete(event.pointerId);
+    canvas.addEventListener("pointerdown", event => {
+      canvas.setPointerCapture(event.pointerId);
+      down.set(event.pointerId, this.at(event));
+      this.changed();
+    });
+    canvas.addEventListener("pointermove", event => {
+      if (!down.has(event.pointerId)) return;
+      const before = [...down.values()];
+      down.set(event.pointerId, this.at(event));
+      const after = [...down.values()], [x, y] = add([...middle(after), 0], [...middle(before), 0], -1), { width, height } = canvas;
+      if (after.length > 1) this.camera.approach(Math.min(2, Math.max(0.5, apart(before) / apart(after))));
+      if (after.length > 1 || event.buttons & 2 || event.shiftKey) this.camera.slide(x, y, width, height);
+      else this.camera.turn(-x / Math.min(width, height) * 3, -y / Math.min(width, height) * 3, this.up);
+      this.changed();
+    });
+    for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, release);
+    canvas.addEventListener("contextmenu", event => event.preventDefault());
+    canvas.addEventListener("wheel", event => {
+      event.preventDefault();
+      this.camera.approach(Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * (event.deltaMode ? 0.05 : 0.0015)))));
+      this.changed();
+    }, { passive: false });
+    canvas.addEventListener("dblclick", event => this.centre(...this.at(event)));
+  }
+
+  centre(x, y) {
+    const place = this.renderer.placeAt(this.camera, x, y);
+    if (!place) return;
+    const move = add(place, this.camera.target, -1), to = Object.assign(Object.create(Camera.prototype), this.camera);
+    const [fx, fy, cx, cy] = this.camera.lensOn(this.canvas.width, this.canvas.height), depth = dot(add(place, to.eye, -1), to.ahead);
+    const aside = add(scaled(to.right, (this.canvas.width / 2 - cx) * depth / fx), to.down, (this.canvas.height / 2 - cy) * depth / fy);
+    Object.assign(to, { target: place, eye: add(add(place, to.ahead, -depth), aside, -1) });
+    if (Math.hypot(...move) > 0) this.flyTo(to);
+  }
+
+  keys() {
+    const step = 0.12, move = (name, ...by) => () => { this.camera[name](...by); this.changed(); }, home = () => this.flyTo(this.orbit[0]);
+    keys({
+      ArrowLeft: move("turn", -step, 0, this.up), ArrowRight: move("turn", step, 0, this.up),
+      ArrowUp: move("turn", 0, -step, this.up), ArrowDown: move("turn", 0, step, this.up),
+      "+": move("approach", 0.85), "=": move("approach", 0.85), "-": move("approach", 1 / 0.85),
+      r: home, R: home, f: fullScreen, F: fullScreen,
+    });
+  }
+
+  save(blob, name) {
+    const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+  }
+
+  controls() {
+    const { look } = this.renderer, on = (id, name, act) => $(id).addEventListener(name, act);
+    on("turn", "click", () => this.turntable(!this.turning));
+    on("reset", "click", () => this.flyTo(this.orbit[0]));
+    on("shot", "click", () => { this.renderer.present(); this.canvas.toBlob(blob => this.save(blob, about.file + ".png")); });
+    on("file", "click", () => this.save(new Blob([fromBase64($("compact").textContent)]), about.file + ".npz"));
+    on("settings", "click", () => { const open = $("panel").toggleAttribute("hidden"); $("settings").setAttribute("aria-expanded", !open); });
+    on("shown", "change", event => { look.shown = Number(event.target.value); this.changed("look"); });
+    const behind = { run: [...about.background, 1], none: [0, 0, 0, 0], black: [0, 0, 0, 1], white: [1, 1, 1, 1] };
+    on("behind", "change", event => { look.background = behind[event.target.value]; this.changed("look"); });
+    on("quality", "input", () => this.changed("look"));
+    for (const [axis, name] of ["x", "y", "z"].entries()) for (const end of [0, 1]) {
+      const slider = Object.assign(document.createElement("input"), { type: "range", min: 0, max: 1, step: 0.005, value: end, className: "crop" });
+      slider.setAttribute("aria-label", `crop ${name}, ${end ? "upper" : "lower"} end`);
+      slider.addEventListener("input", () => { look.keep[3 * end + axis] = Number(slider.value); this.changed("look"); });
+      $("crop").append(slider);
+    }
+    on("uncrop", "click", () => {
+      look.keep = [0, 0, 0, 1, 1, 1];
+      document.querySelectorAll(".crop").forEach((slider, i) => { slider.value = i % 2; });
+      this.changed("look");
+    });
+    this.photoControls();
+  }
+
+  photoControls() {
+    $("photos").hidden = !this.photos.length;
+    about.photos.names.forEach((name, i) => $("photo").append(new Option(name, i)));
+    $("photo").addEventListener("change", event => { if (event.target.value) this.flyTo(this.photos[event.target.value]); });
+    $("frusta").addEventListener("change", () => this.changed("look"));
+    this.marks = this.photos.map((photo, i) => {
+      const mark = document.createElementNS("http://www.w3.org/2000/svg", "path"), title = document.createElementNS(mark.namespaceURI, "title");
+      title.textContent = about.photos.names[i];
+      mark.append(title);
+      mark.addEventListener("click", () => this.flyTo(photo));
+      $("cameras").append(mark);
+      return mark;
+    });
+  }
+
+  // Each photo's camera as a pyramid over the picture.
+  drawPhotos() {
+    $("cameras").toggleAttribute("hidden", !$("frusta").checked);
+    if (!$("frusta").checked) return;
+    const { width, height } = this.canvas, deep = about.photos.depth;
+    $("cameras").setAttribute("viewBox", `0 0 ${width} ${height}`);
+    this.photos.forEach((photo, i) => {
+      const [w, h, fx, fy, cx, cy] = photo.lens, corner = (u, v) => add(add(add(photo.eye, photo.ahead, deep), photo.right, (u - cx) / fx * deep), photo.down, (v - cy) / fy * deep);
+      const seen = [photo.eye, corner(0, 0), corner(w, 0), corner(w, h), corner(0, h)].map(place => this.camera.project(place, width, height));
+      const text = seen.every(Boolean) ? seen.map(([x, y]) => `${x.toFixed(1)} ${y.toFixed(1)}`) : null;
+      this.marks[i].setAttribute("d", text ? `M${text.slice(1).join("L")}Z` + text.slice(1).map(c => `M${text[0]}L${c}`).join("") : "");
+    });
+  }
+
+  // For other programs, and pages side by side: looks through a camera, on a canvas of a size if one is given.
+  show({ rows, lens }, size) {
+    this.turntable(false);
+    if (size) this.fixed = size;
+    this.camera = Camera.from(rows, lens, about.focus);
+    this.resize();
+    return this.atRest;
+  }
+
+  listen() {
+    const numbers = (row, count) => Array.isArray(row) && row.length === count && row.every(Number.isFinite);
+    addEventListener("message", ({ data }) => {
+      const one = data?.kind === CAMERA && data.camera;
+      if (!one || !numbers(one.lens, 6) || !["right", "down", "ahead", "eye", "target"].every(name => numbers(one[name], 3))) return;
+      this.turntable(false);
+      this.flight = null;
+      Object.assign(this.camera, one);
+      this.changed("message");
+    });
+  }
+}
+
+async function open() {
+  tell();
+  document.body.classList.toggle("framed", window.parent !== window);
+  const compact = await Compact.read(fromBase64($("compact").textContent));
+  const renderer = new Renderer($("view"), compact, about, $("march").textContent), page = new Page(renderer);
+  $("view").addEventListener("webglcontextlost", event => { event.preventDefault(); $("view").dataset.drawn = "lost"; });
+  $("view").addEventListener("webglcontextrestored", () => { renderer.prepare(); page.changed("look"); });
+  page.listen();
+  page.turntable(page.turning);
+  window.field = page;
+}
+
+open().catch(error => {
+  $("message").hidden = false;
+  $("message").textContent = error.message;
+  throw error;
+});

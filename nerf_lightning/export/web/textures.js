@@ -1,0 +1,137 @@
+// A field and the cells around it as textures, uniforms and constants of march.glsl.
+
+const BRICK = 7;                            // cells along a brick's side, one less than vertices
+
+function makeTexture(gl, target, type, [width, height, depth], data, linear) {
+  const [inside, format, numbers] = {
+    bytes: [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], halves: [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT],
+    whole: [gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE], places: [gl.RGBA8UI, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE],
+    floats: [gl.RGBA32F, gl.RGBA, gl.FLOAT],
+  }[type];
+  const texture = gl.createTexture();
+  gl.bindTexture(target, texture);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  if (depth === undefined) gl.texImage2D(target, 0, inside, width, height, 0, format, numbers, data);
+  else gl.texImage3D(target, 0, inside, width, height, depth, 0, format, numbers, data);
+  for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T, gl.TEXTURE_WRAP_R]) gl.texParameteri(target, side, gl.CLAMP_TO_EDGE);
+  for (const which of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(target, which, linear ? gl.LINEAR : gl.NEAREST);
+  return { target, texture };
+}
+
+const typeOf = data => data instanceof Uint8Array ? "bytes" : "halves";
+
+// What march.glsl calls gaps: by two passes over all 26 neighbours (Rosenfeld and Pfaltz 1968), exact for this distance.
+function gapsOf(occupied, side) {
+  const gaps = Uint8Array.from(occupied, bit => bit ? 0 : 255), before = [];
+  for (let x = -1; x <= 1; x++) for (let y = -1; y <= 1; y++) for (let z = -1; z <= 1; z++)
+    if (9 * x + 3 * y + z < 0) before.push([x, y, z, (x * side + y) * side + z]);
+  for (const way of [1, -1]) {
+    for (let i = 0; i < gaps.length; i++) {
+      const at = way > 0 ? i : gaps.length - 1 - i, z = at % side, y = (at - z) / side % side, x = Math.floor(at / side / side);
+      for (const [dx, dy, dz, step] of before) {
+        const u = x + way * dx, v = y + way * dy, w = z + way * dz;
+        if (u >= 0 && u < side && v >= 0 && v < side && w >= 0 && w < side) gaps[at] = Math.min(gaps[at], gaps[at + way * step] + 1);
+      }
+    }
+  }
+  return gaps;
+}
+
+// Planes or lines [3, places, C] as layers of four channels, and what their texels stand for.
+function layersOf(gl, compact, name, width, height) {
+  const { data, columns, low, span } = compact.stored(name), groups = Math.ceil(columns / 4), places = width * height;
+  const texels = new data.constructor(3 * groups * places * 4);
+  for (let mode = 0; mode < 3; mode++) for (let place = 0; place < places; place++) for (let c = 0; c < columns; c++)
+    texels[((mode * groups + (c >> 2)) * places + place) * 4 + (c & 3)] = data[(mode * places + place) * columns + c];
+  const ranges = [low, span].map(row => Array.from({ length: groups * 4 }, (_, c) => row[c] ?? 0));
+  return { texture: makeTexture(gl, gl.TEXTURE_2D_ARRAY, typeOf(data), [width, height, 3 * groups], texels, true), groups, ranges };
+}
+
+function volumeOf(gl, compact, name) {
+  const side = compact.shape(`field.${name}.lines`)[1];
+  const planes = layersOf(gl, compact, `field.${name}.planes`, side, side), lines = layersOf(gl, compact, `field.${name}.lines`, side, 1);
+  const rows = [...planes.ranges, ...lines.ranges], ranges = [];
+  for (let group = 0; group < planes.groups; group++) for (const row of rows) ranges.push(...row.slice(4 * group, 4 * group + 4));
+  return { side, groups: planes.groups, planes: planes.texture, lines: lines.texture, ranges };
+}
+
+// The colour network's weights in the order in which march.glsl reads them.
+function networkOf(compact, groups, terms) {
+  const [first, bias, second, last] = ["0.weight", "0.bias", "1.weight", "1.bias"].map(part => compact.floats("field.colour_net." + part));
+  const width = bias.length, inputs = first.length / width, channels = (inputs - terms) / 3, row = [];
+  const four = of => { for (let i = 0; i < 4; i++) row.push(of(i)); };
+  for (let j = 0; j < width; j += 4) {
+    const weight = (i, column) => j + i < width ? first[(j + i) * inputs + column] : 0;
+    four(i => bias[j + i] ?? 0);
+    for (let term = 0; term < terms; term++) four(i => weight(i, 3 * channels + term));
+    for (let mode = 0; mode < 3; mode++) for (let c = 0; c < 4 * groups; c++) four(i => c < channels ? weight(i, mode * channels + c) : 0);
+    for (let colour = 0; colour < 3; colour++) four(i => j + i < width ? second[colour * width + j + i] : 0);
+  }
+  row.push(...last, 0);
+  return { row: Float32Array.from(row), neurons: Math.ceil(width / 4) };
+}
+
+function planesOf(gl, compact, about) {
+  const density = volumeOf(gl, compact, "density_volume"), colour = volumeOf(gl, compact, "colour_volume");
+  const { row, neurons } = networkOf(compact, colour.groups, about.terms), block = row.byteLength <= gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE);
+  const textures = { densityPlanes: density.planes, densityLines: density.lines, colourPlanes: colour.planes, colourLines: colour.lines };
+  if (!block) {
+    const texels = new Float32Array(Math.ceil(row.length / 4096) * 4096);
+    texels.set(row);
+    textures.networkTexture = makeTexture(gl, gl.TEXTURE_2D, "floats", [1024, texels.length / 4096], texels, false);
+  }
+  return {
+    constants: {
+      PLANES: 1, DENSITY_GROUPS: density.groups, COLOUR_GROUPS: colour.groups, DENSITY_SIDE: density.side, COLOUR_SIDE: colour.side,
+      NEURONS: neurons, NETWORK: row.length / 4, ...(block ? { NETWORK_BLOCK: 1 } : {}),
+    },
+    textures, block: block ? row : null, ranges: { densityRanges: density.ranges, colourRanges: colour.ranges },
+  };
+}
+
+function voxelsOf(gl, compact, about) {
+  const kept = compact.bits("field.kept"), side = Math.round(Math.cbrt(kept.length)), terms = about.terms;
+  const rowOf = new Uint32Array(kept.length), bricks = Math.max(1, Math.ceil((side - 1) / BRICK)), used = [];
+  for (let i = 0, row = 0; i < kept.length; i++) rowOf[i] = kept[i] ? ++row : 0;
+  const vertex = (x, y, z) => x < side && y < side && z < side ? rowOf[(x * side + y) * side + z] : 0;
+  const each = visit => { for (let x = 0; x <= BRICK; x++) for (let y = 0; y <= BRICK; y++) for (let z = 0; z <= BRICK; z++) visit(x, y, z); };
+  for (let x = 0; x < bricks; x++) for (let y = 0; y < bricks; y++) for (let z = 0; z < bricks; z++) {
+    let any = 0;
+    each((i, j, k) => { any |= vertex(x * BRICK + i, y * BRICK + j, z * BRICK + k); });
+    if (any) used.push([x, y, z]);
+  }
+  // Bricks stand in layers of `across` squared, one part of the atlas above the other.
+  const size = BRICK + 1, across = Math.max(1, Math.ceil(Math.cbrt(used.length * (1 + terms)))), deep = Math.max(1, Math.ceil(used.length / across ** 2));
+  const shape = [across * size, across * size, deep * size * (1 + terms)];
+  if (Math.max(...shape) > gl.getParameter(gl.MAX_3D_TEXTURE_SIZE)) throw new Error("This field is too large for this device's graphics.");
+  const tables = ["log_density", "colours", "views"].map(name => compact.stored("field." + name));
+  const halves = tables.some(table => table.columns && table.data.length && !(table.data instanceof Uint8Array));
+  if (halves) for (const table of tables) if (table.data instanceof Uint8Array) {
+    const { low, span, columns } = table;
+    Object.assign(table, { data: Uint16Array.from(table.data, (value, i) => toHalf(low[i % columns] + value / 255 * span[i % columns])), low: low.map(() => 0), span: span.map(() => 1) });
+  }
+  const [density, colours, views] = tables, texels = new (halves ? Uint16Array : Uint8Array)(shape[0] * shape[1] * shape[2] * 4);
+  const places = new Uint8Array(bricks ** 3 * 4);
+  used.forEach(([x, y, z], number) => {
+    const slot = [number % across, Math.floor(number / across) % across, Math.floor(number / across ** 2)];
+    places.set([...slot, 1], ((x * bricks + y) * bricks + z) * 4);
+    each((i, j, k) => {
+      const row = vertex(x * BRICK + i, y * BRICK + j, z * BRICK + k);
+      const texel = part => 4 * (((slot[2] + part * deep) * size + k) * shape[1] + slot[1] * size + j) * shape[0] + 4 * (slot[0] * size + i);
+      texels.set([density.data[row], colours.data[3 * row], colours.data[3 * row + 1], colours.data[3 * row + 2]], texel(0));
+      for (let b = 0; b < terms; b++) for (let c = 0; c < 3; c++) texels[texel(1 + b) + c] = views.data[(row * 3 + c) * terms + b];
+    });
+  });
+  const ranges = [density.low[0], ...colours.low, density.span[0], ...colours.span];
+  for (let b = 0; b < terms; b++) for (const row of [views.low, views.span]) ranges.push(row[b], row[terms + b], row[2 * terms + b], 0);
+  return {
+    constants: { SIDE: side, BRICKS: bricks, DENSITY_RATE: number(about.density_rate) },
+    textures: {
+      bricks: makeTexture(gl, gl.TEXTURE_3D, "places", [bricks, bricks, bricks], places, false),
+      atlas: makeTexture(gl, gl.TEXTURE_3D, halves ? "halves" : "bytes", shape, texels, true),
+    },
+    ranges: { ranges }, atlasSize: shape, partDepth: deep * size,
+  };
+}
+
+const number = x => Number.isInteger(x) ? x + ".0" : String(x);   // as GLSL wants it

@@ -1,0 +1,220 @@
+"""A field as a web page: what it draws in a browser against our own rendering, and what a stranger's names can do in it."""
+
+import base64
+import hashlib
+import io
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from nerf_lightning.cameras import Cameras, orbit_around
+from nerf_lightning.config.build import build_system, resolved
+from nerf_lightning.config.compose import composed
+from nerf_lightning.export.drawable import voxels_like
+from nerf_lightning.export.page import SCRIPTS, field_page, gallery_page, part, picture_page
+from nerf_lightning.runs.compact import decode, encode, without_folders
+from nerf_lightning.runs.folder import RunFolder, frame_from
+from nerf_lightning.system import NeRF3D
+
+HOSTILE = "</script><img src=x onerror=\"document.title='run'\">'\""
+SIDE = 24
+
+
+def scene_of(unbounded: bool) -> dict[str, Any]:
+    K = [[30.0, 0, 12], [0, 30, 12], [0, 0, 1]]
+    c2w = orbit_around(torch.zeros(3), torch.tensor([0.0, 0, 1]), 3.0, 0.5, 4)
+    return {
+        "format": 1,
+        "name": "made",
+        "source": "/home/somebody/photos",
+        "background": [0.1, 0.2, 0.3],
+        "aabb": [[-1.0, -0.8, -0.6], [1.0, 0.8, 0.6]],
+        "unbounded": unbounded,
+        "near": None,
+        "far": None,
+        "pixel": None,
+        "to_source": torch.eye(4).tolist(),
+        "orbit": {"K": [K] * 4, "c2w": c2w.tolist(), "width": SIDE, "height": SIDE},
+    }
+
+
+def made(recipe: str, precision: str = "byte", unbounded: bool = False) -> bytes:
+    """A compact file of a field of random numbers, with some of its cells empty."""
+    torch.manual_seed(0)
+    cfg = composed(
+        [f"recipe={recipe}_small", "sampler=occupancy", "sampler.resolution=16", "sampler.samples=48"], Path("unused")
+    )
+    scene = scene_of(unbounded)
+    system = build_system(cfg, frame_from(scene)[0])
+    assert isinstance(system, NeRF3D)
+    with torch.no_grad():
+        for parameter in system.field.parameters():
+            parameter.add_(torch.randn_like(parameter) * (0.3 if recipe == "tensorf" else 0.5))
+    system.sampler.import_state({"occupied": torch.rand(16**3) < 0.3})
+    plain = resolved(cfg)
+    plain["dataset"]["path"] = "/home/somebody/photos"
+    return without_folders(encode(system, precision, plain, scene))
+
+
+def page_of(compact: bytes, name: str = "made") -> tuple[str, RunFolder]:
+    run = decode(compact, "made")
+    return field_page(compact, run, name, [("note", name)], run.orbit, [name] * 4), run
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium here")
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
+        options = [
+            "--no-sandbox",
+            "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader",
+            "--disable-background-networking",
+        ]
+        opened = playwright.chromium.launch(executable_path=chromium, args=options)
+        yield opened
+        opened.close()
+
+
+def opened(browser: Any, text: str, folder: Path) -> tuple[Any, list[str]]:
+    """The page from disk, and a list of whatever it asks for or complains of."""
+    (folder / "field.html").write_text(text, encoding="utf-8")
+    page, wrong = browser.new_page(viewport={"width": 320, "height": 320}, reduced_motion="reduce"), []
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    page.on("request", lambda asked: wrong.append(asked.url) if not asked.url.startswith(("file:", "blob:")) else None)
+    page.goto((folder / "field.html").as_uri())
+    page.wait_for_selector("#view[data-drawn=fine]", timeout=60_000)
+    return page, wrong
+
+
+def seen_through(page: Any, cameras: Cameras, view: int) -> np.ndarray:
+    K, (width, height) = cameras.K[view].tolist(), cameras.size(view)
+    lens = [width, height, K[0][0], K[1][1], K[0][2], K[1][2]]
+    show = "async ([rows, lens, size]) => { await field.show({rows, lens}, size); field.renderer.present(); "
+    url = page.evaluate(
+        show + "return field.canvas.toDataURL(); }", [cameras.c2w[view, :3].flatten().tolist(), lens, [width, height]]
+    )
+    return imageio.imread(base64.b64decode(url.split(",")[1]), extension=".png")[..., :3] / 255
+
+
+@pytest.mark.parametrize(
+    ("recipe", "precision", "unbounded"),
+    [("tensorf", "byte", False), ("tensorf", "half", True), ("voxels", "byte", True), ("voxels", "half", False)],
+)
+def test_a_browser_draws_what_we_render(recipe: str, precision: str, unbounded: bool, browser: Any, tmp_path: Path):
+    text, run = page_of(made(recipe, precision, unbounded))
+    page, wrong = opened(browser, text, tmp_path)
+    assert isinstance(run.system, NeRF3D) and run.orbit is not None
+    for view in range(2):
+        with torch.no_grad():
+            expected = run.system.render(run.orbit.view_rays(view)).rgb.view(SIDE, SIDE, 3).clamp(0, 1).numpy()
+        assert expected.std() > 0.01, "something is seen"
+        error = np.square(seen_through(page, run.orbit, view) - expected).mean()
+        assert -10 * np.log10(error) > 40
+    assert not wrong
+    page.close()
+
+
+def test_hands_keys_and_a_lost_context(browser: Any, tmp_path: Path):
+    page, wrong = opened(browser, page_of(made("voxels"))[0], tmp_path)
+    look = "() => { field.renderer.present(); return field.canvas.toDataURL(); }"
+    rest = "async () => { await field.atRest; }"
+    first = page.evaluate(look)
+    for act in (
+        lambda: page.keyboard.press("ArrowLeft"),
+        lambda: page.mouse.wheel(0, -200),
+        lambda: page.set_viewport_size({"width": 280, "height": 340}),
+    ):
+        page.mouse.move(160, 120)
+        act()
+        page.wait_for_timeout(100)
+        page.evaluate(rest)
+        page.wait_for_selector("#view[data-drawn=fine]")
+        changed = page.evaluate(look)
+        assert changed != first
+        first = changed
+    lose = "() => { window.lost = field.renderer.gl.getExtension('WEBGL_lose_context'); lost.loseContext(); }"
+    page.evaluate(lose)
+    page.wait_for_selector("#view[data-drawn=lost]")
+    page.evaluate("() => lost.restoreContext()")
+    page.wait_for_selector("#view[data-drawn=fine]", timeout=60_000)
+    assert page.evaluate(look) == first, "the same picture after the context came back"
+    assert not wrong
+    page.close()
+
+
+def test_names_are_never_read_as_html(browser: Any, tmp_path: Path):
+    page, wrong = opened(browser, page_of(made("voxels"), HOSTILE)[0], tmp_path)
+    assert page.title() == HOSTILE
+    page.click("#information")
+    assert page.locator("#list dd").first.text_content() == HOSTILE
+    assert page.locator("img").count() == 0
+    assert not wrong
+    page.close()
+
+
+def test_only_its_own_script_may_run_and_no_folder_is_told():
+    for text in (page_of(made("tensorf"), HOSTILE)[0], gallery_page(HOSTILE, [("a b/field.html", HOSTILE, HOSTILE)])):
+        script = re.findall(r"<script>(.*?)</script>", text, re.S)
+        assert len(script) == 1
+        allowed = re.search(r"script-src 'sha256-([^']+)'", text)
+        assert allowed and base64.b64decode(allowed[1]) == hashlib.sha256(script[0].encode()).digest()
+        assert "<img" not in text
+    compact = made("tensorf")
+    with np.load(io.BytesIO(compact)) as file:
+        header = json.loads(file["header"].tobytes())
+    assert header["config"]["dataset"]["path"] == header["scene"]["source"] == "photos"
+
+
+def test_the_page_is_small():
+    text, run = page_of(made("tensorf"))
+    assert len(text) < 1.35 * len(made("tensorf")) + 60_000
+    assert (
+        sum(
+            len((Path(__file__).parents[2] / "nerf_lightning/export/web" / name).read_text().splitlines())
+            for name in SCRIPTS
+        )
+        <= 700
+    )
+
+
+def test_its_script_is_clean(tmp_path: Path):
+    (tmp_path / "page.js").write_text("\n".join(map(part, SCRIPTS)), encoding="utf-8")
+    linter = Path(sys.executable).with_name("oxlint")
+    found = subprocess.run([str(linter), "--deny-warnings", "page.js"], cwd=tmp_path, capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout
+
+
+def test_a_pictures_page_holds_the_picture_without_loss():
+    picture = np.random.default_rng(0).integers(0, 256, (9, 7, 3), dtype=np.uint8)
+    text = picture_page(picture, HOSTILE, [("note", HOSTILE)])
+    packed = re.search(r"data:image/webp;base64,([^\"]+)", text)
+    assert packed and (imageio.imread(base64.b64decode(packed[1]), extension=".webp") == picture).all()
+    assert text.count("<img") == 1
+
+
+def test_another_field_becomes_voxels_of_the_same_density():
+    cfg = composed(["recipe=mlp_small"], Path("unused"))
+    frame, orbit, _ = frame_from(scene_of(False))
+    system = build_system(cfg, frame)
+    assert isinstance(system, NeRF3D) and orbit is not None
+    voxels, options = voxels_like(system.eval(), orbit, 16)
+    assert OmegaConf.create(options).finest == 16
+    inside = system.field.bounds.to_world(voxels.index.view(17, 17, 17)[4:-4, 4:-4, 4:-4].nonzero().add(4) / 16)
+    assert len(inside) > 100
+    torch.testing.assert_close(voxels.density(inside), system.field.density(inside), rtol=1e-3, atol=1e-4)
