@@ -132,26 +132,27 @@ def test_a_browser_draws_what_we_render(recipe: str, precision: str, unbounded: 
 
 def test_hands_keys_and_a_lost_context(browser: Any, tmp_path: Path):
     page, wrong = opened(browser, page_of(made("voxels"))[0], tmp_path)
-    look = "() => JSON.stringify([field.camera, field.canvas.width, field.canvas.height])"
+    look = "() => { field.renderer.present(); return [JSON.stringify(field.camera), field.canvas.toDataURL()]; }"
     first = page.evaluate(look)
-    for act in (
-        lambda: page.keyboard.press("ArrowLeft"),
-        lambda: page.mouse.wheel(0, -200),
-        lambda: page.set_viewport_size({"width": 280, "height": 340}),
+    for act, moves in (
+        (lambda: page.keyboard.press("ArrowLeft"), True),
+        (lambda: page.mouse.wheel(0, -200), True),
+        (lambda: page.set_viewport_size({"width": 280, "height": 340}), False),
     ):
         page.mouse.move(160, 120)
         act()
         page.wait_for_timeout(200)
         page.wait_for_selector("#view[data-drawn=fine]", timeout=60_000)
         changed = page.evaluate(look)
-        assert changed != first
+        assert changed[1] != first[1]
+        assert (changed[0] != first[0]) == moves
         first = changed
     lose = "() => { window.lost = field.renderer.gl.getExtension('WEBGL_lose_context'); lost.loseContext(); }"
     page.evaluate(lose)
     page.wait_for_selector("#view[data-drawn=lost]")
     page.evaluate("() => lost.restoreContext()")
     page.wait_for_selector("#view[data-drawn=fine]", timeout=60_000)
-    assert page.evaluate(look) == first, "the same view after the context came back"
+    assert page.evaluate(look) == first, "the same picture after the context came back"
     assert not wrong
     page.close()
 
@@ -204,6 +205,15 @@ def test_a_pictures_page_holds_the_picture_without_loss():
     packed = re.search(r"data:image/webp;base64,([^\"]+)", text)
     assert packed and (imageio.imread(base64.b64decode(packed[1]), extension=".webp") == picture).all()
     assert text.count("<img") == 1
+
+
+def test_a_picture_fills_its_page(browser: Any, tmp_path: Path):
+    (tmp_path / "field.html").write_text(picture_page(np.zeros((30, 60, 3), np.uint8), "made", []), encoding="utf-8")
+    page = browser.new_page(viewport={"width": 300, "height": 300})
+    page.goto((tmp_path / "field.html").as_uri())
+    page.wait_for_selector("#picture[style]")
+    assert page.locator("#picture").bounding_box() == {"x": 0, "y": 75, "width": 300, "height": 150}
+    page.close()
 
 
 def test_another_field_becomes_voxels_of_the_same_density():

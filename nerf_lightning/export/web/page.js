@@ -101,7 +101,6 @@ class Page {
   // Mouse, pen and fingers: one turns, two or the right button move and come closer.
   hold() {
     const { canvas } = this, down = new Map();
-    const release = event => down.delete(event.pointerId);
     canvas.addEventListener("pointerdown", event => {
       canvas.setPointerCapture(event.pointerId);
       down.set(event.pointerId, this.at(event));
@@ -117,7 +116,7 @@ class Page {
       else this.camera.turn(-x / Math.min(width, height) * 3, -y / Math.min(width, height) * 3, this.up);
       this.changed();
     });
-    for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, release);
+    for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, event => down.delete(event.pointerId));
     canvas.addEventListener("contextmenu", event => event.preventDefault());
     canvas.addEventListener("wheel", event => {
       event.preventDefault();
@@ -159,7 +158,7 @@ class Page {
     on("reset", "click", () => this.flyTo(this.orbit[0]));
     on("shot", "click", () => { this.renderer.present(); this.canvas.toBlob(blob => this.save(blob, about.file + ".png")); });
     on("file", "click", () => this.save(new Blob([fromBase64($("compact").textContent)]), about.file + ".npz"));
-    on("settings", "click", () => { const open = $("panel").toggleAttribute("hidden"); $("settings").setAttribute("aria-expanded", !open); });
+    on("settings", "click", () => { const hidden = $("panel").toggleAttribute("hidden"); $("settings").setAttribute("aria-expanded", !hidden); });
     on("shown", "change", event => { look.shown = Number(event.target.value); this.changed("look"); });
     const behind = { run: [...about.background, 1], none: [0, 0, 0, 0], black: [0, 0, 0, 1], white: [1, 1, 1, 1] };
     on("behind", "change", event => { look.background = behind[event.target.value]; this.changed("look"); });

@@ -101,7 +101,7 @@ class Renderer {
   draw(camera, milliseconds, share) {
     const { width, height } = this.canvas;
     const part = Math.min(share, Math.max(0.08, Math.sqrt(milliseconds / (this.perPixel * width * height))));
-    const side = length => Math.max(1, Math.round(length * Math.ceil(part * 12) / 12 ));  // few sizes, so that few are made
+    const side = length => Math.max(1, Math.round(length * Math.ceil(part * 12) / 12));  // few sizes, so that few are made
     this.coarse = this.picture(this.coarse, side(width), side(height));
     this.march(camera, this.coarse, 0, this.coarse.height);
     this.rows = 0;
@@ -123,6 +123,7 @@ class Renderer {
   present() {
     const { gl, canvas, coarse, fine, rows } = this;
     gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
+    gl.clear(gl.COLOR_BUFFER_BIT);          // a browser that empties the canvas itself may do so after the first copy
     const copy = (picture, high) => {
       gl.bindFramebuffer(gl.READ_FRAMEBUFFER, picture.frame);
       gl.blitFramebuffer(0, 0, picture.width, high, 0, 0, canvas.width, Math.round(high / picture.height * canvas.height), gl.COLOR_BUFFER_BIT, gl.LINEAR);
