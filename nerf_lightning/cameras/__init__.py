@@ -11,6 +11,7 @@ from nerf_lightning.cameras.orbit import (
     orbit_like,
     spiral_like,
     typical_view,
+    upward,
 )
 from nerf_lightning.cameras.transforms import (
     in_other_frame,
@@ -42,4 +43,5 @@ __all__ = [
     "transform_directions",
     "turn_upright",
     "typical_view",
+    "upward",
 ]

@@ -137,6 +137,11 @@ def orbit_like(cameras: Cameras, frames: int = 60) -> Cameras:
     return Cameras.of_size(K.repeat(frames, 1, 1), c2w, width, height)
 
 
+def upward(cameras: Cameras) -> Float[Tensor, "3"]:
+    """What is up in the pictures of cameras, on average: a unit vector, world frame."""
+    return torch.nn.functional.normalize(-cameras.c2w[:, :3, 1].mean(0), dim=0)
+
+
 def typical_view(cameras: Cameras) -> int:
     """The first view of the commonest size."""
     _, which, counts = torch.unique(cameras.sizes, dim=0, return_inverse=True, return_counts=True)
@@ -163,7 +168,7 @@ def spiral_like(orbit: Cameras, frames: int = 60) -> Cameras:
         frames: number of poses; the last stops one step short of the first.
     """
     centre = focus_point(orbit.c2w)
-    up = torch.nn.functional.normalize(-orbit.c2w[:, :3, 1].mean(0), dim=-1)
+    up = upward(orbit)
     offset = orbit.centres - centre
     radius = offset.norm(dim=-1).mean()
     mean = offset.mean(0)

@@ -1,17 +1,15 @@
 """The chart as one HTML file that opens without a network and shows each point's configuration."""
 
-import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from nerf_lightning.chart.advice import in_bytes
 from nerf_lightning.chart.comparison import COSTS, Comparison
 from nerf_lightning.chart.points import Point
 from nerf_lightning.chart.references import Reference
 from nerf_lightning.runs.index import FIELD_PAGE
+from nerf_lightning.utils.html import address_from, script_data
 from nerf_lightning.utils.machine import crowding
 
 TEMPLATE = """<!DOCTYPE html>
@@ -114,8 +112,7 @@ def chart_page(svg: str, comparisons: Sequence[Comparison], folder: Path) -> str
             told[f"{row}-{number}"] = {"marks": marks, **_card(point, one.on_frontier(number), folder)}
         for number, reference in enumerate(one.references):
             told[f"published-{row}-{number}"] = {"marks": [f"published-{row}-{number}"], **_published(reference)}
-    data = json.dumps(told).replace("<", "\\u003c")  # so that nothing in it can end the script
-    return TEMPLATE.format(svg=svg[svg.index("<svg") :], points=data)
+    return TEMPLATE.format(svg=svg[svg.index("<svg") :], points=script_data(told))
 
 
 def _card(point: Point, fronts: Sequence[str], folder: Path) -> dict[str, Any]:
@@ -138,7 +135,7 @@ def _card(point: Point, fronts: Sequence[str], folder: Path) -> dict[str, Any]:
     left_out = [key for key in point.configuration if key.startswith("trainer.") or key.endswith("_partial_")]
     options = [(key, str(value)) for key, value in point.configuration.items() if key not in left_out]
     page = point.typical.folder / FIELD_PAGE
-    address = quote(Path(os.path.relpath(page, folder)).as_posix()) if page.is_file() else None
+    address = address_from(folder, page) if page.is_file() else None
     return {"title": point.label, "figures": figures, "options": options, "page": address}
 
 

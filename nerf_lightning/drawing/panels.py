@@ -1,6 +1,8 @@
 """Pictures for people: panels side by side with a caption under them."""
 
+import base64
 from pathlib import Path
+from typing import Any
 
 import cv2
 import imageio.v3 as imageio
@@ -78,3 +80,13 @@ def narrowed(image: UInt8[ndarray, "H W 3"], width: int) -> UInt8[ndarray, "h w 
 def write_png(path: Path, image: UInt8[ndarray, "H W 3"]) -> None:
     with atomic(path) as temporary:
         imageio.imwrite(temporary, image, compress_level=3)  # half the time of the default, a tenth more bytes
+
+
+MEDIA = {".jpg": "image/jpeg", ".png": "image/png", ".webp": "image/webp"}
+
+
+def data_url(image: UInt8[ndarray, "H W 3"], kind: str) -> str:
+    """A picture as text: a .jpg with loss, a .png or .webp without."""
+    options: dict[str, Any] = {"lossless": True} if kind == ".webp" else {}
+    packed = imageio.imwrite("<bytes>", image, extension=kind, **options)
+    return f"data:{MEDIA[kind]};base64,{base64.b64encode(packed).decode()}"

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.export.reach import NOTHING, Cells, visible_cells
+from nerf_lightning.export.volume import COARSEST, FINEST
 from nerf_lightning.model import TensoRFField, VoxelField
 from nerf_lightning.model.layers.pruning import vertices_in, widened
 from nerf_lightning.model.layers.view_dependence import seen_from
@@ -27,8 +28,8 @@ DAMPING = 1e-2
 """Of that fit, per direction: what a few directions do not tell stays near 0."""
 LOGITS = 6.0
 """Largest: beyond, a byte does not change."""
-COARSEST, FINEST, MOST = 64, 256, 700_000
-"""Limits for the cells along a side, and for the vertices that are kept: some six megabytes."""
+MOST = 700_000
+"""Vertices that are kept, unless the user gives their cells: some six megabytes."""
 EDGE = 1e-4
 """Distance to the unit cube's sides within which there is nothing: in an unbounded scene, they are infinitely far."""
 LESSONS, BATCH, RATE = 400, 4096, 0.05
@@ -44,9 +45,7 @@ class Drawable(NamedTuple):
     config: dict[str, Any]
     """Of its run, with what was put in the place of the run's own."""
     changes: list[str]
-    """What that was, in words."""
-    seen: Cells | None
-    """Its occupied cells that some cameras see, where they were looked for."""
+    """What that was, in words; where there is any, the occupied cells are those that the cameras see."""
 
 
 def drawable(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: int | None) -> Drawable:
@@ -63,7 +62,7 @@ def drawable(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: in
     field, sampler = system.field, system.sampler
     keeps_field, keeps_sampler = isinstance(field, TensoRFField | VoxelField), isinstance(sampler, OccupancySampler)
     if keeps_field and keeps_sampler:
-        return Drawable(system, config, changes, None)
+        return Drawable(system, config, changes)
     made = copy.copy(system)
     made._modules = dict(system._modules)  # the copy's parts are replaced, not changed
     grid = sampler.resolution if isinstance(sampler, OccupancySampler) else CELLS
@@ -82,7 +81,7 @@ def drawable(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: in
     made.sampler.to(system.device).chunk = system.chunk
     if not keeps_field:
         teach(made, system, cameras)
-    return Drawable(made, config, changes, seen)
+    return Drawable(made, config, changes)
 
 
 def target_of(kind: type, **options: Any) -> dict[str, Any]:

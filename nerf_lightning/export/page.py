@@ -3,25 +3,23 @@
 import base64
 import hashlib
 import html
-import json
 import re
 from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any
-from urllib.parse import quote
 
-import imageio.v3 as imageio
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.cameras import Cameras, focus_point
+from nerf_lightning.cameras import Cameras, Rays, focus_point, upward
+from nerf_lightning.drawing.panels import data_url
 from nerf_lightning.model import TensoRFField, VoxelField
 from nerf_lightning.model.layers.activation import SoftenableReLU, shifted_softplus
-from nerf_lightning.runs.folder import RunFolder
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.html import script_data
 
 SCRIPTS = ("common.js", "compact.js", "textures.js", "camera.js", "renderer.js", "page.js")
 PICTURE_SCRIPTS = ("common.js", "picture.js")
@@ -72,11 +70,10 @@ def described(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
     field, sampler = system.field, system.sampler
     assert isinstance(field, TensoRFField | VoxelField) and isinstance(sampler, OccupancySampler)
     bounds = sampler.bounds.to("cpu")
-    near, far = bounds.near, bounds.far
-    if near is None:
-        near = 0.02 * bounds.longest if bounds.unbounded else 0.0
-    if far is None:
-        far = 50.0 * bounds.longest if bounds.unbounded else FAR
+    if bounds.unbounded:  # the same for all rays
+        near, far = (float(end) for end in bounds.near_far(Rays(torch.zeros(1, 3), torch.zeros(1, 3))))
+    else:  # ends within the box, if there are any; the page knows the box
+        near, far = max(bounds.near or 0.0, 0.0), FAR if bounds.far is None else bounds.far
     return {
         "kind": "planes" if isinstance(field, TensoRFField) else "voxels",
         "terms": field.terms,
@@ -89,7 +86,7 @@ def described(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
             "size": (2 * bounds.half_size).tolist(),
             "unit": bounds.longest,
             "unbounded": bounds.unbounded,
-            "near": max(near, 0.0),
+            "near": near,
             "far": far,
         },
         "sampler": {
@@ -104,62 +101,53 @@ def described(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
     }
 
 
-def upward(orbit: Cameras) -> Float[Tensor, "3"]:
-    """What is up in an orbit's pictures, world frame."""
-    return torch.nn.functional.normalize(-orbit.c2w[:, :3, 1].mean(0), dim=0)
-
-
 def photos_of(cameras: Cameras, names: Sequence[str], focus: Float[Tensor, "3"]) -> dict[str, Any]:
     """Photos to look through, and how deep to draw their pyramids."""
-    if not len(cameras):
-        return {"names": [], "poses": "", "lenses": [], "depth": 0.0}
     depth = FRUSTUM * float((cameras.centres - focus).norm(dim=1).median())
     return {"names": list(names), "depth": depth, **poses(cameras)}
 
 
 def field_page(
     compact: bytes,
-    run: RunFolder,
+    system: NeRF3D,
+    orbit: Cameras,
     name: str,
     facts: Sequence[tuple[str, str]],
-    photos: Cameras | None = None,
-    names: Sequence[str] = (),
+    photos: Cameras,
+    names: Sequence[str],
 ) -> str:
     """The page's HTML. Nothing in it is fetched from anywhere, and nothing that a run's files say is executed.
 
     Args:
         compact: a compact file.
-        run: what it holds, with a field and a sampler that `described` knows.
+        system, orbit: what it holds, see `described`.
         name: of the scene.
         facts: about the field, by name.
         photos: cameras to look through.
         names: of those.
     """
-    assert isinstance(run.system, NeRF3D) and run.orbit is not None  # a scene's
-    about = described(run.system, run.orbit)
-    shown = run.orbit[torch.arange(0)] if photos is None else photos
+    about = described(system, orbit)
     about |= {
         "name": name,
         "file": WORD.sub("_", name) or "field",
         "facts": [list(fact) for fact in facts],
-        "photos": photos_of(shown, names, torch.tensor(about["focus"])),
+        "photos": photos_of(photos, names, torch.tensor(about["focus"])),
     }
     return filled(
-        "page", SCRIPTS, shader=part("march.glsl"), about=told(about), compact=base64.b64encode(compact).decode()
+        "page", SCRIPTS, shader=part("march.glsl"), about=script_data(about), compact=base64.b64encode(compact).decode()
     )
 
 
 def picture_page(picture: UInt8[np.ndarray, "H W 3"], name: str, facts: Sequence[tuple[str, str]]) -> str:
     """The page of a picture's field: the field's picture, without loss, and facts about it."""
     about = {"name": name, "facts": [list(fact) for fact in facts]}
-    packed = imageio.imwrite("<bytes>", picture, extension=".webp", lossless=True)
-    return filled("picture", PICTURE_SCRIPTS, about=told(about), picture=base64.b64encode(packed).decode())
+    return filled("picture", PICTURE_SCRIPTS, about=script_data(about), picture=data_url(picture, ".webp"))
 
 
 def gallery_page(title: str, pages: Sequence[tuple[str, str, str]]) -> str:
     """Pages side by side, whose views turn together: of each its address, its name, and a line about it."""
     figures = "\n".join(
-        f'<figure><iframe sandbox="allow-scripts" title="{html.escape(name)}" src="{html.escape(quote(address))}">'
+        f'<figure><iframe sandbox="allow-scripts" title="{html.escape(name)}" src="{html.escape(address)}">'
         f"</iframe><figcaption><b>{html.escape(name)}</b>{html.escape(line)}</figcaption></figure>"
         for address, name, line in pages
     )
@@ -171,11 +159,6 @@ def filled(name: str, scripts: Sequence[str], **values: str) -> str:
     style, script = part("gallery.css" if name == "gallery" else "page.css"), "\n".join(map(part, scripts))
     values |= {"style": style, "script": script, "style_hash": hash_of(style), "script_hash": hash_of(script)}
     return part(f"{name}.html").format(**values)
-
-
-def told(about: dict[str, Any]) -> str:
-    """JSON in which nothing can end the script element that holds it."""
-    return json.dumps(about, allow_nan=False).replace("<", "\\u003c")
 
 
 def hash_of(text: str) -> str:

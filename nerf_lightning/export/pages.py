@@ -1,6 +1,5 @@
 """Runs as web pages: of a scene, of a picture, and of all runs of a sweep side by side."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,9 +13,10 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.export.drawable import drawable
 from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.export.page import field_page, gallery_page, picture_page
+from nerf_lightning.export.reach import occupied_cells
 from nerf_lightning.export.smallest import held_out_psnr, smallest, some_cameras
 from nerf_lightning.gallery.figure import label
-from nerf_lightning.runs.compact import decode, without_folders
+from nerf_lightning.runs.compact import without_folders
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import RunFolder, plain_config
 from nerf_lightning.runs.index import FIELD_PAGE, find_runs, read_run, varied
@@ -24,6 +24,7 @@ from nerf_lightning.runs.open import open_run
 from nerf_lightning.system import NeRF2D, NeRF3D
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.html import address_from
 
 MOST_PHOTOS = 100
 """Photos to look through on a page."""
@@ -50,11 +51,12 @@ def picture(options: ExportOptions, source: Path, found: RunFolder) -> tuple[str
 
 def scene(options: ExportOptions, source: Path, found: RunFolder) -> tuple[str, str]:
     """The page of a radiance field, with the cameras of its photos."""
-    assert isinstance(found.system, NeRF3D)
+    assert isinstance(found.system, NeRF3D) and found.orbit is not None  # a scene's run
     data = data_again(found.cfg, found.scene, options.photos)
     assert isinstance(data, RayDataModule)  # of a scene's run
     drawn = drawable(found.system, some_cameras(data), plain_config(found.cfg), options.resolution)
-    compact = smallest(drawn.system, data, drawn.config, options.loss, options.precision, drawn.seen)
+    seen = occupied_cells(drawn.system) if drawn.changes else None
+    compact = smallest(drawn.system, data, drawn.config, options.loss, options.precision, seen)
     before = held_out_psnr(found.system, data) if drawn.changes else compact.before
     content, changes = without_folders(compact.content), "; ".join(drawn.changes)
     facts = facts_of(
@@ -68,9 +70,8 @@ def scene(options: ExportOptions, source: Path, found: RunFolder) -> tuple[str, 
     )
     shown, chosen = data.scene.train, evenly(len(data.scene.train), MOST_PHOTOS)
     cameras = shown.cameras[torch.tensor(chosen)].to("cpu")
-    page = field_page(
-        content, decode(content, source), data.scene.name, facts, cameras, [shown.name(i) for i in chosen]
-    )
+    names = [shown.name(i) for i in chosen]
+    page = field_page(content, drawn.system, found.orbit, data.scene.name, facts, cameras, names)
     return page, f"held-out PSNR {before:.2f} -> {compact.psnr:.2f} dB" + (f" ({changes})" if changes else "")
 
 
@@ -91,6 +92,7 @@ def side_by_side(options: ExportOptions, folder: Path, device: torch.device) -> 
     """
     output = folder / "gallery.html" if options.output is None else Path(options.output).expanduser()
     runs, pages = find_runs(folder), []
+    keys = varied(runs)
     for run in runs:
         address, line = run.folder / FIELD_PAGE, "no figure" if run.psnr is None else f"{run.psnr:.2f} dB"
         if not address.exists():
@@ -102,8 +104,7 @@ def side_by_side(options: ExportOptions, folder: Path, device: torch.device) -> 
             with atomic(address) as temporary:
                 temporary.write_bytes(page)
             print(f"{address}: {words}")
-        beside = Path(os.path.relpath(address, output.parent)).as_posix()
-        pages.append((beside, label(run, varied(runs)), line))
+        pages.append((address_from(output.parent, address), label(run, keys), line))
     if not pages:
         raise InputError(folder, "", "no run that can be shown", "a folder of finished runs", "see what was left out")
     with atomic(output) as temporary:

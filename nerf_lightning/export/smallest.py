@@ -77,7 +77,9 @@ def smallest(
     before = held_out_psnr(system, data)
     if seen is None and isinstance(data, RayDataModule):
         seen = seen_cells(system, some_cameras(data))
-    confined = [confined_to(system, cells) for cells in ([None] if seen is None else [seen, occupied_cells(system)])]
+    occupied = occupied_cells(system)
+    alike = seen is None or occupied is None or torch.equal(seen, occupied)
+    confined = [confined_to(system, cells) for cells in ([seen] if alike else [seen, occupied])]
     scene = scene_content(data)
     tried: list[Compact] = []
     for one in PRECISIONS if precision is None else (precision,):

@@ -1,13 +1,12 @@
 """The page about a scene: one HTML file that opens without a network."""
 
-import base64
 import html
 from collections.abc import Sequence
 
-import imageio.v3 as imageio
 import numpy as np
 from jaxtyping import UInt8
 
+from nerf_lightning.drawing.panels import data_url
 from nerf_lightning.inspect.quality import Photo
 
 TEMPLATE = """<!DOCTYPE html>
@@ -39,13 +38,6 @@ img.map {{ max-width: 100%; }}
 </body>
 </html>
 """
-
-
-def data_url(image: UInt8[np.ndarray, "H W 3"], kind: str) -> str:
-    """A picture as text."""
-    packed = imageio.imwrite("<bytes>", image, extension=kind)
-    media = "image/jpeg" if kind == ".jpg" else "image/png"
-    return f"data:{media};base64,{base64.b64encode(packed).decode()}"
 
 
 def inspection_page(

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, Rays, focus_point
+from nerf_lightning.cameras import Bounds, Cameras, Rays, focus_point, upward
 from nerf_lightning.dataset.extent import viewing_distance
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import Scene
@@ -152,7 +152,7 @@ def scene_scale(scene: Scene) -> float:
 def overview(scene: Scene) -> Viewpoint:
     """A view of all cameras and the bounds: from behind the orbit's start, upright as the orbit's pictures."""
     focus = focus_point(scene.train.cameras.c2w)
-    up = torch.nn.functional.normalize(-scene.orbit.c2w[:, :3, 1].mean(0), dim=0)
+    up = upward(scene.orbit)
     if float(up.norm()) < 0.5:  # a path that rolls over: no direction is up
         up = torch.tensor([0.0, 0.0, 1.0])
     offset = scene.orbit.centres[0] - focus

@@ -69,7 +69,8 @@ def made(recipe: str, precision: str = "byte", unbounded: bool = False) -> bytes
 
 def page_of(compact: bytes, name: str = "made") -> tuple[str, RunFolder]:
     run = decode(compact, "made")
-    return field_page(compact, run, name, [("note", name)], run.orbit, [name] * 4), run
+    assert isinstance(run.system, NeRF3D) and run.orbit is not None
+    return field_page(compact, run.system, run.orbit, name, [("note", name)], run.orbit, [name] * 4), run
 
 
 @pytest.fixture(scope="module")

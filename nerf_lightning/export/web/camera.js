@@ -20,6 +20,7 @@ class Camera {
     const far = dot(add(focus, eye, -1), ahead), away = Math.hypot(...add(focus, eye, -1));
     return new Camera(column(0), column(1), ahead, eye, lens, add(eye, ahead, far > 0.1 * away ? far : away));
   }
+  copy() { return Object.assign(Object.create(Camera.prototype), this); }
   get distance() { return Math.hypot(...add(this.eye, this.target, -1)); }
 
   // The lens on a canvas that holds its whole picture.

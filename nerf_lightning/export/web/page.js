@@ -16,7 +16,7 @@ class Page {
     this.canvas = renderer.canvas;
     this.orbit = posesOf(about.orbit.poses, about.orbit.lenses);
     this.photos = posesOf(about.photos.poses, about.photos.lenses);
-    this.camera = Object.assign(Object.create(Camera.prototype), this.orbit[0]);
+    this.camera = this.orbit[0].copy();
     this.up = about.up;
     this.turning = window.parent === window && !matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.turnedFor = 0;                     // milliseconds
@@ -129,11 +129,9 @@ class Page {
   centre(x, y) {
     const place = this.renderer.placeAt(this.camera, x, y);
     if (!place) return;
-    const move = add(place, this.camera.target, -1), to = Object.assign(Object.create(Camera.prototype), this.camera);
-    const [fx, fy, cx, cy] = this.camera.lensOn(this.canvas.width, this.canvas.height), depth = dot(add(place, to.eye, -1), to.ahead);
+    const to = this.camera.copy(), [fx, fy, cx, cy] = this.camera.lensOn(this.canvas.width, this.canvas.height), depth = dot(add(place, to.eye, -1), to.ahead);
     const aside = add(scaled(to.right, (this.canvas.width / 2 - cx) * depth / fx), to.down, (this.canvas.height / 2 - cy) * depth / fy);
-    Object.assign(to, { target: place, eye: add(add(place, to.ahead, -depth), aside, -1) });
-    if (Math.hypot(...move) > 0) this.flyTo(to);
+    this.flyTo(Object.assign(to, { target: place, eye: add(add(place, to.ahead, -depth), aside, -1) }));
   }
 
   keys() {
