@@ -48,6 +48,11 @@ class Drawable(NamedTuple):
     """What that was, in words; where there is any, the occupied cells are those that the cameras see."""
 
 
+def drawn_as_it_is(system: NeRF3D) -> bool:
+    """Whether a page can draw a system without any change."""
+    return isinstance(system.field, TensoRFField | VoxelField) and isinstance(system.sampler, OccupancySampler)
+
+
 def drawable(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: int | None) -> Drawable:
     """The system itself where a page can draw it; otherwise a copy with another field, another sampler, or both.
 
@@ -59,10 +64,10 @@ def drawable(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: in
     """
     config = copy.deepcopy(config)
     changes: list[str] = []
+    if drawn_as_it_is(system):
+        return Drawable(system, config, changes)
     field, sampler = system.field, system.sampler
     keeps_field, keeps_sampler = isinstance(field, TensoRFField | VoxelField), isinstance(sampler, OccupancySampler)
-    if keeps_field and keeps_sampler:
-        return Drawable(system, config, changes)
     made = copy.copy(system)
     made._modules = dict(system._modules)  # the copy's parts are replaced, not changed
     grid = sampler.resolution if isinstance(sampler, OccupancySampler) else CELLS

@@ -113,8 +113,8 @@ def field_page(
     orbit: Cameras,
     name: str,
     facts: Sequence[tuple[str, str]],
-    photos: Cameras,
-    names: Sequence[str],
+    photos: Cameras | None = None,
+    names: Sequence[str] = (),
 ) -> str:
     """The page's HTML. Nothing in it is fetched from anywhere, and nothing that a run's files say is executed.
 
@@ -123,7 +123,7 @@ def field_page(
         system, orbit: what it holds, see `described`.
         name: of the scene.
         facts: about the field, by name.
-        photos: cameras to look through.
+        photos: cameras to look through, if there are any.
         names: of those.
     """
     about = described(system, orbit)
@@ -131,7 +131,7 @@ def field_page(
         "name": name,
         "file": WORD.sub("_", name) or "field",
         "facts": [list(fact) for fact in facts],
-        "photos": photos_of(photos, names, torch.tensor(about["focus"])),
+        "photos": None if photos is None else photos_of(photos, names, torch.tensor(about["focus"])),
     }
     return filled(
         "page", SCRIPTS, shader=part("march.glsl"), about=script_data(about), compact=base64.b64encode(compact).decode()

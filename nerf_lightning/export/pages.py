@@ -10,7 +10,7 @@ import nerf_lightning
 from nerf_lightning.dataset import PictureBatch, RayDataModule
 from nerf_lightning.drawing.panels import to_bytes
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.drawable import drawable
+from nerf_lightning.export.drawable import drawable, drawn_as_it_is
 from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.export.page import field_page, gallery_page, picture_page
 from nerf_lightning.export.reach import occupied_cells
@@ -33,7 +33,12 @@ MOST_PHOTOS = 100
 def paged(options: ExportOptions, source: Path, device: torch.device) -> tuple[bytes, str]:
     """A run as a web page, and what to say of it."""
     found = open_run(source, device)
-    page, words = (picture if isinstance(found.system, NeRF2D) else scene)(options, source, found)
+    if isinstance(found.system, NeRF2D):
+        page, words = picture(options, source, found)
+    elif source.is_file() and options.photos is None and drawn_as_it_is(found.system):
+        page, words = as_it_is(source, found)
+    else:
+        page, words = scene(options, source, found)
     return page.encode(), f"{len(page) / 1000:,.1f} kB, {words}: open it in a browser"
 
 
@@ -47,6 +52,14 @@ def picture(options: ExportOptions, source: Path, found: RunFolder) -> tuple[str
     quality = f"PSNR {held_out_psnr(found.system, data):.2f} dB"
     facts = facts_of(source, found, [("quality", quality), ("size", f"{view.width} x {view.height} pixels")])
     return picture_page(to_bytes(rgb.cpu()), data.scene.name, facts), quality
+
+
+def as_it_is(source: Path, found: RunFolder) -> tuple[str, str]:
+    """The page of a compact file that needs no change and whose photos are not asked for: it holds that very file."""
+    assert isinstance(found.system, NeRF3D) and found.orbit is not None  # chosen by the caller
+    content = without_folders(source.read_bytes())
+    facts = facts_of(source, found, [("size", f"{len(content) / 1000:,.1f} kB")])
+    return field_page(content, found.system, found.orbit, found.scene["name"], facts), "without photos"
 
 
 def scene(options: ExportOptions, source: Path, found: RunFolder) -> tuple[str, str]:
@@ -77,9 +90,12 @@ def scene(options: ExportOptions, source: Path, found: RunFolder) -> tuple[str, 
 
 def facts_of(source: Path, found: RunFolder, measured: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
     """What a page says of its field."""
-    run = read_run(source)
-    seconds, steps = run.figure("train_seconds"), run.figure("steps")
-    training = [] if seconds is None or steps is None else [("training", f"{seconds:.3g} s, {steps:.0f} steps")]
+    training = []
+    if source.is_dir():
+        run = read_run(source)
+        seconds, steps = run.figure("train_seconds"), run.figure("steps")
+        if seconds is not None and steps is not None:
+            training = [("training", f"{seconds:.3g} s, {steps:.0f} steps")]
     method = str(OmegaConf.select(found.cfg, "model._target_")).rsplit(".", 1)[-1]
     return [("method", method), *measured, *training, ("made with", f"nerf_lightning {nerf_lightning.__version__}")]
 

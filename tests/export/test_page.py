@@ -26,6 +26,7 @@ from nerf_lightning.export.page import SCRIPTS, field_page, gallery_page, part, 
 from nerf_lightning.runs.compact import decode, encode, without_folders
 from nerf_lightning.runs.folder import RunFolder, frame_from
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.html import address_from
 
 HOSTILE = "</script><img src=x onerror=\"document.title='run'\">'\""
 SIDE = 24
@@ -155,6 +156,61 @@ def test_hands_keys_and_a_lost_context(browser: Any, tmp_path: Path):
     page.wait_for_selector("#view[data-drawn=fine]", timeout=60_000)
     assert page.evaluate(look) == first, "the same picture after the context came back"
     assert not wrong
+    page.close()
+
+
+def test_two_fingers_come_closer_and_one_turns(browser: Any, tmp_path: Path):
+    (tmp_path / "field.html").write_text(page_of(made("voxels"))[0], encoding="utf-8")
+    telephone = browser.new_context(viewport={"width": 320, "height": 480}, has_touch=True, is_mobile=True)
+    page = telephone.new_page()
+    page.goto((tmp_path / "field.html").as_uri())
+    page.wait_for_selector("#view[data-drawn]")
+    send = telephone.new_cdp_session(page).send
+
+    def drag(*fingers: tuple[int, int, int, int]) -> list[float]:
+        for kind, share in (("touchStart", 0.0), ("touchMove", 0.5), ("touchMove", 1.0)):
+            places = [(x + share * (u - x), y + share * (v - y)) for x, y, u, v in fingers]
+            points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
+            send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        page.wait_for_timeout(100)
+        assert page.evaluate("[scrollY, visualViewport.scale]") == [0, 1], "the page itself stays"
+        return page.evaluate("[field.camera.distance, ...field.camera.target]")
+
+    distance, *target = drag((120, 150, 120, 150))
+    assert page.evaluate("field.turning") is False, "a touch stops the turntable"
+    before = page.evaluate("field.camera.eye")
+    assert drag((120, 150, 200, 180)) == pytest.approx([distance, *target])
+    assert page.evaluate("field.camera.eye") != before
+    closer, *moved = drag((100, 150, 50, 180), (140, 150, 190, 180))
+    assert closer < 0.8 * distance and moved != target
+    telephone.close()
+
+
+def test_pages_side_by_side_turn_together_and_rest(browser: Any, tmp_path: Path):
+    names = ["a=1,b", "c"]
+    for name in names:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "field.html").write_text(page_of(made("voxels"), name)[0], encoding="utf-8")
+    pages = [(address_from(tmp_path, tmp_path / name / "field.html"), name, "20 dB") for name in names]
+    (tmp_path / "gallery.html").write_text(gallery_page("made", pages), encoding="utf-8")
+    page = browser.new_page(viewport={"width": 720, "height": 420})
+    page.goto((tmp_path / "gallery.html").as_uri())
+    frames = page.frames[1:]
+    assert len(frames) == 2
+    for frame in frames:
+        frame.wait_for_selector("#view[data-drawn=fine]", timeout=60_000)
+    box = page.locator("iframe").first.bounding_box()
+    page.mouse.move(box["x"] + 50, box["y"] + 50)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 90, box["y"] + 60)
+    page.mouse.up()
+    page.wait_for_timeout(300)
+    for frame in frames:
+        frame.wait_for_selector("#view[data-drawn=fine]", timeout=60_000)
+    eyes = [frame.evaluate("field.camera.eye") for frame in frames]
+    assert eyes[0] == eyes[1] != frames[0].evaluate("field.orbit[0].eye")
+    assert [frame.evaluate("field.frame") for frame in frames] == [None, None], "at rest nothing is asked for"
     page.close()
 
 

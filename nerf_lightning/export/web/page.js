@@ -15,7 +15,7 @@ class Page {
     this.renderer = renderer;
     this.canvas = renderer.canvas;
     this.orbit = posesOf(about.orbit.poses, about.orbit.lenses);
-    this.photos = posesOf(about.photos.poses, about.photos.lenses);
+    this.photos = about.photos ? posesOf(about.photos.poses, about.photos.lenses) : [];
     this.camera = this.orbit[0].copy();
     this.up = about.up;
     this.turning = window.parent === window && !matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -176,7 +176,7 @@ class Page {
   }
 
   photoControls() {
-    $("photos").hidden = !this.photos.length;
+    if (!this.photos.length) { $("photos").hidden = true; return; }
     about.photos.names.forEach((name, i) => $("photo").append(new Option(name, i)));
     $("photo").addEventListener("change", event => { if (event.target.value) this.flyTo(this.photos[event.target.value]); });
     $("frusta").addEventListener("change", () => this.changed("look"));
