@@ -46,6 +46,7 @@ SMALLER: list[tuple[str, str]] = [
     ("capture calibration", f"tags.size={SIZE} resize=60"),
     ("nerf_lightning.render", "frames=2"),
     ("format=compact", "loss=100"),
+    ("format=html", "loss=100 resolution=16"),
     ("nerf_lightning.export", "threshold=1e-3 resolution=24"),
 ]
 """What is added to a command that holds some words; the first that fits counts."""

@@ -35,7 +35,7 @@ def paged(options: ExportOptions, source: Path, device: torch.device) -> tuple[b
     found = open_run(source, device)
     if isinstance(found.system, NeRF2D):
         page, words = picture(options, source, found)
-    elif source.is_file() and options.photos is None and drawn_as_it_is(found.system):
+    elif isinstance(found.system, NeRF3D) and source.is_file() and not options.photos and drawn_as_it_is(found.system):
         page, words = as_it_is(source, found)
     else:
         page, words = scene(options, source, found)

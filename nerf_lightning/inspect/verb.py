@@ -66,7 +66,7 @@ def inspect(
 def doubts_about(scene: Scene) -> list[str]:
     """What the checks before training say, refusals too."""
     try:
-        return check_scene(scene)
+        return [doubt.text for doubt in check_scene(scene)]
     except InputError as error:
         return [str(error)]
 

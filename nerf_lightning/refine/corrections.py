@@ -130,6 +130,12 @@ class Corrections(torch.nn.Module):
             for parameter in self._of(name):
                 parameter.requires_grad_(True)
 
+    def begin_poses(self) -> None:
+        """Corrects poses, if they may be, from the first step on, as they are certainly wrong: they have far to go, and a field
+        that explains them by fog would let no trial tell."""
+        if "poses" in self.rates and "poses" not in self.since:
+            self.begin(0.0, "poses")
+
     def _of(self, name: str) -> list[torch.nn.Parameter]:
         """What is learned of poses, or of light."""
         poses, light = (self.motions, self.lens.zoom), (self.log_gains, self.mixing, self.lens.darkening)

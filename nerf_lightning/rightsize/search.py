@@ -84,7 +84,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     data = build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)
     for doubt in check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []:
-        print(f"{data.scene.name}: {doubt}", flush=True)
+        print(f"{data.scene.name}: {doubt.text}", flush=True)
     rungs: list[Rung] = []
     noise = seconds = 0.0
     why = "the ladder ends there"

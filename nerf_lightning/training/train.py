@@ -87,13 +87,15 @@ def train(
     data.enlarge(limits_of(cfg, device).batch)
     doubts = check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []
     for doubt in doubts:
-        log.warning("%s: %s", data.scene.name, doubt)
+        log.warning("%s: %s", data.scene.name, doubt.text)
     system = build_system(cfg, frame_of(data), device)
+    if isinstance(system, NeRF3D) and system.corrections is not None and any(doubt.far_off for doubt in doubts):
+        system.corrections.begin_poses()
     system.backend = BACKEND if cfg.compile else None
     if system.field.sizing:
         log.info("model: %s", system.field.sizing)
     check_background(cfg, data, system)
-    results = Results("results.json", cfg.method, cfg.seed, doubts)
+    results = Results("results.json", cfg.method, cfg.seed, [doubt.text for doubt in doubts])
     trainer = build_trainer(cfg, folder, device, results)
     check_processes(trainer, system)
     if trainer.is_global_zero:

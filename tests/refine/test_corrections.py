@@ -12,17 +12,20 @@ from torch import Tensor
 import nerf_lightning as nl
 from nerf_lightning.cameras import Cameras, Rays, in_other_frame
 from nerf_lightning.config.compose import composed
+from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.export.verb import export
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
 from nerf_lightning.refine import Corrections, summary, told
+from nerf_lightning.refine.corrections import FIRST
 from nerf_lightning.refine.poses import drifts
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, load_scene
 from nerf_lightning.sampler import Samples, UniformSampler
+from nerf_lightning.stability import damage
 from nerf_lightning.system import aligned
 from nerf_lightning.training.train import train
 
@@ -243,6 +246,17 @@ def test_a_run_says_what_it_corrected_and_is_rendered_without_its_photos(tmp_pat
         export(options)
     with pytest.raises(InputError, match="corrected.*4 poses, one of each training photo"):
         data_again(load_config(tmp_path), {**load_scene(tmp_path)[0], "corrected": [1.0]})
+
+
+def test_poses_by_which_outlines_hardly_fit_are_corrected_before_any_trial(tmp_path: Path):
+    size = {"size": 16, "train_views": 12, "val_views": 1}
+    options = ["+experiment=smoke_3d", "refine=auto", "dataset.rays=64", f"budget.steps={FIRST - 1}"]
+    for scene, wanted in ((bricks(**size), False), (damage.with_pose_noise(bricks(**size), 0, 15.0, 0.1), True)):
+        folder = tmp_path / str(wanted)
+        train(composed(options, folder), folder=folder, scene=scene)
+        results = json.loads((folder / "results.json").read_text())
+        assert any("outlines that no body has" in warning for warning in results["warnings"]) == wanted
+        assert any(results["corrections"]["turned_degrees"]) == wanted
 
 
 def test_cameras_that_moved_far_more_than_the_others_are_named(cameras: Cameras):

@@ -129,6 +129,16 @@ def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Vi
     assert "light as given (corrections would lower most photos' error by 0.5%)" in told(corrections)
 
 
+def test_poses_that_are_certainly_wrong_need_no_trial(views: Views):
+    corrections = Corrections(views.cameras, BOX, auto=True)
+    corrections.begin_poses()
+    assert corrections.motions.requires_grad and corrections.factors(0.0) == [FASTER, 0.0]
+    assert corrections.open_at(EARLY) == ["light"]
+    only_light = Corrections(views.cameras, BOX, poses=False, auto=True)
+    only_light.begin_poses()
+    assert not only_light.since, "they are not to be corrected"
+
+
 def test_a_trial_of_poses_alone_says_the_same_where_light_is_exact(views: Views):
     shifted = Views.of(spoilt(views.images, 2), views.cameras)
     corrections = Corrections(views.cameras, BOX, auto=True)
