@@ -1,5 +1,6 @@
 // One ray a pixel, as sampler/occupancy.py and renderer/volumetric.py do it; names are theirs. The page puts #version and
-// constants before this: PLANES or VOXELS, UNBOUNDED, TERMS, ... Places are in the unit cube, distances in world units.
+// constants before this: PLANES or VOXELS, UNBOUNDED, TERMS, ... and EACH_INPUT(F), which is F(0) F(1) ..., as loops over arrays are
+// slow without a graphics card. Places are in the unit cube, distances in world units.
 precision highp float;
 precision highp int;
 precision highp sampler3D;
@@ -55,56 +56,48 @@ void seenAlong(vec3 d) {
 // bytes lies between `low` and `low + span`, which the filter may be asked for first, as both are linear.
 uniform sampler2DArray densityPlanes, densityLines, colourPlanes, colourLines;
 uniform vec4 densityRanges[4 * DENSITY_GROUPS], colourRanges[4 * COLOUR_GROUPS];   // planes' low, span, lines' low, span
-#ifdef NETWORK_BLOCK
-layout(std140) uniform Network { vec4 network[NETWORK]; };
-#define W(i) network[i]
-#else
-uniform highp sampler2D networkTexture;
-#define W(i) texelFetch(networkTexture, ivec2((i) & 1023, (i) >> 10), 0)
-#endif
+const vec4 network[] = NETWORK;             // read by constant indices alone, so that the compiler sees numbers
 const int INPUTS = 3 * COLOUR_GROUPS, STRIDE = 1 + TERMS + 4 * INPUTS + 3;         // vec4s for each four neurons
 
 vec3 inTexture(vec3 unit, float side) { return (clamp(unit, 0.0, 1.0) * (side - 1.0) + 0.5) / side; }
 vec2 inPlane(vec3 at, int mode) { return mode == 0 ? at.zy : mode == 1 ? at.zx : at.yx; }
 
+// Channels 4g to 4g+3 of a mode of a volume, plane times line.
+#define PRODUCT(planes, lines, ranges, groups, layer) \
+  (ranges[4 * (layer % groups)] + ranges[4 * (layer % groups) + 1] * texture(planes, vec3(inPlane(at, layer / groups), float(layer)))) * \
+  (ranges[4 * (layer % groups) + 2] + ranges[4 * (layer % groups) + 3] * texture(lines, vec3(at[layer / groups], 0.5, float(layer))))
+
 float rawDensity(vec3 unit) {
   vec3 at = inTexture(unit, float(DENSITY_SIDE));
-  float total = 0.0;
-  for (int mode = 0; mode < 3; mode++) for (int g = 0; g < DENSITY_GROUPS; g++) {
-    float layer = float(mode * DENSITY_GROUPS + g);
-    vec4 plane = densityRanges[4 * g] + densityRanges[4 * g + 1] * texture(densityPlanes, vec3(inPlane(at, mode), layer));
-    vec4 line = densityRanges[4 * g + 2] + densityRanges[4 * g + 3] * texture(densityLines, vec3(at[mode], 0.5, layer));
-    total += dot(plane, line);
-  }
-  return total;
+  vec4 total = vec4(0);
+#define LAYER(layer) total += PRODUCT(densityPlanes, densityLines, densityRanges, DENSITY_GROUPS, layer);
+  EACH_DENSITY_LAYER(LAYER)
+  return dot(total, vec4(1));
 }
 
 vec4 alongRay[NEURONS];                     // what bias and direction give each four neurons: the same all along the ray
 void prepare() {
-  for (int j = 0; j < NEURONS; j++) {
-    vec4 sum = W(j * STRIDE);
-    for (int term = 0; term < TERMS; term++) sum += harmonics[term] * W(j * STRIDE + 1 + term);
-    alongRay[j] = sum;
-  }
+#define TERM(t) + harmonics[t] * network[first + 1 + t]
+#define ALONG(j) { const int first = j * STRIDE; alongRay[j] = network[first] EACH_TERM(TERM); }
+  EACH_NEURON(ALONG)
 }
 
 vec3 colourAt(vec3 unit) {
   vec3 at = inTexture(unit, float(COLOUR_SIDE));
   vec4 products[INPUTS];
-  for (int mode = 0; mode < 3; mode++) for (int g = 0; g < COLOUR_GROUPS; g++) {
-    int layer = mode * COLOUR_GROUPS + g;
-    vec4 plane = colourRanges[4 * g] + colourRanges[4 * g + 1] * texture(colourPlanes, vec3(inPlane(at, mode), float(layer)));
-    vec4 line = colourRanges[4 * g + 2] + colourRanges[4 * g + 3] * texture(colourLines, vec3(at[mode], 0.5, float(layer)));
-    products[layer] = plane * line;
+#define INPUT(layer) products[layer] = PRODUCT(colourPlanes, colourLines, colourRanges, COLOUR_GROUPS, layer);
+  EACH_INPUT(INPUT)
+  vec3 logits = network[NEURONS * STRIDE].rgb;
+  // A hidden layer with ReLU, four neurons at a time (kernels/mlp.py).
+#define ADD(i) hidden += mat4(network[w + 4 * i], network[w + 4 * i + 1], network[w + 4 * i + 2], network[w + 4 * i + 3]) * products[i];
+#define NEURON(j) { \
+    const int w = j * STRIDE + 1 + TERMS, last = w + 4 * INPUTS; \
+    vec4 hidden = alongRay[j]; \
+    EACH_INPUT(ADD) \
+    hidden = max(hidden, 0.0); \
+    logits += vec3(dot(network[last], hidden), dot(network[last + 1], hidden), dot(network[last + 2], hidden)); \
   }
-  vec3 logits = W(NEURONS * STRIDE).rgb;
-  for (int j = 0; j < NEURONS; j++) {       // a hidden layer with ReLU, four neurons at a time (kernels/mlp.py)
-    int w = j * STRIDE + 1 + TERMS;
-    vec4 hidden = alongRay[j];
-    for (int i = 0; i < INPUTS; i++, w += 4) hidden += mat4(W(w), W(w + 1), W(w + 2), W(w + 3)) * products[i];
-    hidden = max(hidden, 0.0);
-    logits += vec3(dot(W(w), hidden), dot(W(w + 1), hidden), dot(W(w + 2), hidden));
-  }
+  EACH_NEURON(NEURON)
   return sigmoid(logits);
 }
 #else

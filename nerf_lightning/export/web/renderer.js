@@ -35,11 +35,6 @@ class Renderer {
       gl.uniform1i(this.place(name), unit);
     });
     for (const [name, row] of Object.entries(field.ranges)) gl.uniform4fv(this.place(name), row);
-    if (field.block) {
-      gl.uniformBlockBinding(this.program, gl.getUniformBlockIndex(this.program, "Network"), 0);
-      gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, gl.createBuffer());
-      gl.bufferData(gl.UNIFORM_BUFFER, field.block, gl.STATIC_DRAW);
-    }
     if (field.atlasSize) {
       gl.uniform3fv(this.place("atlasSize"), field.atlasSize);
       gl.uniform1f(this.place("partDepth"), field.partDepth);

@@ -6,7 +6,6 @@ function makeTexture(gl, target, type, [width, height, depth], data, linear) {
   const [inside, format, numbers] = {
     bytes: [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], halves: [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT],
     whole: [gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE], places: [gl.RGBA8UI, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE],
-    floats: [gl.RGBA32F, gl.RGBA, gl.FLOAT],
   }[type];
   const texture = gl.createTexture();
   gl.bindTexture(target, texture);
@@ -18,6 +17,7 @@ function makeTexture(gl, target, type, [width, height, depth], data, linear) {
   return { target, texture };
 }
 
+const each = (name, count) => ({ [`EACH_${name}(F)`]: Array.from({ length: count }, (_, i) => `F(${i})`).join(" ") });
 const typeOf = data => data instanceof Uint8Array ? "bytes" : "halves";
 
 // What march.glsl calls gaps: by two passes over all 26 neighbours (Rosenfeld and Pfaltz 1968), exact for this distance.
@@ -68,24 +68,20 @@ function networkOf(compact, groups, terms) {
     for (let colour = 0; colour < 3; colour++) four(i => j + i < width ? second[colour * width + j + i] : 0);
   }
   row.push(...last, 0);
-  return { row: Float32Array.from(row), neurons: Math.ceil(width / 4) };
+  const vectors = Array.from({ length: row.length / 4 }, (_, i) => `vec4(${row.slice(4 * i, 4 * i + 4).map(number)})`);
+  return { text: `vec4[](${vectors})`, neurons: Math.ceil(width / 4) };
 }
 
 function planesOf(gl, compact, about) {
   const density = volumeOf(gl, compact, "density_volume"), colour = volumeOf(gl, compact, "colour_volume");
-  const { row, neurons } = networkOf(compact, colour.groups, about.terms), block = row.byteLength <= gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE);
+  const { text, neurons } = networkOf(compact, colour.groups, about.terms);
   const textures = { densityPlanes: density.planes, densityLines: density.lines, colourPlanes: colour.planes, colourLines: colour.lines };
-  if (!block) {
-    const texels = new Float32Array(Math.ceil(row.length / 4096) * 4096);
-    texels.set(row);
-    textures.networkTexture = makeTexture(gl, gl.TEXTURE_2D, "floats", [1024, texels.length / 4096], texels, false);
-  }
   return {
     constants: {
-      PLANES: 1, DENSITY_GROUPS: density.groups, COLOUR_GROUPS: colour.groups, DENSITY_SIDE: density.side, COLOUR_SIDE: colour.side,
-      NEURONS: neurons, NETWORK: row.length / 4, ...(block ? { NETWORK_BLOCK: 1 } : {}),
+      PLANES: 1, DENSITY_GROUPS: density.groups, COLOUR_GROUPS: colour.groups, DENSITY_SIDE: density.side, COLOUR_SIDE: colour.side, NEURONS: neurons, NETWORK: text,
+      ...each("DENSITY_LAYER", 3 * density.groups), ...each("INPUT", 3 * colour.groups), ...each("TERM", about.terms), ...each("NEURON", neurons),
     },
-    textures, block: block ? row : null, ranges: { densityRanges: density.ranges, colourRanges: colour.ranges },
+    textures, ranges: { densityRanges: density.ranges, colourRanges: colour.ranges },
   };
 }
 
