@@ -10,7 +10,7 @@ class Renderer {
     this.gl = canvas.getContext("webgl2", { alpha: true, antialias: false, depth: false, powerPreference: "high-performance" });
     if (!this.gl) throw new Error("This page needs WebGL 2, which this browser does not offer or has switched off.");
     this.look = { shown: 0, background: [...about.background, 1], keep: [0, 0, 0, 1, 1, 1] };
-    this.perPixel = 1e-2;                   // milliseconds, as measured last; a guess at first
+    this.perPixel = 5e-2;                   // milliseconds, as measured last; a guess at first, for a slow machine
     this.rows = 0;                          // of the fine picture that are done
     this.prepare();
   }

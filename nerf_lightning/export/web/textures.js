@@ -22,19 +22,22 @@ const typeOf = data => data instanceof Uint8Array ? "bytes" : "halves";
 
 // What march.glsl calls gaps: by two passes over all 26 neighbours (Rosenfeld and Pfaltz 1968), exact for this distance.
 function gapsOf(occupied, side) {
-  const gaps = Uint8Array.from(occupied, bit => bit ? 0 : 255), before = [];
-  for (let x = -1; x <= 1; x++) for (let y = -1; y <= 1; y++) for (let z = -1; z <= 1; z++)
-    if (9 * x + 3 * y + z < 0) before.push([x, y, z, (x * side + y) * side + z]);
-  for (const way of [1, -1]) {
-    for (let i = 0; i < gaps.length; i++) {
-      const at = way > 0 ? i : gaps.length - 1 - i, z = at % side, y = (at - z) / side % side, x = Math.floor(at / side / side);
-      for (const [dx, dy, dz, step] of before) {
-        const u = x + way * dx, v = y + way * dy, w = z + way * dz;
-        if (u >= 0 && u < side && v >= 0 && v < side && w >= 0 && w < side) gaps[at] = Math.min(gaps[at], gaps[at + way * step] + 1);
-      }
-    }
+  const wide = side + 2, gaps = new Uint8Array(wide ** 3).fill(255), before = [];   // with a margin, so that all have neighbours
+  const cells = new Int32Array(side ** 3), found = new Uint8Array(side ** 3);
+  for (let x = 1, i = 0; x <= side; x++) for (let y = 1; y <= side; y++) for (let z = 1; z <= side; z++, i++) {
+    cells[i] = (x * wide + y) * wide + z;
+    if (occupied[i]) gaps[cells[i]] = 0;
   }
-  return gaps;
+  for (let x = -1; x <= 1; x++) for (let y = -1; y <= 1; y++) for (let z = -1; z <= 1; z++)
+    if (9 * x + 3 * y + z < 0) before.push((x * wide + y) * wide + z);
+  for (const way of [1, -1]) for (let i = 0; i < cells.length; i++) {
+    const cell = cells[way > 0 ? i : cells.length - 1 - i];
+    let least = gaps[cell];
+    for (let n = 0; n < before.length && least; n++) least = Math.min(least, gaps[cell + way * before[n]] + 1);
+    gaps[cell] = least;
+  }
+  for (let i = 0; i < cells.length; i++) found[i] = gaps[cells[i]];
+  return found;
 }
 
 // Planes or lines [3, places, C] as layers of four channels, and what their texels stand for.
