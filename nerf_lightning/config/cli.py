@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
 from nerf_lightning.config.renames import rename_given, renamed_overrides
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.waiting import wait_briefly
 
 TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
 """Environment variable: set to 1, errors come with the full traceback."""
@@ -74,7 +75,7 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     Bad input is anything the user can fix: it gets one line. Anything else is a defect and keeps its traceback.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
-
+    wait_briefly()
     sys.argv[1:] = renamed_overrides(quoted(by_path(sys.argv[1:], conf_dir()), texts))
     started = False
 
