@@ -92,10 +92,10 @@ def browser() -> Iterator[Any]:
         opened.close()
 
 
-def opened(browser: Any, text: str, folder: Path) -> tuple[Any, list[str]]:
+def opened(browser: Any, text: str, folder: Path, side: int = 320) -> tuple[Any, list[str]]:
     """The page from disk, and a list of whatever it asks for or complains of."""
     (folder / "field.html").write_text(text, encoding="utf-8")
-    page, wrong = browser.new_page(viewport={"width": 320, "height": 320}, reduced_motion="reduce"), []
+    page, wrong = browser.new_page(viewport={"width": side, "height": side}, reduced_motion="reduce"), []
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
     page.on("request", lambda asked: wrong.append(asked.url) if not asked.url.startswith(("file:", "blob:")) else None)
@@ -120,7 +120,7 @@ def seen_through(page: Any, cameras: Cameras, view: int) -> np.ndarray:
 )
 def test_a_browser_draws_what_we_render(recipe: str, precision: str, unbounded: bool, browser: Any, tmp_path: Path):
     text, run = page_of(made(recipe, precision, unbounded))
-    page, wrong = opened(browser, text, tmp_path)
+    page, wrong = opened(browser, text, tmp_path, side=100)
     assert isinstance(run.system, NeRF3D) and run.orbit is not None
     for view in range(2):
         with torch.no_grad():
