@@ -3,10 +3,12 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from statistics import fmean
 from typing import Any
 
 import lightning as L
+import torch
 
 from nerf_lightning.callbacks.attached import agreed, attached, data_of
 from nerf_lightning.callbacks.plateau import HALF_AGAIN, Plateau
@@ -14,10 +16,12 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU, synchronize
 from nerf_lightning.utils.evenly import evenly
-from nerf_lightning.utils.machine import Load
+from nerf_lightning.utils.machine import Load, cores, taken
 
 LOOK_AT = 3
 """Held-out views rendered to look for a plateau."""
+LOOK_EVERY, MOST_TAKEN = 1.0, 0.9
+"""With `alone`: seconds between two looks at what other work takes, and the most of it that is believed."""
 COOLING = 0.15
 """Cooling down after a plateau takes this share of what was spent up to it."""
 
@@ -32,16 +36,26 @@ class Budget(L.Callback):
     plateau, a field that is still growing jumps to its full size. One at full size cools down quickly: progress, and the
     learning rate with it, runs to the end.
 
+    With `alone`, the clock of a CPU is slowed by the share of this process's threads that other work takes, so that a run
+    beside others does about as many steps as one alone.
+
     Args:
         steps: optimiser steps, or None.
         seconds: seconds of training, or None.
         patience: dB that 50 % more time must still gain; None spends the whole budget.
+        alone: whether seconds are those the machine would need without other work.
 
     Raises:
         InputError: where steps and seconds are None, or one of the three is not positive.
     """
 
-    def __init__(self, steps: int | None = None, seconds: float | None = None, patience: float | None = None):
+    def __init__(
+        self,
+        steps: int | None = None,
+        seconds: float | None = None,
+        patience: float | None = None,
+        alone: bool = False,
+    ):
         if steps is None and seconds is None:
             raise InputError("budget", "", "neither steps nor seconds", "budget.steps=N or budget.seconds=S")
         for key, value in (("steps", steps), ("seconds", seconds), ("patience", patience)):
@@ -57,6 +71,8 @@ class Budget(L.Callback):
         self._before = 0.0  # spent up to the last pause or restart
         self._since: float | None = None
         self._device = CPU
+        self._alone = alone
+        self._speed = 1.0  # of the clock, as other work was found to be when it was last looked at
         self.load = Load()
         """CPU use of this process and of others while the clock ran."""
 
@@ -71,7 +87,8 @@ class Budget(L.Callback):
     @property
     def seconds(self) -> float:
         """Seconds trained so far."""
-        return self._before + (0.0 if self._since is None else time.perf_counter() - self._since)
+        running = 0.0 if self._since is None else time.perf_counter() - self._since
+        return self._before + running * self._speed
 
     def spent(self, step: int) -> float:
         """Fraction of the limits spent after `step` steps."""
@@ -112,6 +129,15 @@ class Budget(L.Callback):
         self._before, self._since = self.seconds, None
         self.load.stop()
 
+    def _look_at_others(self) -> None:
+        """Sets the clock's speed by what other work took since this was last done, if that is long enough to be told."""
+        if self._since is None or time.perf_counter() - self._since < LOOK_EVERY:
+            return
+        before = replace(self.load)
+        with self.paused():
+            others, seconds = self.load.others - before.others, self.load.seconds - before.seconds
+            self._speed = 1 - min(taken(cores(), torch.get_num_threads(), others / seconds), MOST_TAKEN)
+
     def shared_progress(self, trainer: L.Trainer) -> float:
         """`progress`, the same in all processes of a run."""
         progress = self.progress(trainer.global_step)
@@ -130,6 +156,8 @@ class Budget(L.Callback):
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
+        if self._alone and self._device.type == "cpu":
+            self._look_at_others()
         pl_module.progress = self.shared_progress(trainer)
         if self.plateau is not None and self.stopped is None and pl_module.progress < 1.0:
             self._look_for_plateau(trainer, pl_module, self.plateau)

@@ -34,7 +34,9 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 
 Data = RayDataModule | PixelDataModule
 SEARCH = 0.75
-"""Share of the budget that climbing the whole ladder takes."""
+"""Share of a budget in steps that climbing the whole ladder takes."""
+RUNG_STEPS = 300
+"""Steps on each rung where the budget is in seconds: what is chosen must not depend on what else the machine does."""
 VIEWS = 8
 """Held-out views that measure a rung, and training views that decide what its file must hold."""
 EXTRA_SEEDS = 2
@@ -66,14 +68,13 @@ def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
     return changed
 
 
-def share_of_budget(cfg: DictConfig, share: float) -> DictConfig:
-    """A configuration with a part of its budget, however it was given."""
-    limits, changed = budget_options(cfg), copy.deepcopy(cfg)
-    steps, seconds = limits.get("steps"), limits.get("seconds")
-    OmegaConf.update(changed, "budget.steps", None if steps is None else max(1, round(steps * share)))
-    OmegaConf.update(changed, "budget.seconds", None if seconds is None else seconds * share)
-    OmegaConf.update(changed, "budget.patience", None)
-    return changed
+def for_a_rung(cfg: DictConfig, rungs: int) -> DictConfig:
+    """A configuration for training one of several rungs: in steps, however the budget was given."""
+    steps, changed = budget_options(cfg).get("steps"), copy.deepcopy(cfg)
+    wanted = RUNG_STEPS if steps is None else max(1, round(steps * SEARCH / rungs))
+    for key, value in {"steps": wanted, "seconds": None, "patience": None}.items():
+        OmegaConf.update(changed, f"budget.{key}", value)
+    return bare(changed)
 
 
 def bare(cfg: DictConfig) -> DictConfig:
@@ -118,9 +119,9 @@ def compact_bytes(cfg: DictConfig, system: System, data: Data) -> int:
 
 
 def climb(cfg: DictConfig, data: Data, rungs: list[Options], folder: Path) -> Iterator[Rung]:
-    """Trains the smallest rung, then goes on with each next larger one, for equal shares of the budget."""
+    """Trains the smallest rung, then goes on with each next larger one, for as many steps each."""
     start: System | None = None
-    part = bare(share_of_budget(cfg, SEARCH / len(rungs)))
+    part = for_a_rung(cfg, len(rungs))
     for options in rungs:
         with_options = set_options(part, "model", options)
         system, seconds = trained(with_options, data, folder, start)
@@ -136,7 +137,7 @@ def spread(cfg: DictConfig, data: Data, rungs: list[Options], first: Rung, folde
     Returns:
         It, and the seconds of training it took.
     """
-    part = set_options(bare(share_of_budget(cfg, SEARCH / len(rungs))), "model", first.options)
+    part = set_options(for_a_rung(cfg, len(rungs)), "model", first.options)
     found, spent = [first.psnr], 0.0
     for extra in range(1, EXTRA_SEEDS + 1):
         another = copy.deepcopy(part)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.config.build import build_data, corrects_poses, device_of
 from nerf_lightning.config.limits import limits_of
@@ -130,8 +130,9 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
 
 
 def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Any, folder: Path) -> Full:
-    """A run of its own, with the whole budget."""
+    """A run of its own, with the whole budget, as if nothing else ran beside it."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
+    OmegaConf.update(whole, "budget.alone", True)
     train(whole, folder=folder)
     results = read_run(folder).results
     run = load_run(folder, device=device_of(cfg))

@@ -1,7 +1,12 @@
+import time
+
 import pytest
+import torch
 
 from nerf_lightning.callbacks import Budget
+from nerf_lightning.callbacks import budget as budget_module
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.machine import Load
 
 
 def test_the_clock_runs_from_the_first_step_and_stands_while_paused(clock, system, trainer_with):
@@ -97,3 +102,30 @@ def test_a_trainer_needs_a_budget(trainer_with):
     assert Budget.of(trainer_with(budget)) is budget
     with pytest.raises(RuntimeError, match="Budget"):
         Budget.of(trainer_with())
+
+
+def test_alone_the_clock_runs_as_much_slower_as_other_work_takes_threads(clock, system, trainer_with, monkeypatch):
+    monkeypatch.setattr(budget_module, "cores", lambda: 2)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    busy = [0.0]  # CPU seconds of everything
+    monkeypatch.setattr(Load, "_now", lambda *_: (time.perf_counter(), 0.0, busy[0]))
+    plain, alone = Budget(seconds=100), Budget(seconds=100, alone=True)
+    for budget in (plain, alone):
+        budget.on_train_start(trainer_with(budget), system)
+
+    def a_second(others: float) -> None:
+        clock.wait(1)
+        busy[0] += others
+        for budget in (plain, alone):
+            budget.on_train_batch_end(trainer_with(budget), system, None, None, 0)
+
+    a_second(0)
+    assert alone.seconds == plain.seconds == 1
+    for _ in range(11):
+        a_second(1)  # one of two threads: half the work, once this was seen
+    assert plain.seconds == 12
+    assert alone.seconds == pytest.approx(2 + 10 * 0.5)
+    assert alone.progress(0) == alone.seconds / 100
+    a_second(0)
+    a_second(0)
+    assert alone.seconds == pytest.approx(2 + 11 * 0.5 + 1), "quiet again"

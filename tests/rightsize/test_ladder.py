@@ -11,7 +11,7 @@ from nerf_lightning.config import cli
 from nerf_lightning.config.build import PictureFrame, SceneFrame, build_system
 from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
-from nerf_lightning.rightsize.climb import set_options, share_of_budget
+from nerf_lightning.rightsize.climb import RUNG_STEPS, for_a_rung, set_options
 from nerf_lightning.rightsize.ladder import overrides, read_ladder
 
 SHIPPED = cli.conf_dir() / "ladders"
@@ -63,17 +63,18 @@ def test_options_as_a_command_line_gives_them():
 
 
 @pytest.mark.parametrize(
-    ("given", "steps", "seconds"),
+    ("given", "steps"),
     [
-        ([], None, 45.0),
-        (["budget.seconds=10"], None, 5.0),
-        (["budget.steps=10"], 5, None),
-        (["budget.steps=10", "budget.seconds=8"], 5, 4),
+        ([], RUNG_STEPS),
+        (["budget.seconds=10"], RUNG_STEPS),
+        (["budget.steps=40"], 3),
+        (["budget.steps=1", "budget.seconds=8"], 1),
     ],
 )
-def test_a_share_of_the_budget(given: list[str], steps: int | None, seconds: float | None, tmp_path: Path):
-    cfg = composed(given, tmp_path)
+def test_rungs_are_trained_in_steps_however_long_they_take(given: list[str], steps: int, tmp_path: Path):
+    cfg = composed([*given, "budget.patience=1"], tmp_path)
     before = copy.deepcopy(cfg)
-    part = share_of_budget(cfg, 0.5)
-    assert (part.budget.steps, part.budget.seconds) == (steps, seconds)
+    part = for_a_rung(cfg, 10)
+    assert (part.budget.steps, part.budget.seconds, part.budget.patience) == (steps, None, None)
+    assert set(part.callbacks) == {"guard"} and part.logger is None
     assert cfg == before
