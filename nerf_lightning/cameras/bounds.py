@@ -16,6 +16,10 @@ UNBOUNDED_REACH = 50.0
 """An unbounded scene is sampled out to this many half-sizes of the box; beyond, it looks like a picture at infinity."""
 
 
+USUAL_WIDTH = 200
+"""Pixels that the content is wide in photos for which sizes of grids are stated."""
+
+
 def once(of: Callable[[Any], Tensor]) -> cached_property:
     """A cached property whose tensor works with gradients even if first read in inference mode."""
 
@@ -71,6 +75,18 @@ class Bounds:
             return math.inf
         # The contraction leaves the middle half of the unit cube to the box.
         return (4 if self.unbounded else 2) * self.longest / self.pixel
+
+    @property
+    def fineness(self) -> float:
+        """How much finer than usual the photos let grids be: the square root of how much wider the content is in them, at
+        least 1.
+
+        Planes then have as many more numbers as it is wider; cells as fine as the pixels would take too long to learn. Of
+        unbounded scenes, whose numbers have other things to show, this was not measured: 1.
+        """
+        if self.unbounded or self.pixel is None:
+            return 1.0
+        return max(1.0, math.sqrt(self.pixels_across / USUAL_WIDTH))
 
     def settle(self) -> None:
         """Computes all cached properties now."""

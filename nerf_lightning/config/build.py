@@ -121,8 +121,9 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     if isinstance(frame, PictureFrame):
         return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
     field = build_field(cfg, Field, "three coordinates", bounds=frame.bounds)
-    sampler = make(cfg, "sampler", bounds=frame.bounds)
     bounds = frame.bounds
+    asked = inspect.signature(target_of(cfg, "sampler")).parameters
+    sampler = make(cfg, "sampler", bounds=bounds, **({"finer": field.finer} if "finer" in asked else {}))
     seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
     renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
     corrections = None

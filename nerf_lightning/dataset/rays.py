@@ -146,6 +146,11 @@ class RayDataModule(StepDataModule[Views]):
         self.rays = self.first_rays = self.first_rays * batch
         self.samples = None if self.samples is None else self.samples * batch
 
+    def suit(self, finer: float) -> None:
+        """Aims for so many times the samples, for a field that is finer than usual: fewer of them meet in a cell, and gradients
+        would be noise. Before training."""
+        self.samples = None if self.samples is None else round(self.samples * finer)
+
     def note_samples(self, drawn: int) -> None:
         """Called with the samples that a step's rays took: moves the number of rays toward the aim."""
         if self.samples is None:

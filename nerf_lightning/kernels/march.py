@@ -125,9 +125,11 @@ def march(
     from nerf_lightning.kernels.cpu import march, workers
 
     threads, count, resolution = workers(), len(rays), round(len(occupied) ** (1 / 3))
-    cells = resolution // BLOCK if resolution % BLOCK == 0 else resolution
-    blocks = np.empty(cells**3, np.bool_)
-    march.coarsen(occupied.numpy(), resolution, blocks, cells, threads)
+    blocks, cells = occupied.numpy(), resolution
+    if resolution % BLOCK == 0:
+        rows, cells = blocks.view(np.uint32), resolution // BLOCK
+        blocks = np.empty(cells**3, np.bool_)
+        march.coarsen(rows, resolution, BLOCK, blocks, threads)
     found, counts = np.empty((count, samples + 1), np.int32), np.empty(count, np.int64)
     origins, directions = rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy()
     inside = bounds.inside(rays) if bounds.unbounded else torch.empty(0, 2)

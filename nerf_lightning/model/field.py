@@ -59,6 +59,8 @@ class Field(InBounds, AnyField):
 
     fastest: float = math.inf
     """Adam's learning rate above which training diverges, as the stability suite measured it; infinite if unknown."""
+    finer: float = 1.0
+    """How much finer than usual large photos have made it: it wants so many more steps along a ray, and samples a step."""
 
     def __init__(self, bounds: Bounds):
         super().__init__(bounds)
@@ -80,7 +82,7 @@ class Field(InBounds, AnyField):
         shown = max(math.ceil(PER_PIXEL * across), 2)
         self.sizing = (
             f"the content is {across:.0f} pixels wide in the photos, which show {shown} cells a side at most:"
-            f" {min(finest, shown)} of the {finest} asked for"
+            f" {min(finest, shown)} of {finest} wanted"
         )
         return min(coarsest, shown), min(finest, shown)
 

@@ -19,6 +19,9 @@ from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_fr
 from nerf_lightning.model.layers.widening import widen_all
 from nerf_lightning.utils.options import Count
 
+FINEST = 160
+"""Cells along a side at the end, where photos are of usual size."""
+
 
 class VectorMatrix(torch.nn.Module):
     """Trainable planes times lines over the unit cube: TensoRF's vector-matrix decomposition (eq. 3).
@@ -96,7 +99,8 @@ class TensoRFField(Field):
     Args:
         bounds: the box the planes cover.
         density_components, colour_components: channels of each plane. Multiples of 8 are the fast ones on a CPU.
-        coarsest, finest: cells along a side at the start and at the end.
+        coarsest, finest: cells along a side at the start and at the end. Without a finest: 160, and more for larger photos, see
+            `Bounds.fineness`.
         stages: number of sizes, growing geometrically.
         grown: fraction of the budget after which the planes have their finest size; the stages before are equally long.
         width: neurons of the hidden layer.
@@ -118,7 +122,7 @@ class TensoRFField(Field):
         density_components: Count = 16,
         colour_components: Count = 16,
         coarsest: Count = 64,
-        finest: Count = 160,
+        finest: Count | None = None,
         stages: Count = 4,
         grown: float = 0.3,
         width: Count = 32,
@@ -127,6 +131,9 @@ class TensoRFField(Field):
         size: str = "auto",
     ):
         super().__init__(bounds)
+        if finest is None:
+            self.finer = bounds.fineness
+            finest = max(coarsest, round(FINEST * self.finer))
         coarsest, finest = self.grid_sizes(coarsest, finest, size)
         if stages == 1 and coarsest < finest:
             raise InputError("model.stages", "", f"1 with sizes {coarsest} and {finest}", "at least 2, or one size")

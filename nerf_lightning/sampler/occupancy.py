@@ -9,10 +9,12 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import keep_visible, march, mark_cells
-from nerf_lightning.kernels.march import Packed
+from nerf_lightning.kernels.march import BLOCK, Packed
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
 from nerf_lightning.utils.options import Count
 
+SAMPLES, RESOLUTION = 192, 64
+"""Steps along the diagonal, and cells along a side, for a field of usual size."""
 ASKED, LOOKED_AT = 4, 32
 """How many positions are evaluated at a time, and how many steps are tested at a time, as multiples of `Sampler.chunk`."""
 MOST_CAMERAS = 128
@@ -37,8 +39,8 @@ class OccupancySampler(Sampler):
 
     Args:
         bounds: where the content is.
-        samples: steps along the diagonal of the bounds; rays that cross less of it get fewer.
-        resolution: cells along each side.
+        samples: steps along the diagonal of the bounds; rays that cross less of it get fewer. None: 192, times `finer`.
+        resolution: cells along each side. None: 64, times `finer`.
         threshold: optical thickness of a step above which a cell counts as occupied.
         decay: factor on a cell's maximum at each update.
         update_every: training steps between updates.
@@ -48,6 +50,7 @@ class OccupancySampler(Sampler):
             front of its lens.
         early_stop_eps: early-stop transmittance, above 0: below it a ray has ended.
         alpha_thre: alpha threshold: training drops steps of lower opacity; at most half the mean, so that fog trains too.
+        finer: how much finer than usual the field is, see `Field.finer`.
     """
 
     thickness: Tensor
@@ -59,8 +62,8 @@ class OccupancySampler(Sampler):
     def __init__(
         self,
         bounds: Bounds,
-        samples: Count = 192,
-        resolution: Count = 64,
+        samples: Count | None = None,
+        resolution: Count | None = None,
         threshold: float = 0.01,
         decay: float = 0.8,
         update_every: Count = 16,
@@ -69,14 +72,15 @@ class OccupancySampler(Sampler):
         seen_by: int = 3,
         early_stop_eps: float = 1e-4,
         alpha_thre: float = 5e-3,
+        finer: float = 1.0,
     ):
         super().__init__(bounds)
         if not 0 < early_stop_eps < 1:
             raise InputError("sampler.early_stop_eps", "", str(early_stop_eps), "between 0 and 1")
         if not 0 <= alpha_thre < 1:
             raise InputError("sampler.alpha_thre", "", str(alpha_thre), "at least 0, below 1")
-        self.samples = samples
-        self.resolution = resolution
+        self.samples = samples or round(SAMPLES * finer)
+        self.resolution = resolution = resolution or BLOCK * round(RESOLUTION / BLOCK * finer)
         self.threshold = threshold
         self.decay = decay
         self.update_every = update_every
@@ -100,7 +104,7 @@ class OccupancySampler(Sampler):
         self.per_ray: tuple[float, float] | None = None
         """Steps per ray in occupied cells, and how many of those were kept, at the last count; None if the next training step
         must count. Counting waits for the device, so except on a CPU the steps between two updates assume the last count."""
-        self.step_length = 2 * float(bounds.half_size.norm()) / samples
+        self.step_length = 2 * float(bounds.half_size.norm()) / self.samples
         """Length of one step inside the box, in world units."""
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:

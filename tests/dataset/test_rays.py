@@ -31,6 +31,14 @@ def scene() -> Scene:
     return Scene("labels", "test", train, val, val.cameras, Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])))
 
 
+def test_a_finer_field_gets_more_samples_a_step_but_a_fixed_number_of_rays_stays(scene: Scene):
+    data, fixed = RayDataModule(scene, 100, samples=6000), RayDataModule(scene, 100, samples=None)
+    for one in (data, fixed):
+        one.suit(1.5)
+    assert data.samples == 9000 and fixed.samples is None
+    assert data.rays == fixed.rays == 100
+
+
 def test_drawn_colours_belong_to_drawn_rays(scene: Scene):
     batch = draw_rays(scene.train, 200, torch.Generator().manual_seed(0))
     assert len(batch.rays) == len(batch.pixels) == 200

@@ -6,13 +6,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerf_lightning.cameras import Bounds
+from nerf_lightning.cameras import Bounds, bounds
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, HashGrid2DField, HashGridField, PictureMLP, TensoRFField, VoxelField
+from nerf_lightning.model.tensorf import FINEST
 from nerf_lightning.runs.folder import load_run
+from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.stability.toys import MARBLE, around, toy
+from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train
 
 BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 1.0]])
@@ -61,6 +64,13 @@ def test_grids_are_no_finer_than_two_cells_a_pixel(resolutions: Resolutions):
         resolutions(bounds, 16, 100, "large")
 
 
+@pytest.mark.parametrize(("unbounded", "width", "finest"), [(False, 150, 160), (False, 800, 320), (True, 800, 160)])
+def test_planes_have_numbers_in_proportion_to_the_width_of_large_photos(unbounded: bool, width: int, finest: int):
+    assert TensoRFField(Bounds(BOX, unbounded, pixel=2 / width), 2, 2).resolutions[-1] == finest
+    assert TensoRFField(Bounds(BOX, unbounded, pixel=2 / width), 2, 2, finest=100).resolutions[-1] == 100
+    assert TensoRFField(Bounds(BOX, unbounded), 2, 2, coarsest=200).resolutions[-1] == 200
+
+
 def test_fields_say_in_a_line_what_their_size_follows_from():
     assert "20 pixels wide" in TensoRFField(Bounds(BOX, pixel=0.1), size="auto").sizing
     assert Field(Bounds(BOX)).sizing == ""
@@ -75,3 +85,25 @@ def test_a_run_folder_knows_the_size_without_its_photos(tmp_path: Path, capsys: 
     (tmp_path / "scene.npz").unlink()
     field = load_run(tmp_path / "run").system.field
     assert isinstance(field, TensoRFField) and field.resolutions[-1] < 16
+
+
+def test_a_run_on_large_photos_trains_a_finer_field_and_opens_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(bounds, "USUAL_WIDTH", 4)  # so that small photos count as large
+    scene = tmp_path / "scene.npz"
+    save_npz(toy(MARBLE, size=24, views=5, held_out=1), scene)
+    given = ["dataset=photos", f"dataset.path={scene}", "recipe=tensorf_medium", "model.coarsest=8", "model.size=fixed"]
+    given += [
+        "model.width=8",
+        "dataset.samples=500",
+        "budget.steps=4",
+        "device=cpu",
+        "callbacks.orbit=null",
+        "callbacks.snapshots.steps=[]",
+        "~logger",
+    ]
+    train(composed(given, tmp_path / "run"), folder=tmp_path / "run")
+    found = load_run(tmp_path / "run").system
+    assert isinstance(found, NeRF3D) and isinstance(found.sampler, OccupancySampler)
+    finer = found.field.finer
+    assert finer > 1.1 and found.sampler.samples == round(192 * finer)
+    assert found.field.resolutions[-1] == round(FINEST * finer)

@@ -204,3 +204,12 @@ def test_few_cameras_allow_what_all_of_them_see():
     away = look_at(torch.tensor([[-4.0, 0, 0]]), torch.tensor([[-9.0, 0, 0]]), torch.tensor([0.0, 0, 1]))
     sampler.look_through(Cameras.of_size(K, away, 16, 16))
     assert sampler.allowed.all(), "a view of nothing must not leave nothing to train"
+
+
+def test_steps_and_cells_follow_the_field_unless_stated():
+    usual, twice = OccupancySampler(CUBE), OccupancySampler(CUBE, finer=2)
+    assert (usual.samples, usual.resolution) == (192, 64)
+    assert (twice.samples, twice.resolution) == (384, 128)
+    assert twice.step_length == pytest.approx(usual.step_length / 2)
+    stated = OccupancySampler(CUBE, samples=100, resolution=16, finer=2)
+    assert (stated.samples, stated.resolution) == (100, 16)

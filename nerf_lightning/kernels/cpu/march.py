@@ -152,20 +152,23 @@ def pack(near, far, inside, shift, half, unbounded, samples, step, found, offset
 
 
 @kernel
-def coarsen(occupied, resolution, blocks, cells, workers):
-    """blocks [cells^3]: whether any of a block's cells is occupied; cells divides resolution."""
-    size = resolution // cells
+def coarsen(rows, resolution, size, blocks, workers):
+    """blocks [cells^3]: whether any of a block's size^3 cells is occupied.
+
+    Args:
+        rows: [resolution^2 * cells]: the cells of a block's row as one number, 0 where none is occupied.
+    """
+    cells = resolution // size
     for worker in prange(workers):
         for i in range(cells * worker // workers, cells * (worker + 1) // workers):
             for j in range(cells):
-                for k in range(cells):
-                    some = False
-                    for x in range(i * size, (i + 1) * size):
-                        for y in range(j * size, (j + 1) * size):
-                            row = (x * resolution + y) * resolution
-                            for z in range(row + k * size, row + (k + 1) * size):
-                                some = some or occupied[z]
-                    blocks[(i * cells + j) * cells + k] = some
+                block = (i * cells + j) * cells
+                blocks[block : block + cells] = False
+                for x in range(i * size, (i + 1) * size):
+                    for y in range(j * size, (j + 1) * size):
+                        row = (x * resolution + y) * cells
+                        for k in range(cells):
+                            blocks[block + k] |= rows[row + k] != 0
 
 
 @kernel
