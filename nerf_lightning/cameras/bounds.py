@@ -18,6 +18,8 @@ UNBOUNDED_REACH = 50.0
 
 USUAL_WIDTH = 200
 """Pixels that the content is wide in photos for which sizes of grids are stated."""
+MOST_FINE = 2.0
+"""Most that `Bounds.fineness` is: content of 800 pixels; an occupancy grid costs its cube."""
 
 
 def once(of: Callable[[Any], Tensor]) -> cached_property:
@@ -79,14 +81,14 @@ class Bounds:
     @property
     def fineness(self) -> float:
         """How much finer than usual the photos let grids be: the square root of how much wider the content is in them, at
-        least 1.
+        least 1 and at most `MOST_FINE`.
 
         Planes then have as many more numbers as it is wider; cells as fine as the pixels would take too long to learn. Of
         unbounded scenes, whose numbers have other things to show, this was not measured: 1.
         """
         if self.unbounded or self.pixel is None:
             return 1.0
-        return max(1.0, math.sqrt(self.pixels_across / USUAL_WIDTH))
+        return min(max(1.0, math.sqrt(self.pixels_across / USUAL_WIDTH)), MOST_FINE)
 
     def settle(self) -> None:
         """Computes all cached properties now."""

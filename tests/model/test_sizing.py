@@ -64,7 +64,10 @@ def test_grids_are_no_finer_than_two_cells_a_pixel(resolutions: Resolutions):
         resolutions(bounds, 16, 100, "large")
 
 
-@pytest.mark.parametrize(("unbounded", "width", "finest"), [(False, 150, 160), (False, 800, 320), (True, 800, 160)])
+@pytest.mark.parametrize(
+    ("unbounded", "width", "finest"),
+    [(False, 150, 160), (False, 800, 320), (False, 9000, 320), (True, 800, 160)],
+)
 def test_planes_have_numbers_in_proportion_to_the_width_of_large_photos(unbounded: bool, width: int, finest: int):
     assert TensoRFField(Bounds(BOX, unbounded, pixel=2 / width), 2, 2).resolutions[-1] == finest
     assert TensoRFField(Bounds(BOX, unbounded, pixel=2 / width), 2, 2, finest=100).resolutions[-1] == 100
