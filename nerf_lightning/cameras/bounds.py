@@ -14,8 +14,6 @@ from nerf_lightning.cameras.cameras import Rays
 
 UNBOUNDED_REACH = 50.0
 """An unbounded scene is sampled out to this many half-sizes of the box; beyond, it looks like a picture at infinity."""
-
-
 USUAL_WIDTH = 200
 """Pixels that the content is wide in photos for which sizes of grids are stated."""
 MOST_FINE = 2.0

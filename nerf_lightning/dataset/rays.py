@@ -135,6 +135,8 @@ class RayDataModule(StepDataModule[Views]):
         self.batch = 1
         self.plain = False
         """Whether batches say how plain photos are, see `RayBatch.plain`."""
+        self.finer = 1.0
+        """Factor on the samples aimed for, see `Field.finer`: fewer meet in a small cell, and gradients would be noise."""
 
     @property
     def photos(self) -> Views:
@@ -146,17 +148,12 @@ class RayDataModule(StepDataModule[Views]):
         self.rays = self.first_rays = self.first_rays * batch
         self.samples = None if self.samples is None else self.samples * batch
 
-    def suit(self, finer: float) -> None:
-        """Aims for so many times the samples, for a field that is finer than usual: fewer of them meet in a cell, and gradients
-        would be noise. Before training."""
-        self.samples = None if self.samples is None else round(self.samples * finer)
-
     def note_samples(self, drawn: int) -> None:
         """Called with the samples that a step's rays took: moves the number of rays toward the aim."""
         if self.samples is None:
             return
         # Damped, since one batch's count is noisy; bounded, since empty space would ask for endless rays.
-        wanted = self.rays * self.samples / max(drawn, 1)
+        wanted = self.rays * round(self.samples * self.finer) / max(drawn, 1)
         limit = self.first_rays * self.MOST_RAYS
         self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
 

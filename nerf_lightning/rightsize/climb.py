@@ -70,11 +70,9 @@ def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
 
 def for_a_rung(cfg: DictConfig, rungs: int) -> DictConfig:
     """A configuration for training one of several rungs: in steps, however the budget was given."""
-    steps, changed = budget_options(cfg).get("steps"), copy.deepcopy(cfg)
+    steps = budget_options(cfg).get("steps")
     wanted = RUNG_STEPS if steps is None else max(1, round(steps * SEARCH / rungs))
-    for key, value in {"steps": wanted, "seconds": None, "patience": None}.items():
-        OmegaConf.update(changed, f"budget.{key}", value)
-    return bare(changed)
+    return bare(set_options(cfg, "budget", {"steps": wanted, "seconds": None, "patience": None}))
 
 
 def bare(cfg: DictConfig) -> DictConfig:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nerf_lightning.config.build import build_data, corrects_poses, device_of
 from nerf_lightning.config.limits import limits_of
@@ -132,8 +132,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
 def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Any, folder: Path) -> Full:
     """A run of its own, with the whole budget, as if nothing else ran beside it."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
-    OmegaConf.update(whole, "budget.alone", True)
-    train(whole, folder=folder)
+    train(set_options(whole, "budget", {"alone": True}), folder=folder)
     results = read_run(folder).results
     run = load_run(folder, device=device_of(cfg))
     size = compact_bytes(run.cfg, run.system, data)

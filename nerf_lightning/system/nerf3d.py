@@ -76,7 +76,7 @@ class NeRF3D(System):
 
     def on_fit_start(self) -> None:
         self.sampler.look_through(self.data.scene.train.cameras)
-        self.data.plain = self.renderer.prices_plain
+        self.data.plain, self.data.finer = self.renderer.prices_plain, self.field.finer
 
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)

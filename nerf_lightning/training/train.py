@@ -91,8 +91,6 @@ def train(
     system = build_system(cfg, frame_of(data), device)
     if isinstance(system, NeRF3D) and system.corrections is not None and any(doubt.far_off for doubt in doubts):
         system.corrections.begin_poses()
-    if isinstance(system, NeRF3D) and isinstance(data, RayDataModule):
-        data.suit(system.field.finer)
     system.backend = BACKEND if cfg.compile else None
     if system.field.sizing:
         log.info("model: %s", system.field.sizing)

@@ -34,9 +34,12 @@ def scene() -> Scene:
 def test_a_finer_field_gets_more_samples_a_step_but_a_fixed_number_of_rays_stays(scene: Scene):
     data, fixed = RayDataModule(scene, 100, samples=6000), RayDataModule(scene, 100, samples=None)
     for one in (data, fixed):
-        one.suit(1.5)
-    assert data.samples == 9000 and fixed.samples is None
+        one.finer = 1.5
     assert data.rays == fixed.rays == 100
+    for _ in range(60):
+        for one in (data, fixed):
+            one.note_samples(10 * one.rays)
+    assert abs(data.rays - 900) <= 2 and fixed.rays == 100
 
 
 def test_drawn_colours_belong_to_drawn_rays(scene: Scene):

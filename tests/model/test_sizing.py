@@ -8,7 +8,7 @@ import torch
 
 from nerf_lightning.cameras import Bounds, bounds
 from nerf_lightning.config.compose import composed
-from nerf_lightning.dataset import save_npz
+from nerf_lightning.dataset import RayDataModule, save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, HashGrid2DField, HashGridField, PictureMLP, TensoRFField, VoxelField
 from nerf_lightning.model.tensorf import FINEST
@@ -104,9 +104,12 @@ def test_a_run_on_large_photos_trains_a_finer_field_and_opens_again(tmp_path: Pa
         "callbacks.snapshots.steps=[]",
         "~logger",
     ]
+    told: list[float] = []
+    monkeypatch.setattr(RayDataModule, "note_samples", lambda data, _: told.append(data.finer))
     train(composed(given, tmp_path / "run"), folder=tmp_path / "run")
     found = load_run(tmp_path / "run").system
     assert isinstance(found, NeRF3D) and isinstance(found.sampler, OccupancySampler)
     finer = found.field.finer
+    assert told == [finer] * 4, "the data aims for more samples"
     assert finer > 1.1 and found.sampler.samples == round(192 * finer)
     assert found.field.resolutions[-1] == round(FINEST * finer)
