@@ -19,8 +19,10 @@ def bare_step(
     system.progress = progress
     for group in optimizer.param_groups:
         group["lr"] = group["initial_lr"] * system.schedule(progress)
-    for parameter in system.field.grow(progress):
+    for parameter in system.field.grow(system.ripeness(step)):
         optimizer.state.pop(parameter, None)
+    system.sampler.refine(system.field.finer)
+    data.finer = system.field.finer
     batch = data.draw(step).to(system.device)
     optimizer.zero_grad()
     loss, system.stats = system.loss(batch, step_generator(system.seed, Stream.STEP, step, system.device), step)

@@ -122,8 +122,7 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
         return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
     field = build_field(cfg, Field, "three coordinates", bounds=frame.bounds)
     bounds = frame.bounds
-    asked = inspect.signature(target_of(cfg, "sampler")).parameters
-    sampler = make(cfg, "sampler", bounds=bounds, **({"finer": field.finer} if "finer" in asked else {}))
+    sampler = make(cfg, "sampler", bounds=bounds)
     seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
     renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
     corrections = None

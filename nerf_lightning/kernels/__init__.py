@@ -8,6 +8,7 @@ from nerf_lightning.kernels.composite import (
     keep_visible,
     volume_weights,
 )
+from nerf_lightning.kernels.front_first import front_first
 from nerf_lightning.kernels.harmonics import spherical_harmonics
 from nerf_lightning.kernels.hashgrid import hash_interpolate
 from nerf_lightning.kernels.march import (
@@ -39,6 +40,7 @@ __all__ = [
     "cell_index",
     "composite",
     "fast",
+    "front_first",
     "hash_interpolate",
     "interpolate_rows",
     "inverse_cdf",

@@ -119,34 +119,68 @@ def march(
             last interval is repeated with length 0; if more, rays whose `offsets` end beyond `room` lack some.
         most: intervals that the reference tests at a time, which bounds its memory.
     """
-    constants = not any(x.requires_grad for x in (rays.origins, rays.directions, near, far, shift))
-    if room is not None or not (constants and fast(rays.origins, near, shift)):
+    if room is not None or not walks(rays, near, far, shift):
         return march_reference(rays, bounds, near, far, shift, occupied, samples, step, room, most)
-    from nerf_lightning.kernels.cpu import march, workers
+    return Walk(rays, bounds, near, far, shift, occupied, samples, step).on(torch.arange(len(rays)), samples + 1)
 
-    threads, count, resolution = workers(), len(rays), round(len(occupied) ** (1 / 3))
-    blocks, cells = occupied.numpy(), resolution
-    if resolution % BLOCK == 0:
-        rows, cells = blocks.view(np.uint32), resolution // BLOCK
-        blocks = np.empty(cells**3, np.bool_)
-        march.coarsen(rows, resolution, BLOCK, blocks, threads)
-    found, counts = np.empty((count, samples + 1), np.int32), np.empty(count, np.int64)
-    origins, directions = rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy()
-    inside = bounds.inside(rays) if bounds.unbounded else torch.empty(0, 2)
-    ends = tuple(x.contiguous().numpy() for x in (near, far, inside, shift))
-    half, length = bounds.half_size.numpy(), np.float32(step)
-    box = bounds.centre.numpy(), half, bounds.unbounded
-    march.walk(
-        origins, directions, *ends, occupied.numpy(), resolution, blocks, cells, *box, samples, length, found, counts, threads
-    )  # fmt: skip
-    offsets = torch.zeros(count + 1, dtype=torch.int64)
-    np.cumsum(counts, out=offsets.numpy()[1:])
-    total = int(offsets[-1])
-    t, dt, ray = torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
-    march.pack(
-        *ends, half, bounds.unbounded, samples, length, found, offsets.numpy(), t.numpy(), dt.numpy(), ray.numpy(), threads
-    )  # fmt: skip
-    return t, dt, ray, offsets
+
+def walks(rays: Rays, *ends: Tensor) -> bool:
+    """Whether there is a fast version for these rays and what is said of each."""
+    given = (rays.origins, rays.directions, *ends)
+    return fast(rays.origins, *ends) and not any(x.requires_grad for x in given)
+
+
+class Walk:
+    """The fast `march`, which may go some steps at a time. Arguments as there."""
+
+    def __init__(
+        self,
+        rays: Rays,
+        bounds: Bounds,
+        near: Float[Tensor, "R"],
+        far: Float[Tensor, "R"],
+        shift: Float[Tensor, "R"],
+        occupied: Bool[Tensor, "cells"],
+        samples: int,
+        step: float,
+    ):
+        from nerf_lightning.kernels.cpu import march, workers
+
+        resolution = round(len(occupied) ** (1 / 3))
+        threads = workers()
+        if resolution % BLOCK == 0:
+            cells = resolution // BLOCK
+            blocks = np.empty(cells**3, np.uint8)
+            march.coarsen(occupied.numpy().view(np.uint32), resolution, BLOCK, blocks, threads)
+        else:
+            cells, blocks = resolution, np.where(occupied.numpy(), 0, march.FAR).astype(np.uint8)
+        if not bounds.unbounded:
+            cube = blocks.reshape((cells,) * 3)
+            march.clear(cube, np.empty_like(cube), threads)
+        inside = bounds.inside(rays) if bounds.unbounded else torch.empty(0, 2)
+        lines = (rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy())
+        self.ends = tuple(x.contiguous().numpy() for x in (near, far, inside, shift))
+        self.shape = bounds.half_size.numpy(), bounds.unbounded
+        self.steps = samples, np.float32(step)
+        grid = occupied.numpy(), resolution, blocks, cells
+        self.given = *lines, *self.ends, *grid, bounds.centre.numpy(), *self.shape, *self.steps
+        self.after = np.zeros(len(rays), np.int32)
+        """The interval at which each ray goes on."""
+
+    def on(self, which: Int[Tensor, "A"], most: int) -> Packed:
+        """The next intervals of some rays, at most so many of each; `offsets` counts these rays alone."""
+        from nerf_lightning.kernels.cpu import march, workers
+
+        threads, some, count = workers(), which.numpy(), len(which)
+        found, counts = np.empty((count, most), np.int32), np.empty(count, np.int64)
+        march.walk(some, *self.given, most, self.after, found, counts, threads)
+        offsets = torch.zeros(count + 1, dtype=torch.int64)
+        np.cumsum(counts, out=offsets.numpy()[1:])
+        total = int(offsets[-1])
+        t, dt, ray = torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
+        out = t.numpy(), dt.numpy(), ray.numpy()
+        march.pack(some, *self.ends, *self.shape, *self.steps, found, offsets.numpy(), *out, threads)
+        return t, dt, ray, offsets
 
 
 def points_reference(origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor) -> Float[Tensor, "N 3"]:

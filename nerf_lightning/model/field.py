@@ -59,8 +59,14 @@ class Field(InBounds, AnyField):
 
     fastest: float = math.inf
     """Adam's learning rate above which training diverges, as the stability suite measured it; infinite if unknown."""
-    finer: float = 1.0
-    """How much finer than usual large photos have made it: it wants so many more steps along a ray, and samples a step."""
+    growing_steps: int = 0
+    """Steps before which it does not have its last size, whatever the budget: the smaller ones need them."""
+
+    @property
+    def finer(self) -> float:
+        """How much finer than usual large photos have made it by now: it wants so many more steps along a ray, and samples a
+        step."""
+        return 1.0
 
     def __init__(self, bounds: Bounds):
         super().__init__(bounds)

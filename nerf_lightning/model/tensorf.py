@@ -21,6 +21,8 @@ from nerf_lightning.utils.options import Count
 
 FINEST = 160
 """Cells along a side at the end, where photos are of usual size."""
+SETTLED = 80
+"""Steps that a size needs before the next is worth its time."""
 
 
 class VectorMatrix(torch.nn.Module):
@@ -102,7 +104,8 @@ class TensoRFField(Field):
         coarsest, finest: cells along a side at the start and at the end. Without a finest: 160, and more for larger photos, see
             `Bounds.fineness`.
         stages: number of sizes, growing geometrically.
-        grown: fraction of the budget after which the planes have their finest size; the stages before are equally long.
+        grown: fraction of the budget after which the planes have their finest size; the stages before are equally long, and of
+            at least `SETTLED` steps.
         width: neurons of the hidden layer.
         degree: of the spherical harmonics of the direction that the network sees, 0 to 3; with 0, colours are the same from
             everywhere. With few photos, less than 3 may be better.
@@ -131,9 +134,9 @@ class TensoRFField(Field):
         size: str = "auto",
     ):
         super().__init__(bounds)
+        self.follows_photos = finest is None
         if finest is None:
-            self.finer = bounds.fineness
-            finest = max(coarsest, round(FINEST * self.finer))
+            finest = max(coarsest, round(FINEST * bounds.fineness))
         coarsest, finest = self.grid_sizes(coarsest, finest, size)
         if stages == 1 and coarsest < finest:
             raise InputError("model.stages", "", f"1 with sizes {coarsest} and {finest}", "at least 2, or one size")
@@ -141,12 +144,17 @@ class TensoRFField(Field):
             raise InputError("model.grown", "", str(grown), "between 0 and 1")
         self.resolutions = level_resolutions(stages, coarsest, finest)
         self.grown = grown
-        self.grown_after = grown if coarsest < finest else 0.0
+        if coarsest < finest:
+            self.grown_after, self.growing_steps = grown, SETTLED * (stages - 1)
         self.density_volume = VectorMatrix(coarsest, density_components)
         self.colour_volume = VectorMatrix(coarsest, colour_components)
         self.activation = density_activation(density)
         self.terms = harmonics_up_to(degree)
         self.colour_net = layers(3 * colour_components + self.terms, width, 3)
+
+    @property
+    def finer(self) -> float:
+        return max(1.0, self.density_volume.cells / FINEST) if self.follows_photos else 1.0
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         density, colour = self.density_volume, self.colour_volume

@@ -1,6 +1,7 @@
 """Skip empty space: a coarse grid remembers where the field has density (Instant-NGP, appendix C)."""
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,13 +9,15 @@ from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import keep_visible, march, mark_cells
+from nerf_lightning.kernels import front_first, keep_visible, mark_cells
 from nerf_lightning.kernels.march import BLOCK, Packed
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
 from nerf_lightning.utils.options import Count
 
-SAMPLES, RESOLUTION = 192, 64
-"""Steps along the diagonal, and cells along a side, for a field of usual size."""
+RESOLUTION = 64
+"""Cells along a side for a field of usual size."""
+STEPS = 3
+"""Steps along the diagonal for each of them."""
 ASKED, LOOKED_AT = 4, 32
 """How many positions are evaluated at a time, and how many steps are tested at a time, as multiples of `Sampler.chunk`."""
 MOST_CAMERAS = 128
@@ -39,8 +42,8 @@ class OccupancySampler(Sampler):
 
     Args:
         bounds: where the content is.
-        samples: steps along the diagonal of the bounds; rays that cross less of it get fewer. None: 192, times `finer`.
-        resolution: cells along each side. None: 64, times `finer`.
+        samples: steps along the diagonal of the bounds; rays that cross less of it get fewer. None: three times `resolution`.
+        resolution: cells along each side. None: 64, and more where the field becomes finer than usual, see `refine`.
         threshold: optical thickness of a step above which a cell counts as occupied.
         decay: factor on a cell's maximum at each update.
         update_every: training steps between updates.
@@ -50,7 +53,6 @@ class OccupancySampler(Sampler):
             front of its lens.
         early_stop_eps: early-stop transmittance, above 0: below it a ray has ended.
         alpha_thre: alpha threshold: training drops steps of lower opacity; at most half the mean, so that fog trains too.
-        finer: how much finer than usual the field is, see `Field.finer`.
     """
 
     thickness: Tensor
@@ -72,15 +74,14 @@ class OccupancySampler(Sampler):
         seen_by: int = 3,
         early_stop_eps: float = 1e-4,
         alpha_thre: float = 5e-3,
-        finer: float = 1.0,
     ):
         super().__init__(bounds)
         if not 0 < early_stop_eps < 1:
             raise InputError("sampler.early_stop_eps", "", str(early_stop_eps), "between 0 and 1")
         if not 0 <= alpha_thre < 1:
             raise InputError("sampler.alpha_thre", "", str(alpha_thre), "at least 0, below 1")
-        self.samples = samples or round(SAMPLES * finer)
-        self.resolution = resolution = resolution or BLOCK * round(RESOLUTION / BLOCK * finer)
+        self.stated = samples, resolution
+        self.set_resolution(resolution or RESOLUTION)
         self.threshold = threshold
         self.decay = decay
         self.update_every = update_every
@@ -89,7 +90,7 @@ class OccupancySampler(Sampler):
         self.seen_by = seen_by
         self.early_stop_eps = early_stop_eps
         self.alpha_thre = alpha_thre
-        cells = resolution**3
+        cells = self.resolution**3
         self.register_buffer("thickness", torch.zeros(cells))
         self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
         self.register_buffer("allowed", torch.ones(cells, dtype=torch.bool))
@@ -101,25 +102,56 @@ class OccupancySampler(Sampler):
         """Number of the last update; `reached` holds, for each cell, the number of the last update before light last met it."""
         self.look_everywhere = True
         """Whether the next training step looks at all occupied cells."""
+        self.thin: Tensor | None = None
+        """Optical thickness below which training drops steps; None where the cells have changed since it was computed."""
         self.per_ray: tuple[float, float] | None = None
         """Steps per ray in occupied cells, and how many of those were kept, at the last count; None if the next training step
         must count. Counting waits for the device, so except on a CPU the steps between two updates assume the last count."""
-        self.step_length = 2 * float(bounds.half_size.norm()) / self.samples
+
+    @property
+    def rays_at_once(self) -> int:
+        """On a CPU more than elsewhere: it goes some steps at a time along rays, front first."""
+        return self.chunk if self.thickness.device.type == "cpu" else super().rays_at_once
+
+    def set_resolution(self, cells: int) -> None:
+        """Takes so many cells along each side, and steps to match; buffers stay."""
+        self.resolution = cells
+        self.samples = self.stated[0] or STEPS * cells
+        self.step_length = 2 * float(self.bounds.half_size.norm()) / self.samples
         """Length of one step inside the box, in world units."""
+
+    @torch.no_grad()
+    def refine(self, finer: float) -> None:
+        old, new = self.resolution, BLOCK * round(RESOLUTION / BLOCK * finer)
+        if self.stated[1] is not None or new == old:
+            return
+        # A cell holds whatever the cells that it lies in held.
+        edges = torch.arange(new + 1, device=self.thickness.device) * old
+        first, last = edges[:-1] // new, (edges[1:] - 1) // new
+        before = self.step_length
+        self.set_resolution(new)
+        for name in ("thickness", "occupied", "allowed", "reached", "lit"):
+            grid = getattr(self, name).view(old, old, old)
+            for axis in range(3):
+                grid = torch.maximum(grid.index_select(axis, first), grid.index_select(axis, last))
+            setattr(self, name, grid.flatten())
+        self.thickness *= self.step_length / before
+        self.per_ray = self.thin = None
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
         if generator is None:
-            packed = self._march(rays, near, far, torch.zeros_like(near), self.occupied)
+            found, packed = self._look(rays, density, near, far, torch.zeros_like(near), self.occupied)
             # A picture must not depend on how its rays are split into calls: only training uses the mean to drop steps.
-            return Samples(*keep_visible(self._thickness(density, rays, packed), packed, self.early_stop_eps, 0.0))
+            return Samples(*keep_visible(found, packed, self.early_stop_eps, 0.0))
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.occupied if self.look_everywhere else self.lit
         rooms = [None, None] if self.per_ray is None else [math.ceil(ROOM * many * len(rays)) for many in self.per_ray]
-        packed = self._march(rays, near, far, shift, cells, rooms[0])
-        found = self._thickness(density, rays, packed)
-        fog = found.mean().mul(0.5).clamp_max(-math.log1p(-self.alpha_thre)) if len(found) else 0.0
-        kept = keep_visible(found, packed, self.early_stop_eps, fog, rooms[1])
+        found, packed = self._look(rays, density, near, far, shift, cells, rooms[0])
+        if self.thin is None:
+            mean = (self.thickness * self.lit).sum() / self.lit.sum()
+            self.thin = mean.mul(0.5).clamp_max(-math.log1p(-self.alpha_thre))
+        kept = keep_visible(found, packed, self.early_stop_eps, self.thin, rooms[1])
         places = Samples(*kept).positions(rays)
         mark_cells(self.reached, self.updates, self.bounds, places)
         if rooms[0] is not None:
@@ -129,24 +161,26 @@ class OccupancySampler(Sampler):
             self.per_ray = max(len(found), 1) / len(rays), max(len(kept[0]), 1) / len(rays)
         return Samples(*kept, places=places)
 
-    def _march(
+    @torch.no_grad()
+    def _look(
         self,
         rays: Rays,
+        density: DensityFn,
         near: Float[Tensor, "R"],
         far: Float[Tensor, "R"],
         shift: Float[Tensor, "R"],
         cells: Bool[Tensor, "cells"],
         room: int | None = None,
-    ) -> Packed:
-        return march(
-            rays, self.bounds, near, far, shift, cells, self.samples, self.step_length, room, LOOKED_AT * self.chunk
-        )
+    ) -> tuple[Float[Tensor, "N"], Packed]:
+        """Steps in some cells and the optical thickness of each."""
 
-    @torch.no_grad()
-    def _thickness(self, density: DensityFn, rays: Rays, packed: Packed) -> Float[Tensor, "N"]:
-        """Optical thickness of intervals, from the density at their middle, which mixed precision gives in half precision."""
-        found = [density(part).float() for part in Samples(*packed).positions(rays).split(ASKED * self.chunk)]
-        return (found[0].detach() if len(found) == 1 else torch.cat(found)) * packed[1]
+        def thickness(packed: Packed) -> Float[Tensor, "N"]:
+            """From the density at the steps' middle, which mixed precision gives in half precision."""
+            found = [density(part).float() for part in Samples(*packed).positions(rays).split(ASKED * self.chunk)]
+            return (found[0].detach() if len(found) == 1 else torch.cat(found)) * packed[1]
+
+        given = rays, self.bounds, near, far, shift, cells, self.samples, self.step_length
+        return front_first(*given, thickness, self.early_stop_eps, room, LOOKED_AT * self.chunk)
 
     @torch.no_grad()
     def look_through(self, cameras: Cameras) -> None:
@@ -171,9 +205,22 @@ class OccupancySampler(Sampler):
         return {"occupied": self.occupied}
 
     def import_state(self, state: dict[str, Tensor]) -> None:
+        self._take_size(state["occupied"])
         if state["occupied"].shape != self.occupied.shape:
             raise RuntimeError(f"an occupancy grid of {len(state['occupied'])} cells, not {len(self.occupied)}")
         self.occupied.copy_(state["occupied"])
+
+    def _take_size(self, cells: Tensor) -> None:
+        """Makes room for the cells of another stage of training."""
+        side = round(cells.numel() ** (1 / 3))
+        if self.stated[1] is None and cells.shape == (side**3,) and side % BLOCK == 0:
+            self.refine(side / RESOLUTION)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        occupied = state_dict.get(f"{prefix}occupied")
+        if occupied is not None:
+            self._take_size(occupied)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def restart(self, step: int) -> None:
         self.first_step = step
@@ -207,3 +254,4 @@ class OccupancySampler(Sampler):
         # Without any density there would be no samples, so no gradient, forever: look everywhere again.
         self.occupied = torch.where(occupied.any(), occupied, self.allowed)
         self.lit = self.occupied & (self.reached >= self.updates - self.memory)
+        self.thin = None

@@ -16,6 +16,10 @@ DensityFn = Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N"]]
 """World positions -> density (1 / world unit); all that samplers know of a field."""
 
 
+RAY_SAMPLES = 8
+"""Samples that a ray takes about; most rays take few, or many that need little room."""
+
+
 class Histogram(NamedTuple):
     """Weights of intervals along rays."""
 
@@ -106,6 +110,11 @@ class Sampler(InBounds):
     """Samples that a device renders at a time; samplers work on multiples of it."""
 
     @property
+    def rays_at_once(self) -> int:
+        """Rays to sample together without gradient."""
+        return max(1, self.chunk // RAY_SAMPLES)
+
+    @property
     def groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups of what is learned at a rate of its own, see `System.learned`."""
         return []
@@ -130,6 +139,9 @@ class Sampler(InBounds):
 
     def look_through(self, cameras: Cameras) -> None:
         """Called before training with the photos' cameras, for samplers that skip what no camera sees."""
+
+    def refine(self, finer: float) -> None:
+        """Called when the field is `finer` than usual, see `Field.finer`, for samplers whose steps follow it."""
 
     def restart(self, step: int) -> None:
         """Called when training starts again at a step, with a fresh field."""

@@ -6,7 +6,7 @@ from nerf_lightning.sampler.proposal import ProposalSampler
 from nerf_lightning.sampler.samples import Sampler
 
 
-def suited_sampler(bounds: Bounds, finer: float = 1.0) -> Sampler:
+def suited_sampler(bounds: Bounds) -> Sampler:
     """Proposals where every ray meets something, as before a background; where most of the space is empty, an occupancy grid,
-    which skips it and takes more steps through a field that is `finer` than usual."""
-    return ProposalSampler(bounds) if bounds.unbounded else OccupancySampler(bounds, finer=finer)
+    which skips it."""
+    return ProposalSampler(bounds) if bounds.unbounded else OccupancySampler(bounds)

@@ -24,8 +24,6 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 
 MIGHT, DRAWS = 0.5, 4
 """Share of what corrections have to explain from which on this many draws of pixels decide, by their mean."""
-RAYS = 8
-"""Rays sampled at once: one for this many samples of `chunk`."""
 
 
 class NeRF3D(System):
@@ -68,6 +66,7 @@ class NeRF3D(System):
         super().warm_start_from(smaller)
         assert isinstance(smaller, NeRF3D)  # checked by the field
         self.sampler.warm_start_from(smaller.sampler)
+        self.sampler.refine(self.field.finer)
 
     @property
     def data(self) -> RayDataModule:
@@ -75,8 +74,15 @@ class NeRF3D(System):
         return self.trainer.datamodule  # type: ignore[attr-defined]
 
     def on_fit_start(self) -> None:
-        self.sampler.look_through(self.data.scene.train.cameras)
-        self.data.plain, self.data.finer = self.renderer.prices_plain, self.field.finer
+        if self.trainer.ckpt_path is None:  # what is resumed has looked already
+            self.sampler.look_through(self.data.scene.train.cameras)
+        self.data.plain = self.renderer.prices_plain
+        self.follow_field()
+
+    def follow_field(self) -> None:
+        """Steps along rays and samples a step for a field as fine as it is now."""
+        self.sampler.refine(self.field.finer)
+        self.data.finer = self.field.finer
 
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
@@ -88,17 +94,25 @@ class NeRF3D(System):
             for group, factor in zip(ours, factors, strict=True):
                 group["lr"] = group["initial_lr"] * factor * self.rate
         self.renderer.fade(self.progress)
-        ripe = self.progress
-        if self.corrections is not None:
-            ripe = self.corrections.ripeness(ripe, self.field.grown_after)
-        replaced = self.field.grow(ripe)
+        replaced = self.field.grow(self.ripeness(self.global_step))
         if replaced:
+            self.follow_field()
             optimizer = self.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one
             for parameter in replaced:
                 optimizer.state.pop(parameter, None)
             if self.backend is not None:
                 self.rehearse(batch)
+
+    def ripeness(self, step: int) -> float:
+        """The share of the budget by which the field is to grow: behind `progress` where it has not taken the steps that its
+        sizes need, or where corrections are still coming."""
+        ripe = self.progress
+        if self.corrections is not None:
+            ripe = self.corrections.ripeness(ripe, self.field.grown_after)
+        if step < self.field.growing_steps:
+            ripe = min(ripe, self.field.grown_after * step / self.field.growing_steps)
+        return ripe
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if self.corrections is not None:
@@ -193,7 +207,7 @@ class NeRF3D(System):
     @property
     def chunk_rays(self) -> int:
         """Rays sampled together without gradient."""
-        return max(1, self.chunk // RAYS)
+        return self.sampler.rays_at_once
 
     @torch.no_grad()
     def render(

@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import cell_index, march, use_kernels
+from nerf_lightning.kernels.march import Walk
 from nerf_lightning.sampler import Samples
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
@@ -192,7 +193,7 @@ VARIANTS = {
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("resolution", [1, 6, 16])
+@pytest.mark.parametrize("resolution", [1, 6, 60])
 @pytest.mark.parametrize("samples", [1, 100])
 def test_the_very_samples_of_the_reference_are_kept_with_any_number_of_threads(
     variant: str, resolution: int, samples: int, box: Bounds
@@ -225,6 +226,28 @@ def test_the_very_samples_are_kept_whatever_the_unit_of_length(factor, unbounded
         use_kernels("auto")
         actual = marched(rays, bounds, grid, 100, jittered=True)
         assert torch.equal(actual.t, expected.t) and torch.equal(actual.offsets, expected.offsets)
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_rays_that_go_some_steps_at_a_time_take_the_same_steps(unbounded: bool, box: Bounds):
+    bounds = replace(box, unbounded=unbounded)
+    rays, grid = many_rays(bounds), torch.rand(16**3) < 0.2
+    whole = marched(rays, bounds, grid, 100, jittered=True)
+    near, far = bounds.near_far(rays)
+    shift, step = (
+        torch.rand(near.shape, generator=torch.Generator().manual_seed(3)),
+        2 * float(box.half_size.norm()) / 100,
+    )
+    walk = Walk(rays, bounds, near, far, shift, grid, 100, step)
+    going, parts = torch.arange(len(rays)), []
+    while len(going):
+        parts.append(walk.on(going, 3))
+        assert set(parts[-1][2].tolist()) <= set(going.tolist()) and parts[-1][3].diff().max() <= 3
+        going = going[parts[-1][3].diff() == 3]
+    t, dt, ray = (torch.cat([part[i] for part in parts]) for i in range(3))
+    order = torch.argsort(ray, stable=True)
+    assert torch.equal(t[order], whole.t) and torch.equal(dt[order], whole.dt) and torch.equal(ray[order], whole.ray)
+    assert len(parts) > 3
 
 
 def test_steps_may_be_longer_or_shorter_than_the_diagonal_asks(box: Bounds):

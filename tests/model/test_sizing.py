@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerf_lightning.cameras import Bounds, bounds
+from nerf_lightning.cameras import Bounds, Cameras, bounds
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, HashGrid2DField, HashGridField, PictureMLP, TensoRFField, VoxelField
+from nerf_lightning.model import tensorf as planes
 from nerf_lightning.model.tensorf import FINEST
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.sampler import OccupancySampler
@@ -90,26 +91,41 @@ def test_a_run_folder_knows_the_size_without_its_photos(tmp_path: Path, capsys: 
     assert isinstance(field, TensoRFField) and field.resolutions[-1] < 16
 
 
-def test_a_run_on_large_photos_trains_a_finer_field_and_opens_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_run_on_large_photos_trains_a_finer_field_resumes_and_opens_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(bounds, "USUAL_WIDTH", 4)  # so that small photos count as large
+    monkeypatch.setattr(planes, "SETTLED", 2)
     scene = tmp_path / "scene.npz"
     save_npz(toy(MARBLE, size=24, views=5, held_out=1), scene)
     given = ["dataset=photos", f"dataset.path={scene}", "recipe=tensorf_medium", "model.coarsest=8", "model.size=fixed"]
-    given += [
-        "model.width=8",
-        "dataset.samples=500",
-        "budget.steps=4",
-        "device=cpu",
-        "callbacks.orbit=null",
-        "callbacks.snapshots.steps=[]",
-        "~logger",
-    ]
-    told: list[float] = []
-    monkeypatch.setattr(RayDataModule, "note_samples", lambda data, _: told.append(data.finer))
-    train(composed(given, tmp_path / "run"), folder=tmp_path / "run")
-    found = load_run(tmp_path / "run").system
+    given += ["model.width=8", "model.stages=3", "dataset.samples=500", "device=cpu", "callbacks.orbit=null"]
+    given += ["callbacks.snapshots.steps=[]", "~logger", "callbacks.checkpoints.every_seconds=1e-6"]
+    cfg, told = composed([*given, "budget.steps=7"], tmp_path / "run"), []
+
+    def note(data: RayDataModule, drawn: int) -> None:
+        told.append(data.finer)
+        if len(told) == 13:
+            raise ZeroDivisionError
+
+    def look(sampler: OccupancySampler, cameras: Cameras) -> None:
+        """What it finds with finer cells is not what coarse cells become."""
+        sampler.allowed.copy_(torch.arange(len(sampler.allowed)) % 2 == 0)
+
+    monkeypatch.setattr(RayDataModule, "note_samples", note)
+    monkeypatch.setattr(OccupancySampler, "look_through", look)
+    train(cfg, folder=tmp_path / "run")
+    with pytest.raises(ZeroDivisionError):
+        train(cfg, folder=tmp_path / "stopped")
+    train(cfg, tmp_path / "stopped" / "checkpoints" / "last.ckpt", tmp_path / "resumed")
+    found, resumed = (load_run(tmp_path / name).system for name in ("run", "resumed"))
+    assert all(
+        torch.equal(a, b) for a, b in zip(found.state_dict().values(), resumed.state_dict().values(), strict=True)
+    )
     assert isinstance(found, NeRF3D) and isinstance(found.sampler, OccupancySampler)
+    assert found.sampler.allowed.float().mean() > 0.8
+    del told[7:]
     finer = found.field.finer
-    assert told == [finer] * 4, "the data aims for more samples"
-    assert finer > 1.1 and found.sampler.samples == round(192 * finer)
+    assert told == [1.0] * 4 + [finer] * 3, "the data aims for more samples once the field is finer"
+    assert finer > 1.1 and found.sampler.samples == 3 * found.sampler.resolution > 192 * 1.1
     assert found.field.resolutions[-1] == round(FINEST * finer)

@@ -6,8 +6,8 @@ import torch
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at
-from nerf_lightning.kernels import cell_index
-from nerf_lightning.sampler import OccupancySampler
+from nerf_lightning.kernels import cell_index, use_kernels
+from nerf_lightning.sampler import OccupancySampler, occupancy
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 
@@ -27,7 +27,11 @@ def toward_the_cube(count: int, seed: int) -> Rays:
 
 
 def test_what_lies_inside_a_solid_is_looked_at_once_in_a_while():
-    """A hard ball: training asks the field in its shell alone, but for the first step after each update."""
+    """A hard ball: training asks the field in its shell alone, but for the first step after each update.
+
+    Where rays do not go front first, which would hide it.
+    """
+    use_kernels("reference")
     sampler = OccupancySampler(CUBE, samples=100, resolution=16, memory=2)
     asked: list[Tensor] = []
 
@@ -207,9 +211,49 @@ def test_few_cameras_allow_what_all_of_them_see():
 
 
 def test_steps_and_cells_follow_the_field_unless_stated():
-    usual, twice = OccupancySampler(CUBE), OccupancySampler(CUBE, finer=2)
+    usual, stated = OccupancySampler(CUBE), OccupancySampler(CUBE, resolution=16)
     assert (usual.samples, usual.resolution) == (192, 64)
-    assert (twice.samples, twice.resolution) == (384, 128)
-    assert twice.step_length == pytest.approx(usual.step_length / 2)
-    stated = OccupancySampler(CUBE, samples=100, resolution=16, finer=2)
-    assert (stated.samples, stated.resolution) == (100, 16)
+    before = usual.step_length
+    for sampler in (usual, stated):
+        sampler.refine(2.0)
+    assert (usual.samples, usual.resolution) == (384, 128) and usual.step_length == pytest.approx(before / 2)
+    assert (stated.samples, stated.resolution) == (48, 16)
+    assert OccupancySampler(CUBE, samples=100).samples == 100
+
+
+def test_finer_cells_hold_what_the_cells_that_they_lie_in_held(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(occupancy, "RESOLUTION", 8)
+    sampler = OccupancySampler(CUBE, samples=100)
+    sampler.thickness.copy_(torch.rand(8**3, generator=seeded()))
+    sampler.occupied = sampler.thickness > 0.5
+    sampler.reached.copy_(torch.arange(8**3))
+    before = {name: getattr(sampler, name).view(8, 8, 8) for name in ("thickness", "occupied", "reached")}
+    sampler.refine(1.5)
+    assert sampler.resolution == 12
+    for name, old in before.items():
+        new = getattr(sampler, name).view(12, 12, 12)
+        for x, y, z in ((0, 0, 0), (1, 5, 11), (4, 7, 10)):
+            held = [(n * 8 // 12, ((n + 1) * 8 - 1) // 12) for n in (x, y, z)]
+            expected = max(float(old[i, j, k]) for i in held[0] for j in held[1] for k in held[2])
+            assert float(new[x, y, z]) == expected, name
+    monkeypatch.setattr(sampler, "stated", (None, None))
+    sampler.refine(3.0)
+    assert sampler.resolution == 24 and sampler.samples == 72
+    assert sampler.thickness.max() == pytest.approx(before["thickness"].max() * 100 / 72), "for a step as long as now"
+
+
+def test_a_state_of_any_stage_loads_into_any_other():
+    early, late = OccupancySampler(CUBE), OccupancySampler(CUBE)
+    late.refine(1.25)
+    late.occupied = torch.rand(80**3) < 0.5
+    whole, least = OccupancySampler(CUBE), OccupancySampler(CUBE)
+    whole.load_state_dict(late.state_dict())
+    least.import_state(late.export_state())
+    for loaded in (whole, least):
+        assert torch.equal(loaded.occupied, late.occupied) and loaded.samples == late.samples == 240
+    whole.load_state_dict(early.state_dict())
+    assert whole.samples == 192 and len(whole.thickness) == 64**3
+    with pytest.raises(RuntimeError, match="cells"):
+        OccupancySampler(CUBE, resolution=16).import_state(late.export_state())
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        OccupancySampler(CUBE, resolution=16).load_state_dict(late.state_dict())

@@ -199,7 +199,8 @@ def test_a_system_renders_as_much_at_once_as_its_device_takes(tmp_path: Path):
     cfg, data = composed([], tmp_path), RayDataModule(toy(MARBLE, size=4, views=3, held_out=1))
     assert build_system(cfg, frame_of(data)).chunk == 32768
     system = build_system(cfg, frame_of(data), torch.device("cuda"))
-    assert (system.chunk, system.chunk_rays) == (524288, 65536)
+    assert system.chunk == system.sampler.chunk == 524288
+    assert build_system(composed(["sampler=uniform"], tmp_path), frame_of(data)).chunk_rays == 4096
     flat = build_system(composed(["+experiment=smoke_2d", "limits.chunk=5"], tmp_path), PictureFrame(8, 8))
     assert isinstance(flat, NeRF2D) and flat.chunk == 5
 

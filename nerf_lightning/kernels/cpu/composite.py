@@ -91,3 +91,36 @@ def gather(keep, offsets, kept_offsets, t, dt, out_t, out_dt, out_ray, workers):
                 if keep[n]:
                     out_t[to], out_dt[to], out_ray[to] = t[n], dt[n], ray
                     to += 1
+
+
+@kernel
+def absorb(thickness, offsets, which, furthest, most, optical, going, workers):
+    """Adds up in `optical` [R] what some rays have met, and says which of these go on [A].
+
+    Args:
+        which: [A], the rays.
+        furthest: optical thickness behind which light does not reach.
+        most: a ray with fewer new samples has no more.
+    """
+    rays = len(which)
+    for worker in prange(workers):
+        for n in range(rays * worker // workers, rays * (worker + 1) // workers):
+            met = optical[which[n]]
+            for m in range(offsets[n], offsets[n + 1]):
+                met += thickness[m]
+            optical[which[n]] = met
+            going[n] = offsets[n + 1] - offsets[n] == most and not met > furthest
+
+
+@kernel
+def append(which, offsets, thickness, t, dt, at, out_thickness, out_t, out_dt, out_ray, workers):
+    """Writes some rays' [A] samples to where these rays' next ones belong, at [R], which moves on."""
+    rays = len(which)
+    for worker in prange(workers):
+        for n in range(rays * worker // workers, rays * (worker + 1) // workers):
+            ray = which[n]
+            to = at[ray]
+            for m in range(offsets[n], offsets[n + 1]):
+                out_thickness[to], out_t[to], out_dt[to], out_ray[to] = thickness[m], t[m], dt[m], ray
+                to += 1
+            at[ray] = to

@@ -3,9 +3,12 @@
 Distances, positions and cells are rounded exactly as the torch reference rounds them, so both keep the same samples.
 """
 
-from numba import float32, int32, prange
+from numba import float32, int32, prange, uint8
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
+
+FAR = 8
+"""Most blocks that a leap looks ahead."""
 
 
 @inner
@@ -83,37 +86,43 @@ def flat_cell(u, v, w, resolution):
     return (cell(u, resolution) * resolution + cell(v, resolution)) * resolution + cell(w, resolution)
 
 
-@inner
-def steps_to_leave(origin, direction, centre, half, cells, u, v, w, t, step):
-    """How many steps certainly stay within the current cell of a cells^3 grid over the box (0 if unsure)."""
-    nearest = float32(1e30)
-    for axis in range(3):
-        here = u if axis == 0 else (v if axis == 1 else w)
-        d = direction[axis]
-        if d == float32(0):
-            continue
-        low = float32(cell(here, cells))
-        wall = (low + (float32(1) if d > 0 else float32(0))) / float32(cells)
-        at = ((wall - float32(0.5)) * float32(2) * half[axis] + centre[axis] - origin[axis]) / d
-        nearest = min(nearest, at)
-    return max(int((nearest - t) / step) - 1, 0)
+@inner(inline="always")
+def crossing(origin, direction, middle, half, cells):
+    """Of a ray along one axis: where it starts, in cells of a grid over the box, and how far it goes for one of them."""
+    scale = float32(cells) / (float32(2) * half)
+    speed = direction * scale
+    return (origin - (middle - half)) * scale, (float32(1) / speed if speed != float32(0) else float32(1e30))
+
+
+@inner(inline="always")
+def when_at_wall(u, cells, clear, axis):
+    """Distance at which a ray leaves the cells nearer than the `clear`-th from that at u, along one axis; see `crossing`."""
+    start, a_cell = axis
+    wall = cell(u, cells) + (clear if a_cell > float32(0) else 1 - clear)
+    return (float32(wall) - start) * a_cell
 
 
 @kernel
-def walk(origins, directions, near, far, inside, shift, occupied, resolution, blocks, cells, centre, half, unbounded, samples,
-         step, found, counts, workers):  # fmt: skip
-    """Writes which intervals of each ray to keep into found [R, samples + 1], and how many into counts [R].
+def walk(which, origins, directions, near, far, inside, shift, occupied, resolution, blocks, cells, centre, half, unbounded,
+         samples, step, most, after, found, counts, workers):  # fmt: skip
+    """Writes the next intervals to keep of some rays [A] into found [A, most], and how many into counts [A].
 
     Args:
+        which: [A], the rays.
         occupied: [resolution^3], row by row.
-        blocks: [cells^3], whether any cell of a block is occupied: empty blocks are crossed in one leap.
+        blocks: [cells^3], from `clear`: empty ones are crossed in leaps.
+        after: [R], where each ray goes on: at this interval. Moved on.
     """
-    rays = len(near)
+    rays = len(which)
     for worker in prange(workers):
-        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
-            span, k, kept = span_of(near, far, inside, ray, half, unbounded), 0, 0
-            start = edge(0, shift[ray], span, step, samples, unbounded)
-            while k <= samples:
+        for n in range(rays * worker // workers, rays * (worker + 1) // workers):
+            ray = which[n]
+            span, k, kept = span_of(near, far, inside, ray, half, unbounded), int(after[ray]), 0
+            across = crossing(origins[ray, 0], directions[ray, 0], centre[0], half[0], cells)
+            down = crossing(origins[ray, 1], directions[ray, 1], centre[1], half[1], cells)
+            deep = crossing(origins[ray, 2], directions[ray, 2], centre[2], half[2], cells)
+            start = edge(k, shift[ray], span, step, samples, unbounded)
+            while k <= samples and kept < most:
                 end = edge(k + 1, shift[ray], span, step, samples, unbounded)
                 if not end > start:
                     if start >= span[1]:
@@ -123,37 +132,40 @@ def walk(origins, directions, near, far, inside, shift, occupied, resolution, bl
                 t = (start + end) / float32(2)
                 x, y = origins[ray, 0] + t * directions[ray, 0], origins[ray, 1] + t * directions[ray, 1]
                 u, v, w = to_unit(x, y, origins[ray, 2] + t * directions[ray, 2], centre, half, unbounded)
-                if not blocks[flat_cell(u, v, w, cells)]:
-                    leap = 0
+                clear = int(blocks[flat_cell(u, v, w, cells)])
+                if clear > 0:
                     if not unbounded:
-                        leap = steps_to_leave(origins[ray], directions[ray], centre, half, cells, u, v, w, t, step)
-                    if leap > 0:
-                        k += leap
-                        end = edge(k + 1, shift[ray], span, step, samples, unbounded)
+                        first = min(when_at_wall(u, cells, clear, across), when_at_wall(v, cells, clear, down))
+                        first = min(first, when_at_wall(w, cells, clear, deep))
+                        leap = max(int((first - t) / step) - 1, 0)  # one less, as it is rounded
+                        if leap > 0:
+                            k += leap
+                            end = edge(k + 1, shift[ray], span, step, samples, unbounded)
                 elif occupied[flat_cell(u, v, w, resolution)]:
-                    found[ray, kept] = k
+                    found[n, kept] = k
                     kept += 1
                 k, start = k + 1, end
-            counts[ray] = kept
+            after[ray], counts[n] = k, kept
 
 
 @kernel
-def pack(near, far, inside, shift, half, unbounded, samples, step, found, offsets, t, dt, ray_of, workers):
+def pack(which, near, far, inside, shift, half, unbounded, samples, step, found, offsets, t, dt, ray_of, workers):
     """Distances and lengths of the intervals that `walk` found, one ray after the other."""
-    rays = len(near)
+    rays = len(which)
     for worker in prange(workers):
-        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
+        for n in range(rays * worker // workers, rays * (worker + 1) // workers):
+            ray = which[n]
             span = span_of(near, far, inside, ray, half, unbounded)
-            for n in range(offsets[ray], offsets[ray + 1]):
-                k = found[ray, n - offsets[ray]]
+            for m in range(offsets[n], offsets[n + 1]):
+                k = found[n, m - offsets[n]]
                 start = edge(k, shift[ray], span, step, samples, unbounded)
                 end = edge(k + 1, shift[ray], span, step, samples, unbounded)
-                t[n], dt[n], ray_of[n] = (start + end) / float32(2), end - start, ray
+                t[m], dt[m], ray_of[m] = (start + end) / float32(2), end - start, ray
 
 
 @kernel
 def coarsen(rows, resolution, size, blocks, workers):
-    """blocks [cells^3]: whether any of a block's size^3 cells is occupied.
+    """blocks [cells^3]: 0 where any of a block's size^3 cells is occupied, else `FAR`.
 
     Args:
         rows: [resolution^2 * cells]: the cells of a block's row as one number, 0 where none is occupied.
@@ -163,12 +175,46 @@ def coarsen(rows, resolution, size, blocks, workers):
         for i in range(cells * worker // workers, cells * (worker + 1) // workers):
             for j in range(cells):
                 block = (i * cells + j) * cells
-                blocks[block : block + cells] = False
+                blocks[block : block + cells] = uint8(FAR)
                 for x in range(i * size, (i + 1) * size):
                     for y in range(j * size, (j + 1) * size):
                         row = (x * resolution + y) * cells
                         for k in range(cells):
-                            blocks[block + k] |= rows[row + k] != 0
+                            blocks[block + k] *= uint8(rows[row + k] == 0)
+
+
+@kernel
+def clear(blocks, between, workers):
+    """Turns 0 and `FAR` in blocks [n, n, n] into how many blocks away the nearest 0 is, over corners too, at most `FAR`.
+
+    Args:
+        between: [n, n, n], overwritten.
+    """
+    n = len(blocks)
+    for worker in prange(workers):
+        for i in range(n * worker // workers, n * (worker + 1) // workers):
+            for j in range(n):
+                row = blocks[i, j]
+                for k in range(1, n):
+                    row[k] = min(row[k], uint8(row[k - 1] + uint8(1)))
+                for k in range(n - 2, -1, -1):
+                    row[k] = min(row[k], uint8(row[k + 1] + uint8(1)))
+            for j in range(n):
+                nearest_in_rows(blocks[i], j, between[i, j])
+    for worker in prange(workers):
+        for i in range(n * worker // workers, n * (worker + 1) // workers):
+            for j in range(n):
+                nearest_in_rows(between[:, j], i, blocks[i, j])
+
+
+@inner
+def nearest_in_rows(rows, here, out):
+    """out [n]: the least, over the rows around `here`, of what they hold, or how far away they are if that is more."""
+    out[:] = rows[here]
+    for other in range(max(here - FAR + 1, 0), min(here + FAR, len(rows))):
+        away, row = uint8(abs(other - here)), rows[other]
+        for k in range(len(out)):
+            out[k] = min(out[k], max(away, row[k]))
 
 
 @kernel
