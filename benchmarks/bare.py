@@ -28,6 +28,8 @@ def bare_step(
     loss, system.stats = system.loss(batch, step_generator(system.seed, Stream.STEP, step, system.device), step)
     loss.backward()
     optimizer.step()
+    assert system.stats.squares is not None  # a NeRF3D's
+    data.note_errors(system.stats.squares, system.stats.whole)
     if system.stats.counted:
         data.note_samples(system.stats.samples)
     synchronize(system.device)

@@ -55,7 +55,7 @@ def unbind(system: NeRF3D) -> None:
         part._bounds = replace(part._bounds, unbounded=True)
 
 
-MOST = {"tensorf": 250, "hashgrid": 250, "voxels": 250, "mlp": 220}
+MOST = {"tensorf": 255, "hashgrid": 255, "voxels": 255, "mlp": 225}
 """Operations a step between two updates of the sampler: forward, backward, optimiser. Each takes 5 to 10 microseconds."""
 
 

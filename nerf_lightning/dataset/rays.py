@@ -1,12 +1,14 @@
-"""RayDataModule: rays and their pixels, drawn uniformly from all training photos."""
+"""RayDataModule: rays and their pixels, drawn from all training photos."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
+from nerf_lightning.dataset.focus import Focus
 from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
@@ -15,6 +17,8 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 
 RAYS, SAMPLES = 1024, 16384
 """Rays of the first step, and the samples per step that the number of rays then adapts to."""
+FOCUS = 0.5
+"""Share of the rays that are drawn by the error around them."""
 SOME_PIXELS = 8192
 """Pixels drawn to measure the error of one plain colour."""
 NEIGHBOUR = 0.0125
@@ -34,10 +38,12 @@ class RayBatch:
     """The training photo that each belongs to; None where that is not asked for."""
     plain: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
     """How plain the photo is around each, see `plainness`; None where that is not asked for."""
+    weights: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
+    """How much each counts, see `Focus`; None where all count the same."""
 
     def to(self, device: torch.device | str) -> "RayBatch":
-        views, plain = (None if x is None else x.to(device) for x in (self.views, self.plain))
-        return RayBatch(self.rays.to(device), self.pixels.to(device), views=views, plain=plain)
+        views, plain, weights = (None if x is None else x.to(device) for x in (self.views, self.plain, self.weights))
+        return RayBatch(self.rays.to(device), self.pixels.to(device), views=views, plain=plain, weights=weights)
 
 
 @dataclass(frozen=True)
@@ -104,8 +110,16 @@ def draw_rays(
     flat = torch.randint(whole, (count,), generator=generator, device=views.pixels.device)[part]
     if views.known is not None:
         flat = views.known.find(flat)
-    rays, view = rays_through(views, flat)
-    return RayBatch(rays, views.pixels[flat], views=view, plain=plainness(views, flat, view) if plain else None)
+    return batch_of(views, flat, plain)
+
+
+def batch_of(
+    views: Views, places: Int[Tensor, "R"], plain: bool = False, weights: Float[Tensor, "R"] | None = None
+) -> RayBatch:
+    """Rays and pixels at these places in `Views.pixels`; `plain` and `weights` as in `RayBatch`."""
+    rays, view = rays_through(views, places)
+    shown = plainness(views, places, view) if plain else None
+    return RayBatch(rays, views.pixels[places], views=view, plain=shown, weights=weights)
 
 
 class RayDataModule(StepDataModule[Views]):
@@ -116,15 +130,20 @@ class RayDataModule(StepDataModule[Views]):
         rays: rays a step, which several processes share; with `samples`, only of the first.
         samples: aim for this many samples a step by adapting the number of rays; None keeps `rays`.
         seed: of the draw.
+        focus: share of the rays that are drawn by the error of what is around them, see `Focus`; 0 draws all alike.
 
     Raises:
-        InputError: for less than one ray or sample a step.
+        InputError: for less than one ray or sample a step, or a focus outside [0, 1).
     """
 
     MOST_RAYS = 32  # times the rays of the first step
 
-    def __init__(self, scene: Scene, rays: int = RAYS, samples: int | None = SAMPLES, seed: int = 0):
+    def __init__(
+        self, scene: Scene, rays: int = RAYS, samples: int | None = SAMPLES, seed: int = 0, focus: float = FOCUS
+    ):
         super().__init__(seed)
+        if not 0 <= focus < 1:
+            raise InputError("dataset.focus", "", str(focus), "at least 0, below 1")
         if rays < 1:
             raise InputError("dataset.rays", "", str(rays), "at least 1")
         if samples is not None and samples < 1:
@@ -133,6 +152,10 @@ class RayDataModule(StepDataModule[Views]):
         self.rays = self.first_rays = rays
         self.samples = samples
         self.batch = 1
+        self.focus = focus
+        self._focus: Focus | None = None
+        self._focus_state: dict[str, Tensor] = {}
+        """What `_focus` goes on from, when photos are drawn from for the first time."""
         self.plain = False
         """Whether batches say how plain photos are, see `RayBatch.plain`."""
         self.finer = 1.0
@@ -157,13 +180,28 @@ class RayDataModule(StepDataModule[Views]):
         limit = self.first_rays * self.MOST_RAYS
         self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
 
+    def note_errors(self, errors: Float[Tensor, "R"], counted: Bool[Tensor, "R"] | None = None) -> None:
+        """Called after each step with the squared errors of all its rays, those of other processes too, and which of them were
+        measured: later steps look more where they are large."""
+        if self._focus is not None:
+            self._focus.note(errors, counted)
+
     def start_again(self) -> None:
-        """Before another training on the same photos: back to the number of rays of a first step."""
+        """Before another training on the same photos: nothing is known of errors, and a first step's number of rays."""
         self.rays = self.first_rays
+        self._focus, self._focus_state = None, {}
 
     def draw_from(self, photos: Views, step: int, part: slice) -> RayBatch:
         generator = step_generator(self.seed, Stream.BATCH, step, photos.pixels.device)
-        return draw_rays(photos, self.rays, generator, part, self.plain)
+        if self.focus == 0:
+            return draw_rays(photos, self.rays, generator, part, self.plain)
+        if self._focus is None or self._focus.views is not photos:
+            self._focus_state = self._focus_state if self._focus is None else self._focus.state_dict()
+            self._focus = Focus(photos, self.focus)
+            if self._focus_state:
+                self._focus.load_state_dict(self._focus_state)
+        places, weights = self._focus.draw(self.rays, generator)
+        return batch_of(photos, places[part], self.plain, weights[part])
 
     def some_pixels(self) -> RayBatch:
         """Training pixels to measure the error of one plain colour on."""
@@ -179,9 +217,11 @@ class RayDataModule(StepDataModule[Views]):
         known = None if views.known is None else views.mask_of(view).flatten()
         return ViewBatch(views.cameras.view_rays(view), views.image(view).flatten(0, 1), height, width, known)
 
-    def state_dict(self) -> dict[str, int]:
-        return {"rays": self.rays, "batch": self.batch}
+    def state_dict(self) -> dict[str, Any]:
+        focus = self._focus_state if self._focus is None else self._focus.state_dict()
+        return {"rays": self.rays, "batch": self.batch, "focus": focus}
 
-    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._focus, self._focus_state = None, state_dict.get("focus", {})
         before = state_dict.get("batch", 1)  # perhaps of another device
         self.rays = max(1, state_dict["rays"] * self.batch // before)

@@ -16,7 +16,7 @@ from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PixelDataModule
-from nerf_lightning.dataset.rays import RAYS, SAMPLES, RayDataModule
+from nerf_lightning.dataset.rays import FOCUS, RAYS, SAMPLES, RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
 from nerf_lightning.utils.files import atomic
@@ -41,10 +41,11 @@ def from_photos(
     rays: Count = RAYS,
     samples: Count | None = SAMPLES,
     seed: int = 0,
+    focus: float = FOCUS,
 ) -> RayDataModule:
     """Posed photos in any supported format, see `open_scene` and `RayDataModule`."""
     scene = open_scene(path, name, resize, holdout, near, far, masked, invert_masks, undistort)
-    return RayDataModule(scene, rays, samples, seed)
+    return RayDataModule(scene, rays, samples, seed, focus)
 
 
 def from_bricks(
@@ -54,9 +55,10 @@ def from_bricks(
     rays: Count = RAYS,
     samples: Count | None = SAMPLES,
     seed: int = 0,
+    focus: float = FOCUS,
 ) -> RayDataModule:
     """The built-in scene, see `bricks` and `RayDataModule`."""
-    return RayDataModule(bricks(size, train_views, val_views), rays, samples, seed)
+    return RayDataModule(bricks(size, train_views, val_views), rays, samples, seed, focus)
 
 
 def from_download(
@@ -70,6 +72,7 @@ def from_download(
     rays: Count = RAYS,
     samples: Count | None = SAMPLES,
     seed: int = 0,
+    focus: float = FOCUS,
 ) -> RayDataModule:
     """A published scene: from `path` if given, else `folder`, else downloaded into `folder`, else the built-in scene.
 
@@ -79,7 +82,7 @@ def from_download(
         download: whether to use the network.
         path: a local copy, which must exist.
         resize, near, far: see `open_scene`.
-        rays, samples, seed: see `RayDataModule`.
+        rays, samples, seed, focus: see `RayDataModule`.
     """
     if path is None:
         local = Path(folder) / url.rsplit("/", 1)[-1]
@@ -92,9 +95,9 @@ def from_download(
                 problem += f" and {url} could not be fetched ({error})"
         if problem:
             log.warning("%s: the built-in scene 'bricks' stands in for it", problem)
-            return from_bricks(size=resize or 200, rays=rays, samples=samples, seed=seed)
+            return from_bricks(size=resize or 200, rays=rays, samples=samples, seed=seed, focus=focus)
         path = str(local)
-    return from_photos(path, resize=resize, near=near, far=far, rays=rays, samples=samples, seed=seed)
+    return from_photos(path, resize=resize, near=near, far=far, rays=rays, samples=samples, seed=seed, focus=focus)
 
 
 def _download(url: str, target: Path) -> None:

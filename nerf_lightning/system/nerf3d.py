@@ -184,9 +184,16 @@ class NeRF3D(System):
             rgb = corrections.lit(rgb, rendered.opacity, backgrounds, batch.rays, batch.views, truth)
         # A ray without all of its samples must not be learned from.
         rgb = rgb if samples.whole is None else torch.where(samples.whole[:, None], rgb, truth)
-        loss = torch.nn.functional.mse_loss(rgb, truth)
+        squares = (rgb - truth).square().mean(1)
+        loss = (squares if batch.weights is None else squares * batch.weights).mean()
         stats = StepStats(
-            loss.detach(), len(batch.rays), len(samples), samples.whole is None, rendered.opacity.detach()
+            loss.detach(),
+            len(batch.rays),
+            len(samples),
+            samples.whole is None,
+            rendered.opacity.detach(),
+            squares.detach(),
+            samples.whole,
         )
         learned = None if rendered.weights is None else self.sampler.loss(samples, rendered.weights)
         for penalty in (self.field.penalty(), rendered.penalty, learned):
@@ -196,6 +203,7 @@ class NeRF3D(System):
     def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
         generator = step_generator(self.seed, Stream.STEP, self.global_step, self.device)
         loss, self.stats = self.loss(batch, generator, self.global_step)
+        self.note_errors()
         if not self.stats.counted:
             return loss
         drawn = self.stats.samples
@@ -203,6 +211,21 @@ class NeRF3D(System):
             drawn = int(self.trainer.strategy.reduce(torch.tensor(drawn, device=self.device), reduce_op="sum"))
         self.data.note_samples(drawn)
         return loss
+
+    def note_errors(self) -> None:
+        """Tells the data how wrong each ray of the last step was: of all processes, since each draws for all."""
+        errors, counted = self.stats.squares, self.stats.whole
+        assert errors is not None  # a step of this system
+        world, rays = self.trainer.world_size, self.data.rays
+        if world > 1:
+            both = torch.stack([errors, torch.ones_like(errors) if counted is None else counted.float()])
+            padded = torch.nn.functional.pad(both, (0, -(-rays // world) - len(errors)))
+            gathered = self.all_gather(padded)
+            assert isinstance(gathered, Tensor)  # as what was given
+            # Process p has the rays p, p + world, p + 2 world, ...
+            errors, counted = gathered.permute(1, 2, 0).flatten(1)[:, :rays]
+            counted = counted > 0
+        self.data.note_errors(errors, counted)
 
     @property
     def chunk_rays(self) -> int:

@@ -37,6 +37,10 @@ class StepStats:
     """Whether `samples` is their count; otherwise it is the room for them."""
     opacity: Float[Tensor, "R"] | None = None
     """Of each ray, on the device: 0 is empty, 1 is opaque."""
+    squares: Float[Tensor, "R"] | None = None
+    """Squared error of each ray, on the device."""
+    whole: Bool[Tensor, "R"] | None = None
+    """Which rays have all their samples; None for all."""
 
 
 @dataclass(frozen=True)

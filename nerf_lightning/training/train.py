@@ -83,7 +83,7 @@ def train(
     elif scene is None:
         data = build_data(cfg)
     else:
-        data = RayDataModule(scene, cfg.dataset.rays, cfg.dataset.samples, cfg.dataset.seed)
+        data = RayDataModule(scene, *(cfg.dataset[key] for key in ("rays", "samples", "seed", "focus")))
     data.enlarge(limits_of(cfg, device).batch)
     doubts = check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []
     for doubt in doubts:

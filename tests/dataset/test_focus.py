@@ -1,0 +1,125 @@
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.dataset import RayDataModule, Views
+from nerf_lightning.dataset.focus import EVERY, SIDE, Focus
+from nerf_lightning.dataset.views import Runs
+from nerf_lightning.errors import InputError
+from nerf_lightning.stability.toys import MARBLE, toy
+
+SIZES = [(40, 20), (16, 16), (7, 33)]
+
+
+def photos(masked: bool = False) -> Views:
+    """Three sizes; each pixel's number is its colour."""
+    sizes = torch.tensor(SIZES)
+    count = int(sizes.prod(1).sum())
+    numbers = torch.arange(count)
+    known = None
+    if masked:  # a third of the pixels in one photo, half of a tile in another
+        known = Runs.of((numbers % 3 > 0) | (numbers > 800) & (numbers < 1000))
+    pixels = torch.stack([numbers // 256, numbers % 256, 0 * numbers], dim=1).to(torch.uint8)
+    return Views(pixels, Cameras(torch.eye(3).repeat(3, 1, 1), torch.eye(4).repeat(3, 1, 1), sizes), known)
+
+
+def seeded(seed: int = 0) -> Generator:
+    return Generator().manual_seed(seed)
+
+
+def taught(views: Views, errors: Tensor, share: float = 0.5, steps: int = 2 * EVERY) -> Focus:
+    """After some steps in which each pixel had its own error."""
+    focus = Focus(views, share)
+    for step in range(steps):
+        places, _ = focus.draw(4000, seeded(step))
+        focus.note(errors[places])
+    return focus
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_weights_make_up_for_the_draw(masked: bool):
+    views = photos(masked)
+    known = views.mask.double()
+    errors = torch.rand(len(known), generator=seeded()) ** 4
+    errors[:200] *= 0.01
+    focus = taught(views, errors)
+    places, weights = focus.draw(400_000, seeded(100))
+    assert (weights[~views.mask[places]] == 0).all() and (weights[views.mask[places]] > 0).all()
+    share = torch.zeros(len(known), dtype=torch.float64).index_add_(0, places, weights.double()) / len(places)
+    torch.testing.assert_close(share.sum(), torch.tensor(1.0, dtype=torch.float64), rtol=0.01, atol=0)
+    for part in (slice(0, 200), slice(200, 800), slice(800, 1056), slice(1056, None)):
+        torch.testing.assert_close(share[part].sum(), known[part].sum() / known.sum(), rtol=0.05, atol=0)
+
+
+def test_pixels_are_drawn_where_the_error_is():
+    views = photos()
+    errors = torch.zeros(len(views.pixels))
+    errors[800:1056] = 0.5  # the second photo, which is one tile
+    places, _ = taught(views, errors).draw(20_000, seeded(100))
+    inside = ((places >= 800) & (places < 1056)).float().mean()
+    assert inside == pytest.approx(0.5 + 0.5 * 256 / len(errors), abs=0.02)
+    places, weights = taught(views, 0 * errors).draw(20_000, seeded(100))
+    assert ((places >= 800) & (places < 1056)).float().mean() == pytest.approx(256 / len(errors), abs=0.02)
+    torch.testing.assert_close(weights, torch.ones_like(weights), rtol=1e-5, atol=0)
+
+
+def test_tiles_hold_their_pixels():
+    focus = Focus(photos(), 0.5)
+    assert focus.known.tolist() == [256, 256, 128, 64, 64, 32, 256, 112, 112, 7]
+    places, _ = focus.draw(50_000, seeded())
+    assert len(places.unique()) == sum(width * height for width, height in SIZES), "each pixel is drawn"
+    left, top, width, height, view = focus._places(focus.drawn)
+    number = places - focus.views.starts[view]
+    column, row = number % focus.views.widths[view], number // focus.views.widths[view]
+    assert ((left <= column) & (column < left + width) & (top <= row) & (row < top + height)).all()
+    assert width.max() == height.max() == SIDE
+
+
+def test_it_goes_on_as_it_was_whatever_the_order_of_errors():
+    views = photos()
+    errors = torch.rand(len(views.pixels), generator=seeded())
+    whole = taught(views, errors, steps=EVERY + 5)
+    other = Focus(views, 0.5)
+    other.load_state_dict(whole.state_dict())
+    for step in range(EVERY):
+        drawn = [focus.draw(300, seeded(step)) for focus in (whole, other)]
+        assert torch.equal(drawn[0][0], drawn[1][0]) and torch.equal(drawn[0][1], drawn[1][1])
+        whole.note(errors[drawn[0][0]])
+        order = torch.randperm(300)
+        other.drawn = other.drawn[order]
+        other.note(errors[drawn[1][0]][order])
+    assert all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), other.state_dict().values(), strict=True))
+
+
+def test_an_error_that_was_not_measured_does_not_count():
+    focus = Focus(photos(), 0.5)
+    focus.draw(100, seeded())
+    focus.note(torch.full((100,), 0.5), torch.arange(100) < 30)
+    assert focus.new_counts.sum() == 30
+    focus.note(torch.full((100,), torch.nan))
+    assert focus.new_sums.sum() == (30 * 0.5 + 100) * 2**30, "what is not a number is looked at"
+
+
+def test_data_looks_where_steps_were_wrong_and_starts_again():
+    scene = toy(MARBLE, size=32, views=4, held_out=1)
+    data = RayDataModule(scene, rays=500, samples=None)
+    first = data.draw(0)
+    for step in range(EVERY):
+        batch = data.draw(step)
+        data.note_errors((batch.views == 1).float())
+    assert (data.draw(EVERY).views == 1).float().mean() > 0.55
+    resumed = RayDataModule(scene, rays=500, samples=None)
+    resumed.load_state_dict(data.state_dict())
+    assert torch.equal(resumed.draw(EVERY).pixels, data.draw(EVERY).pixels)
+    data.start_again()
+    assert torch.equal(data.draw(0).pixels, first.pixels)
+    alike = RayDataModule(scene, rays=500, focus=0)
+    alike.note_errors(torch.ones(500))
+    assert alike.draw(0).weights is None
+
+
+@pytest.mark.parametrize("focus", [-0.1, 1.0])
+def test_a_share_that_leaves_nothing_to_the_others_is_refused(focus: float):
+    with pytest.raises(InputError, match="dataset.focus"):
+        RayDataModule(toy(MARBLE, size=8, views=3, held_out=1), focus=focus)
