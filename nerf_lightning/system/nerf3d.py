@@ -9,6 +9,7 @@ from statistics import fmean
 from typing import Any
 
 import torch
+from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
@@ -101,6 +102,9 @@ class NeRF3D(System):
             assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one
             for parameter in replaced:
                 optimizer.state.pop(parameter, None)
+            if isinstance(self.trainer.strategy, DDPStrategy):  # it has made room for gradients of the old size
+                self.trainer.strategy.model = self
+                self.trainer.strategy.configure_ddp()
             if self.backend is not None:
                 self.rehearse(batch)
 

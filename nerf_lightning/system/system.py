@@ -15,6 +15,7 @@ from torch import Tensor
 from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system.metrics import psnr, ssim
+from nerf_lightning.utils.allocator import give_back_freed_memory
 from nerf_lightning.utils.device import synchronize
 
 MakeOptimizer = Callable[[list[dict[str, Any]]], torch.optim.Optimizer]
@@ -150,6 +151,7 @@ class System(L.LightningModule):
     @torch.no_grad()
     def evaluate(self, view: Any) -> ViewResult:
         """Renders a whole view and measures it."""
+        give_back_freed_memory()
         view = view.to(self.device)
         synchronize(self.device)
         start = time.perf_counter()
@@ -163,6 +165,7 @@ class System(L.LightningModule):
         rgb, truth = image(rgb.clamp(0, 1)), image(self.truth(view))
         depth, opacity, known = (None if x is None else image(x) for x in (depth, opacity, view.known))
         figures = psnr(rgb, truth, known), ssim(rgb, truth, known)
+        give_back_freed_memory()
         return ViewResult(rgb, truth, *figures, seconds, depth, opacity, known)
 
     def evaluate_held_out(self, data: StepDataModule, views: Iterable[int]) -> Iterator[ViewResult]:

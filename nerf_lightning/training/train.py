@@ -29,7 +29,6 @@ from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, S
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
-from nerf_lightning.model import Field
 from nerf_lightning.refine import summary, told
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, load_scene, read_checkpoint, save_config, save_scene
@@ -97,7 +96,7 @@ def train(
     check_background(cfg, data, system)
     results = Results("results.json", cfg.method, cfg.seed, [doubt.text for doubt in doubts])
     trainer = build_trainer(cfg, folder, device, results)
-    check_processes(trainer, system)
+    check_processes(trainer)
     if trainer.is_global_zero:
         save_config(cfg, folder)
         save_scene(data, folder)
@@ -153,23 +152,14 @@ def prepare_process(
     L.seed_everything(seed, verbose=False)
 
 
-def check_processes(trainer: L.Trainer, system: System) -> None:
+def check_processes(trainer: L.Trainer) -> None:
     """Refuses what several processes cannot share.
 
     Raises:
-        InputError: for a field that grows, and for a sweep whose jobs would start further processes.
+        InputError: for a sweep whose jobs would start further processes.
     """
     if trainer.world_size == 1:
         return
-    if isinstance(system, NeRF3D) and type(system.field).grow is not Field.grow:
-        name = type(system.field).__name__
-        raise InputError(
-            "config",
-            "model",
-            f"{name}, which grows",
-            "a field of fixed size for several processes",
-            "choose model=hashgrid",
-        )
     cluster = getattr(trainer.strategy, "cluster_environment", None)
     if HydraConfig.get().mode == RunMode.MULTIRUN and not getattr(cluster, "creates_processes_externally", False):
         expected = "one process a job in a sweep"

@@ -1,4 +1,4 @@
-"""A setting of the C allocator that large tensors on a CPU need."""
+"""What large tensors on a CPU want of the C allocator."""
 
 import ctypes
 
@@ -22,3 +22,12 @@ def keep_freed_memory() -> bool:
     settings = ((_M_MMAP_THRESHOLD, _LARGEST_MMAP_THRESHOLD), (_M_TRIM_THRESHOLD, 1 << 30), (_M_ARENA_MAX, 1))
     taken = [mallopt(setting, value) for setting, value in settings]
     return all(taken)
+
+
+def give_back_freed_memory() -> None:
+    """Returns kept memory to the system, where the C library can: between kinds of work, which need it in other pieces."""
+    try:
+        trim = ctypes.CDLL(None).malloc_trim
+    except (OSError, TypeError, AttributeError):  # as above
+        return
+    trim(0)

@@ -129,14 +129,19 @@ def test_other_launchers(launcher: str, tmp_path: Path):
     assert statuses.count("failed") == 1 and statuses.count("unfinished") == 0
 
 
-def test_two_processes_share_a_run_and_leave_one_folder(inside, tmp_path: Path):
-    options = [
-        "+experiment=picture",
-        "dataset.max_side=32",
-        "budget.steps=100",
-        "trainer.accelerator=cpu",
-        "threads=1",
-    ] + BARE
+SHARED = {
+    "a picture": ["+experiment=picture", "dataset.max_side=32", *BARE],
+    "planes that grow": [
+        *("dataset.size=24", "dataset.train_views=8", "dataset.val_views=1", "dataset.samples=1000", "model=tensorf"),
+        *("model.size=fixed", "model.coarsest=8", "model.finest=16", "model.stages=2", "sampler.resolution=16"),
+        *("callbacks.orbit=null", "callbacks.snapshots.steps=[]"),
+    ],
+}
+
+
+@pytest.mark.parametrize("what", SHARED)
+def test_two_processes_share_a_run_and_leave_one_folder(what: str, inside, tmp_path: Path):
+    options = [*SHARED[what], "budget.steps=100", "trainer.accelerator=cpu", "threads=1"]
     code, out, err = inside(*options, "name=one")
     assert code == 0, err
     done = command(*options, "trainer=ddp", "name=two", cwd=tmp_path)
@@ -149,7 +154,7 @@ def test_two_processes_share_a_run_and_leave_one_folder(inside, tmp_path: Path):
         assert (folder / "checkpoints" / "last.ckpt").stat().st_size > 0
         assert told.count("everything is in") == 1
     one, two = results
-    assert abs(one["psnr"] - two["psnr"]) < 0.2 and one["psnr"] > 15
+    assert abs(one["psnr"] - two["psnr"]) < (0.2 if what == "a picture" else 1.0) and one["psnr"] > 15
     assert (two["steps"], two["status"]) == (100, "finished")
 
 
@@ -160,7 +165,5 @@ def test_a_missing_launcher_says_what_to_install(inside, monkeypatch):
 
 def test_several_processes_refuse_what_they_cannot_share(inside):
     pair = ["trainer=ddp", "trainer.accelerator=cpu"]
-    code, out, err = inside("model=tensorf", "dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", *pair)
-    assert code == 2 and "TensoRFField, which grows" in err and "model=hashgrid" in err
     code, out, err = inside("-m", *SMALL, "seed=0,1", *pair)
     assert code == 1 and err.count("one process a job in a sweep") >= 2
