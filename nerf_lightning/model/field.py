@@ -100,6 +100,10 @@ class Field(InBounds, AnyField):
         """Features and unit directions -> rgb in [0, 1]."""
         raise TypeError(f"{type(self).__name__} must define colour(features, directions)")
 
+    def grows_at(self, progress: float) -> bool:
+        """Whether `grow` would change its size."""
+        return False
+
     def grow(self, progress: float) -> list[torch.nn.Parameter]:
         """Called before each training step with the fraction of the budget done; a field may change its size here.
 

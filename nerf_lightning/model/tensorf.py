@@ -193,6 +193,9 @@ class TensoRFField(Field):
         columns = torch.tensor([*products, *range(3 * has, 3 * has + smaller.terms)])
         widen_all(self.colour_net, smaller.colour_net, columns)
 
+    def grows_at(self, progress: float) -> bool:
+        return self.density_volume.cells < self.resolution_at(progress)
+
     def grow(self, progress: float) -> list[torch.nn.Parameter]:
         """Refines planes and lines to the size that `progress` asks for; they never shrink."""
         wanted = self.resolution_at(progress)

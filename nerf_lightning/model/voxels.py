@@ -148,13 +148,20 @@ class VoxelField(Field):
             return None
         return self.smoothness * roughness(self.log_density, self.vertex, self.index, first, last)
 
+    def stage_at(self, progress: float) -> int:
+        """Number of the size that it should have after this fraction of the budget."""
+        return max(i for i, time in enumerate(self.times) if progress >= time)
+
+    def grows_at(self, progress: float) -> bool:
+        return self.stage_at(progress) > self.stage
+
     @torch.no_grad()
     def grow(self, progress: float) -> list[torch.nn.Parameter]:
         """Moves on to the size that `progress` asks for."""
         self.steps += 1
-        wanted = max(i for i, time in enumerate(self.times) if progress >= time)
-        if wanted <= self.stage:
+        if not self.grows_at(progress):
             return []
+        wanted = self.stage_at(progress)
         keep = self.surroundings(self.resolutions[wanted] + 1)
         values = torch.cat([table.view(len(table), -1) for table in self.tables], dim=1)
         parts = (keep.nonzero() / (keep.shape[0] - 1)).split(CHUNK)

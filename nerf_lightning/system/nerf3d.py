@@ -95,7 +95,11 @@ class NeRF3D(System):
             for group, factor in zip(ours, factors, strict=True):
                 group["lr"] = group["initial_lr"] * factor * self.rate
         self.renderer.fade(self.progress)
-        replaced = self.field.grow(self.ripeness(self.global_step))
+        ripe = self.ripeness(self.global_step)
+        if self.trainer.world_size > 1 and self.field.grows_at(ripe):
+            for buffer in self.buffers():  # each process has seen rays of its own, and all must grow alike
+                torch.distributed.broadcast(buffer, 0)
+        replaced = self.field.grow(ripe)
         if replaced:
             self.follow_field()
             optimizer = self.optimizers(use_pl_optimizer=False)
