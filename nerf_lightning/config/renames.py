@@ -12,7 +12,8 @@ RENAMED = {
     "sampler.thin": "sampler.alpha_thre",
 }
 GRIDS = ("HashGridField", "TensoRFField", "VoxelField")
-"""Models whose runs without `size` were made with a fixed size; runs on photos without `undistort` resampled these."""
+"""Models whose runs without `size` were made with a fixed size; runs on photos without `undistort` resampled these, those
+without `focus` drew all rays alike, and those of pictures without `share` held half as many numbers."""
 
 
 def with_new_names(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -26,9 +27,14 @@ def with_new_names(config: Mapping[str, Any]) -> dict[str, Any]:
     model = renamed.get("model")
     if isinstance(model, dict) and str(model.get("_target_")).rpartition(".")[2] in GRIDS:
         renamed["model"] = {"size": "fixed", **model}
+    if isinstance(model, dict) and str(model.get("_target_")).endswith(".HashGrid2DField"):
+        renamed["model"] = {"share": 0.5, **model}
     dataset = renamed.get("dataset")
-    if isinstance(dataset, dict) and str(dataset.get("_target_")).endswith(".from_photos"):
-        renamed["dataset"] = {"undistort": True, **dataset}
+    if isinstance(dataset, dict):
+        source = str(dataset.get("_target_")).rpartition(".")[2]
+        if source in ("from_photos", "from_bricks", "from_download"):
+            resampled = {"undistort": True} if source == "from_photos" else {}
+            renamed["dataset"] = {**resampled, "focus": 0.0, **dataset}
     return renamed
 
 

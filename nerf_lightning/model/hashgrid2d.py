@@ -1,5 +1,7 @@
 """A picture as features on nested hash grids and one small network (Instant-NGP, Müller et al. 2022, section 5.1)."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,8 +13,8 @@ from nerf_lightning.model.hashgrid import layers, level_resolutions, table_sizes
 from nerf_lightning.model.layers.widening import widen_all
 from nerf_lightning.utils.options import Count
 
-SHARE = 0.5
-"""Numbers in the grids for each number in the picture, unless the table size is given."""
+STEP = 2.4
+"""How much finer each level is than the one before, unless their number is given."""
 
 
 class HashGrid2DField(PictureField):
@@ -22,9 +24,12 @@ class HashGrid2DField(PictureField):
 
     Args:
         size: see `PictureField`.
-        levels: number of grids; fewer for a picture so small that some would be equal.
+        levels: number of grids; fewer for a picture so small that some would be equal. None: each is about 2.4 times finer than
+            the one before.
         log2_entries: each level has at most 2^log2_entries entries; levels too fine for that share them by hashing. None picks
-            the largest for which all levels together hold at most half as many numbers as the picture.
+            the largest for which all levels together hold at most `share` times as many numbers as the picture.
+        share: of the picture's numbers, unless `log2_entries` is given. Shared entries cost most of all in what is fine
+            everywhere, as grain, fur and letters; from about 0.8 on none are.
         features: numbers per entry.
         coarsest: cells along the longer side of the first level, at most as many as pixels.
         finest: the same for the last level; None makes it as fine as the pixels.
@@ -35,27 +40,32 @@ class HashGrid2DField(PictureField):
     def __init__(
         self,
         size: tuple[int, int],
-        levels: Count = 8,
+        levels: Count | None = None,
         log2_entries: Count | None = None,
+        share: float = 1.0,
         features: Count = 2,
         coarsest: Count = 16,
         finest: Count | None = None,
         width: Count = 64,
-        rate: float = 1.0,
+        rate: float = 2.0,
     ):
         super().__init__(size, rate)
+        if not share > 0:
+            raise InputError("model.share", "", str(share), "above 0")
         cells = [max(side - 1, 1) for side in size]
         pixels, finest = max(cells), min(max(cells), finest or max(cells))
         first = finest if levels == 1 else min(coarsest, finest)
+        levels = levels or 1 + round(math.log(finest / first) / math.log(STEP))
         scaled = [[max(1, round(c * r / pixels)) for c in cells] for r in level_resolutions(levels, first, finest)]
         self.resolutions = list(dict.fromkeys((across, down) for across, down in scaled))  # a small picture has fewer
         if log2_entries is None:
-            numbers = SHARE * 3 * size[0] * size[1]
+            numbers = share * 3 * size[0] * size[1]
             fitting = [e for e in range(4, 25) if sum(table_sizes(self.resolutions, 2**e)) * features <= numbers]
             log2_entries = max(fitting, default=4)
+            held = sum(table_sizes(self.resolutions, 2**log2_entries)) * features / (3 * size[0] * size[1])
             self.sizing = (
-                f"grids up to the picture's {size[0]} x {size[1]} pixels, of at most 2^{log2_entries} entries: together half"
-                " as many numbers as the picture"
+                f"{len(self.resolutions)} grids up to the picture's {size[0]} x {size[1]} pixels: together {held:.2f} times as"
+                " many numbers as the picture"
             )
         if log2_entries > 24:
             raise InputError("model.log2_entries", "", str(log2_entries), "at most 24")

@@ -48,4 +48,13 @@ def test_runs_on_photos_that_say_nothing_of_lenses_had_them_undone():
     dataset = {"_target_": "nerf_lightning.dataset.from_photos", "path": "x"}
     assert check_config({"dataset": dataset}, "config.yaml")["dataset"]["undistort"] is True
     said = {**dataset, "undistort": False}
-    assert check_config({"dataset": said}, "config.yaml")["dataset"] == said
+    assert check_config({"dataset": said}, "config.yaml")["dataset"] == {"focus": 0.0, **said}
+
+
+def test_runs_from_before_a_new_default_go_on_with_theirs():
+    scene = {"_target_": "nerf_lightning.dataset.from_bricks", "rays": 64}
+    assert check_config({"dataset": scene}, "config.yaml")["dataset"]["focus"] == 0
+    picture = {"_target_": "nerf_lightning.model.HashGrid2DField", "levels": 8, "log2_entries": None, "rate": 1.0}
+    assert check_config({"model": picture}, "config.yaml")["model"]["share"] == 0.5
+    assert check_config({"model": {**picture, "share": 1.0}}, "config.yaml")["model"]["share"] == 1.0
+    assert "focus" not in check_config({"dataset": {"_target_": "nerf_lightning.dataset.from_picture"}}, "x")["dataset"]
