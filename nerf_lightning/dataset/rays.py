@@ -198,7 +198,7 @@ class RayDataModule(StepDataModule[Views]):
         if self._focus is None or self._focus.views is not photos:
             self._focus_state = self._focus_state if self._focus is None else self._focus.state_dict()
             self._focus = Focus(photos, self.focus)
-            if self._focus_state:
+            if len(self._focus_state.get("sums", ())) == len(self._focus.sums):  # else of other photos, or of none
                 self._focus.load_state_dict(self._focus_state)
         places, weights = self._focus.draw(self.rays, generator)
         return batch_of(photos, places[part], self.plain, weights[part])
