@@ -220,6 +220,7 @@ class OccupancySampler(Sampler):
         occupied = state_dict.get(f"{prefix}occupied")
         if occupied is not None:
             self._take_size(occupied)
+        self.thin = None
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def restart(self, step: int) -> None:
