@@ -21,8 +21,7 @@ def bare_step(
         group["lr"] = group["initial_lr"] * system.schedule(progress)
     for parameter in system.field.grow(system.ripeness(step)):
         optimizer.state.pop(parameter, None)
-    system.sampler.refine(system.field.finer)
-    data.finer = system.field.finer
+    system.follow_field(data)
     batch = data.draw(step).to(system.device)
     optimizer.zero_grad()
     loss, system.stats = system.loss(batch, step_generator(system.seed, Stream.STEP, step, system.device), step)

@@ -40,8 +40,8 @@ class Focus:
         self.first = torch.cat([sizes.new_zeros(1), (self.across * ((sizes[:, 1] + SIDE - 1) // SIDE)).cumsum(0)])
         """Where each photo's tiles begin, and where the last's end."""
         tiles = int(self.first[-1])
-        _, _, self.widths, self.heights, _ = self._places(torch.arange(tiles).to(device))
-        self.known = self.widths * self.heights if views.known is None else self._known()
+        _, _, widths, heights, _ = self._places(torch.arange(tiles).to(device))
+        self.known = widths * heights if views.known is None else self._known()
         self.sums, self.counts = torch.zeros(tiles, device=device), torch.zeros(tiles, device=device)
         """Errors of the pixels that each tile remembers, and how many these are."""
         self.new_sums, self.new_counts = torch.zeros_like(self.known), torch.zeros_like(self.known)

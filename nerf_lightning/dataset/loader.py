@@ -1,4 +1,5 @@
-"""How data modules feed a system: a batch for each step, drawn from the seed and the step alone, and held-out views whole."""
+"""How data modules feed a system: a batch for each step, drawn from the seed, the step and what data were told of
+earlier steps, which checkpoints keep, and held-out views whole."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, Generic, TypeVar

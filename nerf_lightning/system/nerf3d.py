@@ -78,12 +78,12 @@ class NeRF3D(System):
         if self.trainer.ckpt_path is None:  # what is resumed has looked already
             self.sampler.look_through(self.data.scene.train.cameras)
         self.data.plain = self.renderer.prices_plain
-        self.follow_field()
+        self.follow_field(self.data)
 
-    def follow_field(self) -> None:
-        """Steps along rays and samples a step for a field as fine as it is now."""
+    def follow_field(self, data: RayDataModule) -> None:
+        """Steps along rays, and samples a step of the data, for a field as fine as it is now."""
         self.sampler.refine(self.field.finer)
-        self.data.finer = self.field.finer
+        data.finer = self.field.finer
 
     def on_train_batch_start(self, batch: RayBatch, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
@@ -101,7 +101,7 @@ class NeRF3D(System):
                 torch.distributed.broadcast(buffer, 0)
         replaced = self.field.grow(ripe)
         if replaced:
-            self.follow_field()
+            self.follow_field(self.data)
             optimizer = self.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one
             for parameter in replaced:
@@ -198,7 +198,6 @@ class NeRF3D(System):
             loss.detach(),
             len(batch.rays),
             len(samples),
-            samples.whole is None,
             rendered.opacity.detach(),
             squares.detach(),
             samples.whole,
@@ -225,7 +224,7 @@ class NeRF3D(System):
         errors, counted = self.stats.squares, self.stats.whole
         assert errors is not None  # a step of this system
         world, rays = self.trainer.world_size, self.data.rays
-        if world > 1:
+        if world > 1 and self.data.focus:  # else nobody asks
             both = torch.stack([errors, torch.ones_like(errors) if counted is None else counted.float()])
             padded = torch.nn.functional.pad(both, (0, -(-rays // world) - len(errors)))
             gathered = self.all_gather(padded)

@@ -34,14 +34,17 @@ class StepStats:
     rays: int
     """Rays, or pixels in 2D."""
     samples: int
-    counted: bool = True
-    """Whether `samples` is their count; otherwise it is the room for them."""
     opacity: Float[Tensor, "R"] | None = None
     """Of each ray, on the device: 0 is empty, 1 is opaque."""
     squares: Float[Tensor, "R"] | None = None
     """Squared error of each ray, on the device."""
     whole: Bool[Tensor, "R"] | None = None
     """Which rays have all their samples; None for all."""
+
+    @property
+    def counted(self) -> bool:
+        """Whether `samples` is their count; otherwise it is the room for them."""
+        return self.whole is None
 
 
 @dataclass(frozen=True)
