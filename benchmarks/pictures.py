@@ -1,21 +1,28 @@
-"""2D fields: how long the default takes to where the course's network ends, and what each of them reaches."""
+"""2D fields: how long the default takes to where the course's network ends, what each of them reaches, and what the default
+reaches on pictures of other kinds, and on a large one."""
 
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from benchmarks.drawn import KINDS, leaves, write_picture
 from benchmarks.methods import Run, middle, seconds_to, train
 
 COURSE, FAST = "picture_mlp", "picture"
 CHECKS = tuple(round(0.005 * 1.25**i, 4) for i in range(24))
 """Shares of a short run's budget after which it is measured: the answer is a matter of tenths of a second."""
 FIELDS = ("hashgrid2d", "picture_mlp", "fourier", "siren")
+SIZE = 512
+"""Pixels along each side of the pictures that are drawn."""
+LARGE, LARGE_SECONDS = 4096, 60
+"""The same of a picture as a camera makes it, of leaves; and its training."""
 
 Rows = list[dict[str, Any]]
 
 
 def measure(overrides: list[str], seeds: list[int], output: Path) -> dict[str, Rows]:
-    """Tables by name: the race against the course's own recipe, and all fields after the same few seconds."""
+    """Tables by name: the race against the course's own recipe, all fields after the same few seconds, and the default on
+    pictures of each kind. A picture that the overrides name is that of the first two tables alone."""
     often = ",".join(str(check) for check in CHECKS if check < 1)
     course = train(COURSE, overrides, seeds[0], output / "pictures" / COURSE)
     runs: dict[str, list[Run]] = {name: [] for name in FIELDS}
@@ -46,4 +53,26 @@ def measure(overrides: list[str], seeds: list[int], output: Path) -> dict[str, R
         }
         for name, found in runs.items()
     ]
-    return {"pictures": [race], "2D fields": fields}
+    others = [part for part in overrides if not part.startswith("dataset.path=")]
+    kinds = [kind_row(kind, SIZE, others, seeds, output) for kind in KINDS]
+    kinds.append(kind_row(leaves.__name__, LARGE, [*others, f"budget.seconds={LARGE_SECONDS}"], seeds[:1], output))
+    return {"pictures": [race], "2D fields": fields, "kinds of pictures": kinds}
+
+
+def kind_row(kind: str, size: int, overrides: list[str], seeds: list[int], output: Path) -> dict[str, Any]:
+    """What the default recipe makes of a picture that is drawn for it."""
+    path = write_picture(kind, size, 0, output / "pictures" / "drawn")
+    found: list[Run] = []
+    for seed in seeds:
+        folder = output / "pictures" / f"{path.stem}_{seed}"
+        found.append(train(FAST, [*overrides, f"dataset.path='{path}'"], seed, folder))
+        print(f"{path.stem}, seed {seed}: {found[-1]['psnr']:.2f} dB", flush=True)
+    return {
+        "picture": path.stem,
+        "seeds": len(found),
+        "seconds": median(run["train_seconds"] for run in found),
+        "psnr": median(run["psnr"] for run in found),
+        "worst": min(run["psnr"] for run in found),
+        "parameters": found[0]["parameters"],
+        "peak_memory_bytes": max(run["peak_memory_bytes"] for run in found),
+    }

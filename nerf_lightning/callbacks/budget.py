@@ -3,7 +3,6 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from statistics import fmean
 from typing import Any
 
@@ -16,12 +15,10 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU, synchronize
 from nerf_lightning.utils.evenly import evenly
-from nerf_lightning.utils.machine import Load, cores, taken
+from nerf_lightning.utils.machine import Load, work_clocks
 
 LOOK_AT = 3
 """Held-out views rendered to look for a plateau."""
-LOOK_EVERY, MOST_TAKEN = 1.0, 0.9
-"""With `alone`: seconds between two looks at what other work takes, and the most of it that is believed."""
 COOLING = 0.15
 """Cooling down after a plateau takes this share of what was spent up to it."""
 
@@ -36,8 +33,8 @@ class Budget(L.Callback):
     plateau, a field that is still growing jumps to its full size. One at full size cools down quickly: progress, and the
     learning rate with it, runs to the end.
 
-    With `alone`, the clock of a CPU is slowed by the share of this process's threads that other work takes, so that a run
-    beside others does about as many steps as one alone.
+    With `alone`, the clock on a CPU is the time its threads have worked: a run beside others does about as many steps as one
+    alone, however long its threads wait for a core.
 
     Args:
         steps: optimiser steps, or None.
@@ -69,10 +66,9 @@ class Budget(L.Callback):
         self._line = (0.0, 0.0, 1.0)
         """Progress is a line over the share spent: (start, progress there, slope)."""
         self._before = 0.0  # spent up to the last pause or restart
-        self._since: float | None = None
+        self._since: tuple[float, ...] | None = None
         self._device = CPU
         self._alone = alone
-        self._speed = 1.0  # of the clock, as other work was found to be when it was last looked at
         self.load = Load()
         """CPU use of this process and of others while the clock ran."""
 
@@ -87,8 +83,13 @@ class Budget(L.Callback):
     @property
     def seconds(self) -> float:
         """Seconds trained so far."""
-        running = 0.0 if self._since is None else time.perf_counter() - self._since
-        return self._before + running * self._speed
+        if self._since is None:
+            return self._before
+        return self._before + max(now - then for now, then in zip(self._clocks(), self._since, strict=True))
+
+    def _clocks(self) -> tuple[float, ...]:
+        by_work = self._alone and self._device.type == "cpu"
+        return work_clocks(torch.get_num_threads()) if by_work else (time.perf_counter(),)
 
     def spent(self, step: int) -> float:
         """Fraction of the limits spent after `step` steps."""
@@ -122,21 +123,12 @@ class Budget(L.Callback):
     def _start(self) -> None:
         synchronize(self._device)
         self.load.start()
-        self._since = time.perf_counter()
+        self._since = self._clocks()
 
     def _stop(self) -> None:
         synchronize(self._device)  # work still queued on the device counts as training
         self._before, self._since = self.seconds, None
         self.load.stop()
-
-    def _look_at_others(self) -> None:
-        """Sets the clock's speed by what other work took since this was last done, if that is long enough to be told."""
-        if self._since is None or time.perf_counter() - self._since < LOOK_EVERY:
-            return
-        before = replace(self.load)
-        with self.paused():
-            others, seconds = self.load.others - before.others, self.load.seconds - before.seconds
-            self._speed = 1 - min(taken(cores(), torch.get_num_threads(), others / seconds), MOST_TAKEN)
 
     def shared_progress(self, trainer: L.Trainer) -> float:
         """`progress`, the same in all processes of a run."""
@@ -156,8 +148,6 @@ class Budget(L.Callback):
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if self._alone and self._device.type == "cpu":
-            self._look_at_others()
         pl_module.progress = self.shared_progress(trainer)
         if self.plateau is not None and self.stopped is None and pl_module.progress < 1.0:
             self._look_for_plateau(trainer, pl_module, self.plateau)

@@ -56,6 +56,12 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
     return {"processor": processor(), "cores": cores(), "accelerator": accelerator(device)}
 
 
+def work_clocks(threads: int) -> tuple[float, float]:
+    """Seconds worked by the thread that calls, and by this process for each of its threads: whichever went on further tells how
+    long work took, without the time spent waiting for a core."""
+    return time.thread_time(), time.process_time() / threads
+
+
 def taken(cores: float, threads: float, others: float) -> float:
     """Share of a run's threads taken by other work: what that used beyond the cores the run left free."""
     return max(0.0, others - max(0.0, cores - threads)) / max(threads, 1.0)

@@ -4,9 +4,7 @@ import pytest
 import torch
 
 from nerf_lightning.callbacks import Budget
-from nerf_lightning.callbacks import budget as budget_module
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.machine import Load
 
 
 def test_the_clock_runs_from_the_first_step_and_stands_while_paused(clock, system, trainer_with):
@@ -104,28 +102,26 @@ def test_a_trainer_needs_a_budget(trainer_with):
         Budget.of(trainer_with())
 
 
-def test_alone_the_clock_runs_as_much_slower_as_other_work_takes_threads(clock, system, trainer_with, monkeypatch):
-    monkeypatch.setattr(budget_module, "cores", lambda: 2)
+def test_alone_the_clock_counts_work_and_not_waiting_for_a_core(clock, system, trainer_with, monkeypatch):
+    worked = {"thread": 50.0, "process": 500.0}
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    busy = [0.0]  # CPU seconds of everything
-    monkeypatch.setattr(Load, "_now", lambda *_: (time.perf_counter(), 0.0, busy[0]))
+    monkeypatch.setattr(time, "thread_time", lambda: worked["thread"])
+    monkeypatch.setattr(time, "process_time", lambda: worked["process"])
     plain, alone = Budget(seconds=100), Budget(seconds=100, alone=True)
     for budget in (plain, alone):
         budget.on_train_start(trainer_with(budget), system)
 
-    def a_second(others: float) -> None:
-        clock.wait(1)
-        busy[0] += others
-        for budget in (plain, alone):
-            budget.on_train_batch_end(trainer_with(budget), system, None, None, 0)
+    def ten_seconds(thread: float, process: float) -> None:
+        clock.wait(10)
+        worked["thread"] += thread
+        worked["process"] += process
 
-    a_second(0)
-    assert alone.seconds == plain.seconds == 1
-    for _ in range(11):
-        a_second(1)  # one of two threads: half the work, once this was seen
-    assert plain.seconds == 12
-    assert alone.seconds == pytest.approx(2 + 10 * 0.5)
-    assert alone.progress(0) == alone.seconds / 100
-    a_second(0)
-    a_second(0)
-    assert alone.seconds == pytest.approx(2 + 11 * 0.5 + 1), "quiet again"
+    ten_seconds(10, 20)
+    assert alone.seconds == plain.seconds == 10, "nothing else runs"
+    ten_seconds(5, 10)
+    assert (alone.seconds, plain.seconds) == (15, 20), "each thread got half a core"
+    ten_seconds(0, 20)
+    assert alone.seconds == 25, "all work was done by other threads of this process"
+    with alone.paused():
+        ten_seconds(10, 20)
+    assert alone.progress(0) == 0.25
