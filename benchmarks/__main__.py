@@ -146,6 +146,7 @@ def main() -> None:
             tables = {part: kernels.measure()}
         elif part == "growth":
             tables = {part: growth.measure([f"+experiment={experiments[0]}", *overrides])}
+            tables["threads"] = growth.by_threads(experiments, overrides)
         else:
             tables = {part: [overhead.measure([f"+experiment={experiments[0]}", *overrides])]}
         for name, rows in tables.items():

@@ -1,4 +1,4 @@
-"""How the time of a step grows: with samples a step, with the number of photos, with their size."""
+"""How the time of a step grows: with samples a step, with the number of photos, with their size; and how threads share it."""
 
 import tempfile
 from dataclasses import replace
@@ -11,6 +11,8 @@ from benchmarks.bare import bare_step
 from benchmarks.setup import built
 from nerf_lightning.dataset import RayDataModule, Views
 from nerf_lightning.dataset.resize import resize_views
+from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.machine import cores
 
 WARMUP, BLOCK, ROUNDS = 300, 32, 10
 """Steps before the first that counts; steps in a row at one point; how often each point has its turn."""
@@ -42,6 +44,12 @@ def points(data: RayDataModule, seed: int) -> list[tuple[str, int, RayDataModule
     ]
 
 
+def block_ms(system: NeRF3D, data: RayDataModule, optimizer: torch.optim.Optimizer, first: int, steps: int) -> float:
+    """Milliseconds of a step, the mean over the later half of some: by then the number of rays has found its level."""
+    times = [bare_step(system, data, optimizer, first + i, PROGRESS) for i in range(steps)]
+    return 1e3 * fmean(times[steps // 2 :])
+
+
 def measure(overrides: list[str]) -> list[dict[str, float | str]]:
     """Milliseconds of a step along each axis, all measured on one field in training, block after block in turn.
 
@@ -51,15 +59,10 @@ def measure(overrides: list[str]) -> list[dict[str, float | str]]:
         cfg, data, system = built(overrides, Path(folder))
     optimizer = system.configure_optimizers()
     everything = points(data, cfg.seed)
-
-    def block(data: RayDataModule, first: int, steps: int) -> float:
-        times = [bare_step(system, data, optimizer, first + i, PROGRESS) for i in range(steps)]
-        return 1e3 * fmean(times[steps // 2 :])  # by then the number of rays has found its level
-
-    block(data, 0, WARMUP)
+    block_ms(system, data, optimizer, 0, WARMUP)
     for _, _, variant in everything:
-        block(variant, 0, BLOCK)
-    times = [[block(v, BLOCK * r, BLOCK) for _, _, v in everything] for r in range(ROUNDS)]
+        block_ms(system, variant, optimizer, 0, BLOCK)
+    times = [[block_ms(system, v, optimizer, BLOCK * r, BLOCK) for _, _, v in everything] for r in range(ROUNDS)]
     first = {axis: i for i, (axis, _, _) in reversed(list(enumerate(everything)))}
     return [
         {
@@ -70,3 +73,34 @@ def measure(overrides: list[str]) -> list[dict[str, float | str]]:
         }
         for i, (axis, value, _) in enumerate(everything)
     ]
+
+
+def by_threads(experiments: list[str], overrides: list[str]) -> list[dict[str, float | str]]:
+    """Milliseconds of a step of each experiment on 1, 2, 4, ... threads, as many as there are cores, measured in turn.
+
+    `efficiency` is the share of those threads that one thread's time explains, the median over rounds.
+    """
+    counts = [2**power for power in range(cores().bit_length())]
+    before, rows = torch.get_num_threads(), []
+    for experiment in experiments:
+        with tempfile.TemporaryDirectory() as folder:
+            _, data, system = built([f"+experiment={experiment}", *overrides], Path(folder))
+        optimizer = system.configure_optimizers()
+        block_ms(system, data, optimizer, 0, WARMUP)
+        times: list[list[float]] = []
+        for turn in range(ROUNDS):
+            times.append([])
+            for count in counts:
+                torch.set_num_threads(count)
+                times[-1].append(block_ms(system, data, optimizer, WARMUP + BLOCK * turn, BLOCK))
+        torch.set_num_threads(before)
+        rows += [
+            {
+                "experiment": experiment,
+                "threads": count,
+                "step_ms": median(row[i] for row in times),
+                "efficiency": median(row[0] / (count * row[i]) for row in times),
+            }
+            for i, count in enumerate(counts)
+        ]
+    return rows

@@ -12,10 +12,11 @@ from blob import around_it
 from torch import Tensor
 
 from benchmarks import __main__ as command
-from benchmarks import alike, cameras, capture, cases, device, growth, methods, overhead, steps, trainings
+from benchmarks import alike, cameras, capture, cases, device, drawn, growth, methods, overhead, steps, trainings
 from benchmarks import kernels as timing
 from nerf_lightning import kernels
 from nerf_lightning.cameras import in_other_frame
+from nerf_lightning.dataset.picture import load_picture
 from nerf_lightning.utils.device import CPU
 
 CURVE = [[2.0, 100, 20.0], [8.0, 400, 24.5], [10.5, 500, 26.0], [30.0, 1500, 29.0]]
@@ -72,6 +73,7 @@ def test_one_command_writes_table_and_json(tmp_path: Path, monkeypatch: pytest.M
     assert {row["kernel"] for row in report["kernels"]} >= {"march", "mlp", "hash_interpolate + gradient"}
     assert all(row["fast_ms"] > 0 and row["reference_ms"] > 0 for row in report["kernels"])
     assert [row["value"] for row in report["growth"]] == [64, 128, 3, 8]
+    assert report["threads"][0]["threads"] == report["threads"][0]["efficiency"] == 1
     assert report["overhead"][0]["bare_ms"] > 0
     assert report["methods"][0]["method"] == "smoke_3d" and report["runs"][0]["status"] == "finished"
     assert "bare_ms" in (tmp_path / "table.txt").read_text() and "bare_ms" in capsys.readouterr().out
@@ -267,3 +269,11 @@ def test_a_training_that_fails_is_named_and_the_others_go_on(tmp_path: Path, mon
     rows, failed = device.lego(CPU, [], 7.0, 0, tmp_path)
     assert failed == ["voxels (its training failed)"] and "no room" in rows[2]["failed"]
     assert [row.get("scene") for row in rows] == ["lego", "lego", None, "lego"]
+
+
+@pytest.mark.parametrize("kind", drawn.KINDS)
+def test_pictures_are_drawn_from_their_seed_alone(kind: str, tmp_path: Path):
+    first, again, other = (drawn.write_picture(kind, 48, seed, tmp_path / str(n)) for n, seed in enumerate((0, 0, 1)))
+    pixels = load_picture(first)
+    assert pixels.shape == (48, 48, 3) and pixels.float().std() > 5
+    assert first.read_bytes() == again.read_bytes() != other.read_bytes()
