@@ -94,12 +94,20 @@ def composite(
 
 
 def keep_visible_reference(
-    thickness: Tensor, packed: Packed, early_stop_eps: float, min_thickness: float | Tensor, room: int | None = None
+    thickness: Tensor,
+    packed: Packed,
+    early_stop_eps: float,
+    min_thickness: float | Tensor,
+    room: int | None = None,
+    dropped: float = math.inf,
 ) -> Kept:
     """`keep_visible` in plain PyTorch, for every device."""
     t, dt, ray, offsets = packed
-    # NaN stays, so that somebody notices.
-    keep = ~((before(thickness, ray, offsets) > -math.log(early_stop_eps)) | (thickness < min_thickness))
+    nothing = thickness < min_thickness  # NaN stays, so that somebody notices
+    if dropped < math.inf:
+        thin = torch.where(nothing, thickness, 0.0)
+        nothing &= before(thin, ray, offsets) + thin <= dropped
+    keep = ~((before(thickness, ray, offsets) > -math.log(early_stop_eps)) | nothing)
     if room is not None:  # drops what an earlier call repeated to fill its room
         keep = keep & (dt > 0)
     counts = counted(keep)
@@ -117,6 +125,7 @@ def keep_visible(
     early_stop_eps: float,
     min_thickness: float | Float[Tensor, ""],
     room: int | None = None,
+    dropped: float = math.inf,
 ) -> Kept:
     """Drops samples that light cannot reach, and those that hold nothing.
 
@@ -126,10 +135,11 @@ def keep_visible(
         early_stop_eps: early-stop transmittance, above 0: below it a ray has ended.
         min_thickness: alpha threshold, as an optical thickness: a sample below it holds nothing.
         room: see `march`.
+        dropped: optical thickness that a ray's samples below `min_thickness` may have together; the later ones stay.
     """
     t, dt, ray, offsets = packed
     if room is not None or not fast(thickness, t, dt) or t.requires_grad or dt.requires_grad:
-        return keep_visible_reference(thickness, packed, early_stop_eps, min_thickness, room)
+        return keep_visible_reference(thickness, packed, early_stop_eps, min_thickness, room, dropped)
     from nerf_lightning.kernels.cpu import composite, workers
 
     threads, keep, counts = workers(), np.empty(len(t), np.bool_), np.empty(len(offsets) - 1, np.int64)
@@ -138,6 +148,7 @@ def keep_visible(
         offsets.numpy(),
         early_stop_eps,
         float(min_thickness),
+        dropped,
         keep,
         counts,
         threads,

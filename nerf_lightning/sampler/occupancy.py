@@ -22,6 +22,8 @@ ASKED, LOOKED_AT = 4, 32
 """How many positions are evaluated at a time, and how many steps are tested at a time, as multiples of `Sampler.chunk`."""
 MOST_CAMERAS = 128
 """Most cameras, evenly chosen, that decide which cells are in view."""
+UNSEEN = 0.5 / 255
+"""Optical thickness that rays of a picture may lose to steps that hold less: half of what 8 bits tell."""
 ROOM = 1.25
 """Room for steps that are not counted, as a multiple of the last count."""
 
@@ -143,7 +145,7 @@ class OccupancySampler(Sampler):
         if generator is None:
             found, packed = self._look(rays, density, near, far, torch.zeros_like(near), self.occupied)
             # A picture must not depend on how its rays are split into calls: only training uses the mean to drop steps.
-            return Samples(*keep_visible(found, packed, self.early_stop_eps, 0.0))
+            return Samples(*keep_visible(found, packed, self.early_stop_eps, UNSEEN, dropped=UNSEEN))
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.occupied if self.look_everywhere else self.lit
         rooms = [None, None] if self.per_ray is None else [math.ceil(ROOM * many * len(rays)) for many in self.per_ray]

@@ -15,43 +15,49 @@ def packed(samples: Samples):
 
 @pytest.mark.parametrize("counts", COUNTS)
 @pytest.mark.parametrize("early_stop_eps", [1e-4, 0.5])
-@pytest.mark.parametrize("min_thickness", [0.0, 1e-3, 0.2])
-def test_what_is_seen_agrees_with_a_loop(counts: list[int], early_stop_eps: float, min_thickness: float, kernels: str):
+@pytest.mark.parametrize(("min_thickness", "dropped"), [(0.0, math.inf), (1e-3, math.inf), (0.2, math.inf), (0.2, 0.3)])
+def test_what_is_seen_agrees_with_a_loop(
+    counts: list[int], early_stop_eps: float, min_thickness: float, dropped: float, kernels: str
+):
     samples = ragged(counts)
     density = 20 * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.7)
     kept, ends, i = [], [0], 0
     for count in counts:
-        transmittance = 1.0
+        transmittance, thin = 1.0, 0.0
         for _ in range(count):
             thickness = float(density[i]) * float(samples.dt[i])
-            if transmittance >= early_stop_eps and thickness >= min_thickness:
+            thin += thickness if thickness < min_thickness else 0.0
+            if transmittance >= early_stop_eps and (thickness >= min_thickness or thin > dropped):
                 kept.append(i)
             transmittance *= math.exp(-thickness)
             i += 1
         ends.append(len(kept))
-    t, dt, ray, offsets = keep_visible(density * samples.dt, packed(samples), early_stop_eps, min_thickness)
+    given = density * samples.dt, packed(samples), early_stop_eps, min_thickness
+    t, dt, ray, offsets = keep_visible(*given, dropped=dropped)
     assert torch.equal(t, samples.t[kept]) and torch.equal(dt, samples.dt[kept])
     assert torch.equal(ray, samples.ray[kept]) and offsets.tolist() == ends
 
 
 @pytest.mark.parametrize("counts", [[], [0, 0], MANY])
-@pytest.mark.parametrize("min_thickness", [0.0, 0.1])
-def test_what_is_seen_agrees_with_the_reference(counts: list[int], min_thickness: float):
+@pytest.mark.parametrize(("min_thickness", "dropped"), [(0.0, math.inf), (0.1, math.inf), (0.1, 0.2)])
+def test_what_is_seen_agrees_with_the_reference(counts: list[int], min_thickness: float, dropped: float):
     samples = ragged(counts)
     density = 30 * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.5)
     results = {}
     for choice in ("auto", "reference"):
         use_kernels(choice)
-        results[choice] = keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness)
+        results[choice] = keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness, dropped=dropped)
     assert all(torch.equal(a, b) for a, b in zip(*results.values(), strict=True))
     use_kernels("auto")
-    one = with_threads(lambda: keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness), 1)
+    one = with_threads(
+        lambda: keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness, dropped=dropped), 1
+    )
     assert all(torch.equal(a, b) for a, b in zip(one, results["auto"], strict=True))
 
 
 def test_nothing_is_dropped_when_all_may_stay(kernels: str):
     samples = ragged(MANY)
-    kept = keep_visible(torch.zeros(len(samples)), packed(samples), 1e-4, 0.0)
+    kept = keep_visible(torch.full((len(samples),), 1e-3), packed(samples), 1e-4, 0.1, dropped=1e-4)
     assert all(torch.equal(a, b) for a, b in zip(kept, packed(samples), strict=True))
 
 

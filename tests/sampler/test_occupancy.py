@@ -192,7 +192,7 @@ def test_what_too_few_cameras_have_in_view_stays_empty():
     assert torch.equal(grid, sampler.allowed.view(16, 16, 16)) and sampler.lit.sum() <= grid.sum()
     # Through the lone camera's beam nothing is found but where the others look too.
     along_y = Rays(torch.tensor([[0.0, -4, 0]]), torch.tensor([[0.0, 1, 0]]))
-    found = sampler(along_y, lambda x: torch.full((len(x),), 1e-3)).positions(along_y)
+    found = sampler(along_y, lambda x: torch.full((len(x),), 0.1)).positions(along_y)
     assert len(found) and found[:, 1].abs().max() < 0.7
     near = OccupancySampler(replace(CUBE, near=4.0), samples=100, resolution=16, seen_by=3)
     near.look_through(Cameras.of_size(K, c2w, 16, 16))

@@ -60,21 +60,25 @@ def backward(
 
 
 @kernel
-def visible(thickness, offsets, early_stop_eps, min_thickness, keep, counts, workers):
+def visible(thickness, offsets, early_stop_eps, min_thickness, dropped, keep, counts, workers):
     """Marks samples that light can reach and that hold something, and counts them for each ray [R].
 
     Args:
         early_stop_eps: early-stop transmittance: below it a ray has ended.
         min_thickness: alpha threshold, as an optical thickness: a sample below it holds nothing.
+        dropped: optical thickness that those of a ray may have together; the later ones stay.
     """
     rays = len(offsets) - 1
     furthest = -math.log(early_stop_eps)
     for worker in prange(workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
-            optical, kept = 0.0, 0
+            optical, thin, kept = 0.0, 0.0, 0
             for n in range(offsets[ray], offsets[ray + 1]):
                 step = thickness[n]
-                keep[n] = not (optical > furthest or step < min_thickness)  # NaN stays, to be noticed
+                nothing = step < min_thickness  # NaN stays, to be noticed
+                if nothing:
+                    thin += step
+                keep[n] = not (optical > furthest or (nothing and thin <= dropped))
                 kept += keep[n]
                 optical += step
             counts[ray] = kept
