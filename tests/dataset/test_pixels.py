@@ -50,6 +50,12 @@ def test_the_fingerprint_tells_pictures_apart(picture: Picture):
     assert picture.describe()["resolution"] == [WIDTH, HEIGHT]
 
 
+@pytest.mark.parametrize(("side", "expected"), [(7, 8192), (1024, 8192), (2048, 32768)])
+def test_a_step_looks_at_a_share_of_large_pictures(side: int, expected: int):
+    data = PixelDataModule(Picture("black", "test", torch.zeros(side, side, 3, dtype=torch.uint8)))
+    assert data.pixels == len(data.draw(0).uv) == expected
+
+
 def test_less_than_one_pixel_is_refused(picture: Picture):
     with pytest.raises(InputError, match="dataset.pixels"):
         PixelDataModule(picture, pixels=0)
