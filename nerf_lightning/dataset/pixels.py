@@ -17,8 +17,8 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 USUAL = 8192
 """Pixels a step, where a picture is not large."""
 SHARE = 1 / 128
-"""Least share of a picture that a step looks at: an optimiser's step passes over all numbers of a field, of which large pictures
-have many. On 16 million pixels, 777 steps of 8192 gave 34.6 dB and, in the same time, 496 of 131,072 gave 39.9."""
+"""Least share of a picture that a step looks at: an optimiser's step passes over all numbers of a field, of which large
+pictures have many. On 16 million pixels, 777 steps of 8192 gave 34.6 dB and, in the same time, 496 of 131,072 gave 39.9."""
 
 
 def unknown(width: int, height: int) -> None:

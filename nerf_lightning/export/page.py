@@ -90,8 +90,8 @@ def described(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
             "far": far,
         },
         "sampler": {
-            "samples": sampler.samples,
-            "step": sampler.step_length,
+            "samples": sampler.picture_samples,
+            "step": sampler.length(sampler.picture_samples),
             "cells": sampler.resolution,
             "stop": sampler.early_stop_eps,
         },

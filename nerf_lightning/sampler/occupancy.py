@@ -16,8 +16,9 @@ from nerf_lightning.utils.options import Count
 
 RESOLUTION = 64
 """Cells along a side for a field of usual size."""
-STEPS = 3
-"""Steps along the diagonal for each of them."""
+STEPS, PICTURE_STEPS = 3, 4
+"""Steps along the diagonal for each of them, in training, where they begin elsewhere each time, and in pictures: on Lego at 200
+and 800 pixels the finer ones add 0.3 dB to a picture, and a sixth to its time."""
 ASKED, LOOKED_AT = 4, 32
 """How many positions are evaluated at a time, and how many steps are tested at a time, as multiples of `Sampler.chunk`."""
 MOST_CAMERAS = 128
@@ -44,7 +45,8 @@ class OccupancySampler(Sampler):
 
     Args:
         bounds: where the content is.
-        samples: steps along the diagonal of the bounds; rays that cross less of it get fewer. None: three times `resolution`.
+        samples: steps along the diagonal of the bounds; rays that cross less of it get fewer. None: three times `resolution`,
+            in pictures four times.
         resolution: cells along each side. None: 64, and more where the field becomes finer than usual, see `refine`.
         threshold: optical thickness of a step above which a cell counts as occupied.
         decay: factor on a cell's maximum at each update.
@@ -118,9 +120,11 @@ class OccupancySampler(Sampler):
     def set_resolution(self, cells: int) -> None:
         """Takes so many cells along each side, and steps to match; buffers stay."""
         self.resolution = cells
-        self.samples = self.stated[0] or STEPS * cells
-        self.step_length = 2 * float(self.bounds.half_size.norm()) / self.samples
-        """Length of one step inside the box, in world units."""
+        self.samples, self.picture_samples = (self.stated[0] or steps * cells for steps in (STEPS, PICTURE_STEPS))
+
+    def length(self, samples: int) -> float:
+        """Of one of so many steps, inside the box, in world units."""
+        return 2 * float(self.bounds.half_size.norm()) / samples
 
     @torch.no_grad()
     def refine(self, finer: float) -> None:
@@ -130,26 +134,27 @@ class OccupancySampler(Sampler):
         # A cell holds whatever the cells that it lies in held.
         edges = torch.arange(new + 1, device=self.thickness.device) * old
         first, last = edges[:-1] // new, (edges[1:] - 1) // new
-        before = self.step_length
+        before = self.samples
         self.set_resolution(new)
         for name in ("thickness", "occupied", "allowed", "reached", "lit"):
             grid = getattr(self, name).view(old, old, old)
             for axis in range(3):
                 grid = torch.maximum(grid.index_select(axis, first), grid.index_select(axis, last))
             setattr(self, name, grid.flatten())
-        self.thickness *= self.step_length / before
+        self.thickness *= before / self.samples
         self.per_ray = self.thin = None
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
         if generator is None:
-            found, packed = self._look(rays, density, near, far, torch.zeros_like(near), self.occupied)
+            steps = self.picture_samples
+            found, packed = self._look(rays, density, near, far, torch.zeros_like(near), self.occupied, steps)
             # A picture must not depend on how its rays are split into calls: only training uses the mean to drop steps.
             return Samples(*keep_visible(found, packed, self.early_stop_eps, UNSEEN, dropped=UNSEEN))
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.occupied if self.look_everywhere else self.lit
         rooms = [None, None] if self.per_ray is None else [math.ceil(ROOM * many * len(rays)) for many in self.per_ray]
-        found, packed = self._look(rays, density, near, far, shift, cells, rooms[0])
+        found, packed = self._look(rays, density, near, far, shift, cells, self.samples, rooms[0])
         if self.thin is None:
             mean = (self.thickness * self.lit).sum() / self.lit.sum()
             self.thin = mean.mul(0.5).clamp_max(-math.log1p(-self.alpha_thre))
@@ -172,6 +177,7 @@ class OccupancySampler(Sampler):
         far: Float[Tensor, "R"],
         shift: Float[Tensor, "R"],
         cells: Bool[Tensor, "cells"],
+        samples: int,
         room: int | None = None,
     ) -> tuple[Float[Tensor, "N"], Packed]:
         """Steps in some cells and the optical thickness of each."""
@@ -181,7 +187,7 @@ class OccupancySampler(Sampler):
             found = [density(part).float() for part in Samples(*packed).positions(rays).split(ASKED * self.chunk)]
             return (found[0].detach() if len(found) == 1 else torch.cat(found)) * packed[1]
 
-        given = rays, self.bounds, near, far, shift, cells, self.samples, self.step_length
+        given = rays, self.bounds, near, far, shift, cells, samples, self.length(samples)
         return front_first(*given, thickness, self.early_stop_eps, room, LOOKED_AT * self.chunk)
 
     @torch.no_grad()
@@ -248,10 +254,9 @@ class OccupancySampler(Sampler):
         n = self.resolution
         corner = torch.stack([cells // (n * n), cells // n % n, cells % n])
         unit = ((corner + torch.rand(corner.shape, generator=generator, device=device)) / n).T
-        found = (
-            torch.cat([density(part) for part in self.bounds.to_world(unit).split(ASKED * self.chunk)])
-            * self.step_length
-        )
+        found = torch.cat(
+            [density(part) for part in self.bounds.to_world(unit).split(ASKED * self.chunk)]
+        ) * self.length(self.samples)
         self.thickness[cells] = torch.maximum(self.thickness[cells] * self.decay, found)
         occupied = self.allowed & (self.thickness > self.thickness.mean().mul(0.5).clamp_max(self.threshold))
         # Without any density there would be no samples, so no gradient, forever: look everywhere again.

@@ -59,7 +59,7 @@ def test_what_lies_inside_a_solid_is_looked_at_once_in_a_while():
     first = near.clone().scatter_reduce(0, trained.ray, trained.t, "amin")
     second = near.clone().scatter_reduce(0, whole.ray[full], whole.t[full], "amin")
     hit = second.isfinite()
-    close = (first - second)[hit].abs() < 2 * sampler.step_length
+    close = (first - second)[hit].abs() < 2 * sampler.length(sampler.samples)
     assert hit.sum() > 150 and close.float().mean() > 0.95, "and both see the surface"
 
 
@@ -213,12 +213,13 @@ def test_few_cameras_allow_what_all_of_them_see():
 def test_steps_and_cells_follow_the_field_unless_stated():
     usual, stated = OccupancySampler(CUBE), OccupancySampler(CUBE, resolution=16)
     assert (usual.samples, usual.resolution) == (192, 64)
-    before = usual.step_length
+    before = usual.length(usual.samples)
     for sampler in (usual, stated):
         sampler.refine(2.0)
-    assert (usual.samples, usual.resolution) == (384, 128) and usual.step_length == pytest.approx(before / 2)
+    assert (usual.samples, usual.resolution) == (384, 128) and usual.length(usual.samples) == pytest.approx(before / 2)
     assert (stated.samples, stated.resolution) == (48, 16)
-    assert OccupancySampler(CUBE, samples=100).samples == 100
+    stated = OccupancySampler(CUBE, samples=100)
+    assert stated.samples == stated.picture_samples == 100 and usual.picture_samples == 4 * 128
 
 
 def test_finer_cells_hold_what_the_cells_that_they_lie_in_held(monkeypatch: pytest.MonkeyPatch):
@@ -257,3 +258,9 @@ def test_a_state_of_any_stage_loads_into_any_other():
         OccupancySampler(CUBE, resolution=16).import_state(late.export_state())
     with pytest.raises(RuntimeError, match="size mismatch"):
         OccupancySampler(CUBE, resolution=16).load_state_dict(late.state_dict())
+
+
+def test_pictures_take_finer_steps_than_training(rays: Rays, box: Bounds):
+    sampler = OccupancySampler(box, resolution=8)
+    training, picture = (sampler(rays, lambda x: torch.ones(len(x)), generator) for generator in (seeded(), None))
+    assert picture.dt.max() < 0.76 * training.dt.max() and len(picture) > 1.2 * len(training)

@@ -37,7 +37,9 @@ def bare(sampler: OccupancySampler, rays: Rays, cells: Tensor, generator: Genera
     """All steps in the given cells, whatever the field says."""
     near, far = sampler.bounds.near_far(rays)
     shift = torch.zeros_like(near) if generator is None else torch.rand(near.shape, generator=generator)
-    return Samples(*march(rays, sampler.bounds, near, far, shift, cells, sampler.samples, sampler.step_length))
+    return Samples(
+        *march(rays, sampler.bounds, near, far, shift, cells, sampler.samples, sampler.length(sampler.samples))
+    )
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
@@ -98,7 +100,7 @@ def test_pictures_keep_fog_but_for_less_than_anyone_sees(density: float, box: Bo
     everything = bare(sampler, rays, sampler.occupied).dt.sum()
     lost = density * (everything - sampler(rays, lambda x: torch.full((len(x),), density)).dt.sum())
     assert 0 <= lost <= len(rays) * UNSEEN * (1 + 1e-5)
-    assert lost > 0 or density * sampler.step_length > UNSEEN
+    assert lost > 0 or density * sampler.length(sampler.samples) > UNSEEN
 
 
 def test_a_picture_does_not_depend_on_how_its_rays_are_cut(box: Bounds, rays: Rays):
@@ -111,9 +113,9 @@ def test_a_picture_does_not_depend_on_how_its_rays_are_cut(box: Bounds, rays: Ra
 def test_a_thin_fog_is_kept(density: float, box: Bounds, rays: Rays):
     sampler = OccupancySampler(box, samples=40, resolution=6, alpha_thre=0.1)
     everything = bare(sampler, rays, sampler.occupied, seeded())
-    sampler.thickness.fill_(density * sampler.step_length)
+    sampler.thickness.fill_(density * sampler.length(sampler.samples))
     samples = sampler(rays, lambda x: torch.full((len(x),), density), seeded())
-    short = everything.dt < 0.5 * sampler.step_length * (density > 0)  # cut off where a ray ends
+    short = everything.dt < 0.5 * sampler.length(sampler.samples) * (density > 0)  # cut off where a ray ends
     assert torch.equal(samples.t, everything.t[~short]) and short.float().mean() < 0.1
 
 
