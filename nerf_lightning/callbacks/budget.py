@@ -1,6 +1,7 @@
 """Budget: how long to train, by the steps or by the clock, and the clock itself."""
 
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from statistics import fmean
@@ -19,6 +20,9 @@ from nerf_lightning.utils.machine import Load, work_clocks
 
 LOOK_AT = 3
 """Held-out views rendered to look for a plateau."""
+RECENT, UNDISTURBED = 20, 0.1
+"""With `alone`: steps that are looked back on, and the share of them that other work never disturbs: each time it has a core in
+between, it leaves this process's data out of the caches too."""
 COOLING = 0.15
 """Cooling down after a plateau takes this share of what was spent up to it."""
 
@@ -33,8 +37,8 @@ class Budget(L.Callback):
     plateau, a field that is still growing jumps to its full size. One at full size cools down quickly: progress, and the
     learning rate with it, runs to the end.
 
-    With `alone`, the clock on a CPU is the time its threads have worked: a run beside others does about as many steps as one
-    alone, however long its threads wait for a core.
+    With `alone`, a step on a CPU counts as long as its threads work on one that nothing disturbs: a run beside others does
+    about as many steps as one alone, however long its threads wait for a core.
 
     Args:
         steps: optimiser steps, or None.
@@ -66,9 +70,11 @@ class Budget(L.Callback):
         self._line = (0.0, 0.0, 1.0)
         """Progress is a line over the share spent: (start, progress there, slope)."""
         self._before = 0.0  # spent up to the last pause or restart
-        self._since: tuple[float, ...] | None = None
+        self._since: float | None = None
         self._device = CPU
         self._alone = alone
+        self._worked = (0.0, 0.0)  # `work_clocks` when the step began
+        self._took: deque[float] = deque(maxlen=RECENT)  # work of the last steps, seconds
         self.load = Load()
         """CPU use of this process and of others while the clock ran."""
 
@@ -83,13 +89,21 @@ class Budget(L.Callback):
     @property
     def seconds(self) -> float:
         """Seconds trained so far."""
-        if self._since is None:
+        if self._since is None or self._by_step:
             return self._before
-        return self._before + max(now - then for now, then in zip(self._clocks(), self._since, strict=True))
+        return self._before + time.perf_counter() - self._since
 
-    def _clocks(self) -> tuple[float, ...]:
-        by_work = self._alone and self._device.type == "cpu"
-        return work_clocks(torch.get_num_threads()) if by_work else (time.perf_counter(),)
+    @property
+    def _by_step(self) -> bool:
+        """Whether the clock goes on by what a step takes undisturbed."""
+        return self._alone and self._device.type == "cpu"
+
+    def _count_step(self) -> None:
+        """Lets that clock go on by a step."""
+        now = work_clocks(torch.get_num_threads())
+        self._took.append(max(a - b for a, b in zip(now, self._worked, strict=True)))
+        self._worked = now
+        self._before += sorted(self._took)[round(UNDISTURBED * (len(self._took) - 1))]
 
     def spent(self, step: int) -> float:
         """Fraction of the limits spent after `step` steps."""
@@ -123,7 +137,7 @@ class Budget(L.Callback):
     def _start(self) -> None:
         synchronize(self._device)
         self.load.start()
-        self._since = self._clocks()
+        self._since, self._worked = time.perf_counter(), work_clocks(torch.get_num_threads())
 
     def _stop(self) -> None:
         synchronize(self._device)  # work still queued on the device counts as training
@@ -148,6 +162,8 @@ class Budget(L.Callback):
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
+        if self._by_step:
+            self._count_step()
         pl_module.progress = self.shared_progress(trainer)
         if self.plateau is not None and self.stopped is None and pl_module.progress < 1.0:
             self._look_for_plateau(trainer, pl_module, self.plateau)

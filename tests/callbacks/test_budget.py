@@ -102,7 +102,7 @@ def test_a_trainer_needs_a_budget(trainer_with):
         Budget.of(trainer_with())
 
 
-def test_alone_the_clock_counts_work_and_not_waiting_for_a_core(clock, system, trainer_with, monkeypatch):
+def test_alone_a_step_counts_as_long_as_it_works_undisturbed(clock, system, trainer_with, monkeypatch):
     worked = {"thread": 50.0, "process": 500.0}
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     monkeypatch.setattr(time, "thread_time", lambda: worked["thread"])
@@ -111,17 +111,27 @@ def test_alone_the_clock_counts_work_and_not_waiting_for_a_core(clock, system, t
     for budget in (plain, alone):
         budget.on_train_start(trainer_with(budget), system)
 
-    def ten_seconds(thread: float, process: float) -> None:
-        clock.wait(10)
+    def step(wall: float, thread: float, process: float) -> None:
+        clock.wait(wall)
         worked["thread"] += thread
         worked["process"] += process
+        for budget in (plain, alone):
+            budget.on_train_batch_end(trainer_with(budget), system, None, None, 0)
 
-    ten_seconds(10, 20)
-    assert alone.seconds == plain.seconds == 10, "nothing else runs"
-    ten_seconds(5, 10)
-    assert (alone.seconds, plain.seconds) == (15, 20), "each thread got half a core"
-    ten_seconds(0, 20)
-    assert alone.seconds == 25, "all work was done by other threads of this process"
+    step(0.1, 0.1, 0.2)
+    step(0.1, 0.0, 0.2)
+    assert plain.seconds == pytest.approx(0.2) and alone.seconds == pytest.approx(0.2), "other threads did all the work"
+    for _ in range(10):
+        step(0.3, 0.12, 0.24)
+    assert plain.seconds == pytest.approx(3.2)
+    assert alone.seconds == pytest.approx(12 * 0.1), "waits for a core do not count, nor what they do to the caches"
     with alone.paused():
-        ten_seconds(10, 20)
-    assert alone.progress(0) == 0.25
+        clock.wait(50)
+        worked["thread"] += 50
+    for _ in range(20):
+        step(0.2, 0.2, 0.4)
+    step(0.2, 0.2, 0.4)
+    before = alone.seconds
+    step(0.2, 0.2, 0.4)
+    assert alone.seconds == pytest.approx(before + 0.2), "steps that grow count in full before long"
+    assert alone.progress(0) == alone.seconds / 100
