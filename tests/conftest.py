@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -51,6 +52,7 @@ from torch.nn.functional import normalize
 from benchmarks.synthetic.photos import Flaws, Truth, write_capture
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import use_kernels
+from nerf_lightning.utils.ending import SIGNALS
 
 
 @pytest.fixture(scope="session")
@@ -115,7 +117,10 @@ def verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
             code = int(end.code or 0)
         return code, *capfd.readouterr()
 
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
     yield run
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
     logging.getLogger().handlers.clear()  # they write to what was captured
 
 
