@@ -16,7 +16,7 @@ from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.system import System
-from nerf_lightning.utils.ending import Interrupted, asked, held, listen_again
+from nerf_lightning.utils.ending import Interrupted, asked, held, interrupt, listen_again
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic
 
@@ -105,7 +105,7 @@ class Checkpoints(L.Callback):
     ) -> None:
         due, number = agreed(trainer, (time.monotonic() - self._saved >= self.every_seconds, asked()))
         if number is not None:
-            raise Interrupted(number)
+            interrupt(number)
         if due:
             self.save(trainer, "last.ckpt")
             self._saved = time.monotonic()

@@ -4,6 +4,7 @@ import functools
 import os
 import re
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -101,6 +102,7 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
                 give_up(told)  # here, as Hydra would add a line
             raise  # a sweep decides what becomes of its other jobs
 
+    threading.excepthook = _untold
     listen()
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
@@ -115,6 +117,12 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
         if number is None:
             raise
         leave(number, error.go_on if isinstance(error, Interrupted) else AGAIN)
+
+
+def _untold(of: threading.ExceptHookArgs) -> None:
+    """A thread that meets a full disk, as TensorBoard's does, says nothing: whoever gives it more to write is told."""
+    if not full_disk(of.exc_value):
+        threading.__excepthook__(of)
 
 
 def as_told(error: BaseException) -> BaseException:

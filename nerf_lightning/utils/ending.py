@@ -16,6 +16,7 @@ from typing import NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN = "the same command goes on"
 _asked: int | None = None
+_pending = False  # not raised yet
 _holding = 0
 
 
@@ -37,8 +38,8 @@ class Interrupted(BaseException):
 
 def listen() -> None:
     """From now on signals raise `Interrupted`; those before are forgotten."""
-    global _asked
-    _asked = None
+    global _asked, _pending
+    _asked, _pending = None, False
     _take(_raise)
 
 
@@ -55,13 +56,14 @@ def end_at_once() -> None:
 @contextmanager
 def listening() -> Iterator[None]:
     """Listens for a while in somebody else's process. The signal then does there what it would have done."""
-    global _asked
+    global _asked, _pending
     before = {number: signal.getsignal(number) for number in SIGNALS}
     listen()
     try:
         yield
     finally:
-        number, _asked = _asked, None
+        number = _asked
+        _asked, _pending = None, False
         if threading.current_thread() is threading.main_thread():
             for one, handler in before.items():
                 signal.signal(one, handler)
@@ -74,10 +76,17 @@ def asked() -> int | None:
     return _asked
 
 
+def interrupt(number: int) -> NoReturn:
+    """Raises `Interrupted`, once for the signals that have come so far."""
+    global _pending
+    _pending = False
+    raise Interrupted(number)
+
+
 def leave_if_asked() -> None:
-    """Raises `Interrupted` if a signal has come, held back or not."""
+    """Raises `Interrupted` if a signal has come, also one that was lost: what is raised in a clean-up is."""
     if _asked is not None:
-        raise Interrupted(_asked)
+        interrupt(_asked)
 
 
 @contextmanager
@@ -89,7 +98,7 @@ def held() -> Iterator[None]:
         yield
     finally:
         _holding -= 1
-    if not _holding:
+    if _pending and not _holding:
         leave_if_asked()
 
 
@@ -107,10 +116,10 @@ def _take(handler: object) -> None:
 
 
 def _raise(number: int, frame: FrameType | None) -> None:
-    global _asked
-    _asked = _asked or number
+    global _asked, _pending
+    _asked, _pending = _asked or number, True
     if not _holding:
-        raise Interrupted(_asked)
+        interrupt(_asked)
 
 
 def _exit(number: int, frame: FrameType | None) -> None:

@@ -42,8 +42,9 @@ def atomic(path: Path) -> Iterator[Path]:
         raise
     finally:
         with held():
-            if temporary is not None:
-                temporary.unlink(missing_ok=True)
+            if temporary is not None and temporary.exists():
+                os.truncate(temporary, 0)  # gives its room back even where a writer that failed still holds it open
+                temporary.unlink()
 
 
 @contextmanager
