@@ -89,6 +89,15 @@ def same_random_numbers() -> None:
 
 
 @pytest.fixture(autouse=True)
+def signals_as_they_were() -> Iterator[None]:
+    """Command lines take them for the rest of their process."""
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture(autouse=True)
 def fast_kernels() -> Iterator[None]:
     """Whatever a test switches, the next one finds the fast kernels."""
     yield
@@ -117,10 +126,7 @@ def verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
             code = int(end.code or 0)
         return code, *capfd.readouterr()
 
-    handlers = {number: signal.getsignal(number) for number in SIGNALS}
     yield run
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
     logging.getLogger().handlers.clear()  # they write to what was captured
 
 

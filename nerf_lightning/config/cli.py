@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
 from nerf_lightning.config.renames import rename_given, renamed_overrides
 from nerf_lightning.errors import InputError, NoRoom
-from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, leave, listen
+from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leave, listen
 from nerf_lightning.utils.files import full_disk, no_room
 from nerf_lightning.utils.waiting import wait_briefly
 
@@ -117,6 +117,8 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
         if number is None:
             raise
         leave(number, error.go_on if isinstance(error, Interrupted) else AGAIN)
+    finally:
+        be_deaf()
 
 
 def _untold(of: threading.ExceptHookArgs) -> None:

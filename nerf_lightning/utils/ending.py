@@ -102,9 +102,14 @@ def held() -> Iterator[None]:
         leave_if_asked()
 
 
-def leave(number: int, told: str) -> NoReturn:
-    """Ends the process after a signal, with one line; what comes on the way out is no longer heard."""
+def be_deaf() -> None:
+    """From now on signals do nothing: all is done or told, and the process is on its way out."""
     _take(signal.SIG_IGN)
+
+
+def leave(number: int, told: str) -> NoReturn:
+    """Ends the process after a signal, with one line."""
+    be_deaf()
     print(f"nerf_lightning: interrupted ({signal.Signals(number).name}); {told}", file=sys.stderr, flush=True)
     sys.exit(128 + number)
 

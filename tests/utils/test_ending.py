@@ -20,12 +20,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(params=ending.SIGNALS, ids=lambda number: number.name)
 def number(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = {one: signal.getsignal(one) for one in ending.SIGNALS}
     listen()
     yield request.param
     listen()  # forgets
-    for one, handler in before.items():
-        signal.signal(one, handler)
 
 
 def test_a_signal_is_raised_where_it_comes_and_after_what_must_be_whole(number: int):
