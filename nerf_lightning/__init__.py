@@ -27,7 +27,14 @@ Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S sa
 to world; pixel centres lie at +0.5. Lengths are in the scene's own unit, colours are sRGB in [0, 1].
 """
 
+import sys
 from typing import TYPE_CHECKING, Any
+
+if sys.argv[:1] == ["-m"] and any(word.partition(".")[0] == __name__ for word in sys.orig_argv):
+    # A command line looks for its module: from here on, through all imports, Ctrl-C ends it in a line.
+    from nerf_lightning.utils.ending import end_at_once
+
+    end_at_once()
 
 if TYPE_CHECKING:
     from nerf_lightning.api import Run, View, load_run, load_scene, train

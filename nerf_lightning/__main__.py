@@ -1,5 +1,7 @@
 """Train: compose -> build -> fit -> test -> results.json. Heavy imports wait until they are needed."""
 
+import os
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
 from nerf_lightning.config import cli
+from nerf_lightning.utils.ending import Interrupted
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -21,7 +24,14 @@ def train(cfg: "DictConfig") -> float | None:
         return job(cfg)
     from nerf_lightning.training.train import train
 
-    return train(cfg)
+    try:
+        return train(cfg)
+    except Interrupted as interrupted:
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        if (folder / "checkpoints" / "last.ckpt").exists():
+            given = shlex.quote(f"resume={os.path.relpath(folder)}")
+            interrupted.go_on = f"go on with: python -m nerf_lightning {given}"
+        raise
 
 
 def main() -> None:
@@ -29,7 +39,7 @@ def main() -> None:
     resumed = [argument.removeprefix("resume=") for argument in sys.argv[1:] if argument.startswith("resume=")]
     if resumed and resumed[-1] not in ("", "null"):
         sys.argv.append(f"hydra.run.dir='{Path(resumed[-1]).absolute()}'")
-    cli.run("config", train)
+    cli.run("config", train, texts=("resume",))
 
 
 if __name__ == "__main__":

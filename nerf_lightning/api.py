@@ -30,6 +30,7 @@ from nerf_lightning.runs.open import open_scene_run
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train as train_configured
 from nerf_lightning.utils.device import the_device
+from nerf_lightning.utils.ending import listening
 from nerf_lightning.utils.options import check_options
 from nerf_lightning.utils.quiet import NOISY
 
@@ -142,6 +143,7 @@ def train(
     Raises:
         InputError: as the command line does, in one line.
         FileExistsError: if the folder holds a run.
+        KeyboardInterrupt: after Ctrl-C; the last state is saved, and the command line's `resume=` goes on from it.
     """
     if not isinstance(scene, Scene):
         scene = load_scene(scene)
@@ -161,7 +163,7 @@ def train(
     ]
     if recipe is not None:
         given.append(f"recipe={recipe}")
-    with undisturbed():
+    with undisturbed(), listening():
         train_configured(
             composed([*quoted(given, ("dataset.path", "name")), *options], place), folder=place, scene=scene
         )

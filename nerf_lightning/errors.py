@@ -1,5 +1,7 @@
 """The exception for bad input: one line that a user can act on."""
 
+from typing import Any
+
 
 class InputError(ValueError):
     """Bad input from outside: a file, a config key, a command-line value.
@@ -19,3 +21,17 @@ class InputError(ValueError):
         place = f"{where}: {key}" if key else f"{where}"
         line = f"{place}: found {found}, expected {expected}" + (f"; {todo}" if todo else "")
         super().__init__(" ".join(line.split()))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """So that it comes back whole from another process."""
+        return _told, (type(self), str(self))
+
+
+def _told(kind: type[InputError], line: str) -> InputError:
+    error = kind.__new__(kind)
+    error.args = (line,)
+    return error
+
+
+class NoRoom(InputError):
+    """A disk, a quota or a limit on files is full. Told as bad input is: the user can make room and go on."""

@@ -5,6 +5,7 @@ import re
 import runpy
 import shlex
 import shutil
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -16,6 +17,8 @@ import numpy as np
 import pytest
 from capture.views import SIZE
 from commands import BARE
+
+from nerf_lightning.utils.ending import Interrupted
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
@@ -69,7 +72,7 @@ def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     from nerf_lightning.view.scene_page import ScenePage
 
     def leave(*_: Any) -> None:
-        raise KeyboardInterrupt
+        raise Interrupted(signal.SIGINT)
 
     built = ScenePage.__init__
 

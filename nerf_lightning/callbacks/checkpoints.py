@@ -2,23 +2,65 @@
 
 import shutil
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import lightning as L
+import torch
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 
 from nerf_lightning.callbacks.attached import agreed, attached
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.system import System
+from nerf_lightning.utils.ending import Interrupted, asked, held, interrupt, listen_again
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic
+
+COPIES = 3
+"""Of all parameters in a checkpoint: themselves and Adam's two means. Other optimisers keep less."""
+NAMES = ("last.ckpt", "best.ckpt")
+
+
+class InPlace(TorchCheckpointIO):
+    """Writes where it is told. Lightning writes into memory, then into the system's temporary folder, which may be full or stay
+    full after an interruption."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
+        torch.save(checkpoint, path)
+
+
+def check_room(folder: Path, system: System) -> None:
+    """Asks, before a run begins, whether its checkpoints fit on the disk: the last, the best, and one that is being written.
+
+    Args:
+        folder: where they will be; those of a resumed run are replaced.
+        system: to be trained.
+
+    Raises:
+        NoRoom: where they do not.
+    """
+    values = sum(p.numel() for p in system.parameters()) - system.field.values + system.field.values_grown()
+    one = 4 * COPIES * values + sum(b.numel() * b.element_size() for b in system.buffers())
+    there = sum(file.stat().st_size for file in map(folder.joinpath, NAMES) if file.is_file())
+    needed = (len(NAMES) + 1) * one - there
+    existing = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.is_dir())
+    free = shutil.disk_usage(existing).free
+    if free < needed:
+        expected = (
+            f"{needed / 1e6:,.1f} MB for checkpoints (the last, the best, one being written: {one / 1e6:,.1f} MB each)"
+        )
+        raise NoRoom(folder, "", f"{free / 1e6:,.1f} MB free", expected, "make room, or callbacks.checkpoints=null")
 
 
 class Checkpoints(L.Callback):
     """Keeps `last.ckpt` and `best.ckpt` in a folder. Each is written whole, then renamed: a killed run keeps the one before.
+
+    A run that is asked to end (Ctrl-C, SIGTERM) finishes its step, or the view that it measures, and saves `last.ckpt`:
+    going on from there gives the same weights.
 
     Args:
         folder: where they go, below the run folder.
@@ -37,6 +79,11 @@ class Checkpoints(L.Callback):
         self._saved = 0.0
         self._judged = 0  # measurements compared so far
         self._tested: list[float] = []
+        self._steps = ExitStack()  # signals are held back from the first step to the last
+        self._stepping = False
+
+    def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
+        trainer.strategy.checkpoint_io = InPlace()
 
     def save(self, trainer: L.Trainer, name: str) -> None:
         path = Path(trainer.default_root_dir) / self.folder / name
@@ -49,11 +96,17 @@ class Checkpoints(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._saved = time.monotonic()
+        listen_again()  # Lightning has taken SIGTERM, and would end with 0
+        self._steps.enter_context(held())
+        self._stepping = True
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if agreed(trainer, time.monotonic() - self._saved >= self.every_seconds):
+        due, number = agreed(trainer, (time.monotonic() - self._saved >= self.every_seconds, asked()))
+        if number is not None:
+            interrupt(number)
+        if due:
             self.save(trainer, "last.ckpt")
             self._saved = time.monotonic()
         held_out = attached(trainer, HeldOut)
@@ -67,6 +120,16 @@ class Checkpoints(L.Callback):
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
         self.save(trainer, "last.ckpt")
+        self._stepping = False
+        self._steps.close()
+
+    def on_exception(self, trainer: L.Trainer, pl_module: System, exception: BaseException) -> None:
+        try:
+            if isinstance(exception, Interrupted) and self._stepping:
+                self.save(trainer, "last.ckpt")
+        finally:
+            self._stepping = False
+            self._steps.__exit__(type(exception), exception, exception.__traceback__)
 
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._tested = []

@@ -9,6 +9,7 @@ from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System, ViewResult
+from nerf_lightning.utils.ending import leave_if_asked
 from nerf_lightning.utils.evenly import evenly
 
 
@@ -67,8 +68,17 @@ class HeldOut(L.Callback):
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        due = sum(pl_module.progress >= fraction for fraction in self.at)
-        if due <= len(self.curve) or pl_module.progress >= 1.0:
+        self.measure(trainer, pl_module, pl_module.progress)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        """What an interruption left undone is measured where it was due."""
+        if trainer.global_step:
+            self.measure(trainer, pl_module, Budget.of(trainer).shared_progress(trainer))
+
+    def measure(self, trainer: L.Trainer, pl_module: System, progress: float) -> None:
+        """Measures if another of the fractions has been reached."""
+        due = sum(progress >= fraction for fraction in self.at)
+        if due <= len(self.curve) or progress >= 1.0:
             return
         with Budget.of(trainer).paused():
             data = data_of(trainer)
@@ -80,7 +90,11 @@ class HeldOut(L.Callback):
                     f"{len(chosen)} of {data.held_out_views} held-out views are measured while training, as one takes "
                     f"{self.view_seconds:.1f} s; callbacks.heldout.views={data.held_out_views} takes all"
                 )
-            results = list(pl_module.evaluate_held_out(data, chosen))
+            results: list[ViewResult] = []
+            for result in pl_module.evaluate_held_out(data, chosen):
+                results.append(result)
+                if trainer.world_size == 1:  # several processes leave together, at the end of a step
+                    leave_if_asked()
             while len(self.curve) < due:  # one step may pass several marks: one measurement counts for all
                 self.record(trainer, results)
 

@@ -4,6 +4,7 @@ import math
 import platform
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -20,8 +21,10 @@ from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
 from nerf_lightning.dataset import PictureBatch, Scene
+from nerf_lightning.errors import NoRoom
 from nerf_lightning.refine import summary
 from nerf_lightning.system import NeRF2D, NeRF3D, System, aligned_psnr, misfits, mse_to_psnr, psnr_of_photos
+from nerf_lightning.utils.ending import Interrupted
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.machine import describe_machine
 
@@ -146,10 +149,13 @@ class Results(L.Callback):
             trainer.logger.log_metrics(scores, trainer.global_step)
 
     def on_exception(self, trainer: L.Trainer, pl_module: System, exception: BaseException) -> None:
-        if isinstance(exception, KeyboardInterrupt):
-            self.write(trainer, pl_module, "stopped_early", "interrupted")
+        if isinstance(exception, Interrupted | KeyboardInterrupt):
+            if len(self.views) < data_of(trainer).held_out_views:
+                self.views = []  # the mean of some views is another figure
+            self.write(trainer, pl_module, "interrupted", f"at step {trainer.global_step}; resume= goes on")
         else:
-            self.write(trainer, pl_module, "failed", " ".join(f"{type(exception).__name__}: {exception}".split()))
+            with suppress(NoRoom):  # on a full disk what happened first is to be told
+                self.write(trainer, pl_module, "failed", " ".join(f"{type(exception).__name__}: {exception}".split()))
 
     def write(self, trainer: L.Trainer, pl_module: System, status: str, diagnosis: str) -> None:
         """Writes the file with what is known so far; what was not measured is null."""

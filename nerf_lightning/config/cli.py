@@ -4,6 +4,7 @@ import functools
 import os
 import re
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -19,7 +20,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
 from nerf_lightning.config.renames import rename_given, renamed_overrides
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leave, listen
+from nerf_lightning.utils.files import full_disk, no_room
 from nerf_lightning.utils.waiting import wait_briefly
 
 TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
@@ -68,7 +71,8 @@ def given_of(cfg: DictConfig) -> dict[str, Any]:
 
 
 def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] = ()) -> None:
-    """Composes `conf/<config>.yaml` with the command line and calls `task`; exits with 2 on bad input.
+    """Composes `conf/<config>.yaml` with the command line and calls `task`; exits with 2 on bad input or a full disk, with 130
+    after Ctrl-C and with 143 after SIGTERM.
 
     The values of the keys in `texts` may hold commas and other characters that are special to Hydra.
 
@@ -86,26 +90,53 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
         rename_given(cfg)
         try:
             return task(cfg)
-        except InputError as error:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise  # the sweep decides what becomes of the other jobs
-            folder, here = Path(HydraConfig.get().runtime.output_dir).resolve(), Path.cwd()
-            with suppress(OSError):  # a folder that is not empty stays
-                while folder != here:  # a verb may write nothing of its own
-                    folder.rmdir()
-                    folder = folder.parent if here in folder.parents else here
-            give_up(error)
+        except (Exception, Interrupted) as error:
+            told, alone = as_told(error), HydraConfig.get().mode != RunMode.MULTIRUN
+            if alone and isinstance(told, InputError | Interrupted):
+                folder, here = Path(HydraConfig.get().runtime.output_dir).resolve(), Path.cwd()
+                with suppress(OSError):  # a folder that is not empty stays
+                    while folder != here:  # a verb may write nothing of its own
+                        folder.rmdir()
+                        folder = folder.parent if here in folder.parents else here
+            if isinstance(told, NoRoom) or (alone and isinstance(told, InputError)):
+                give_up(told)  # here, as Hydra would add a line
+            raise  # a sweep decides what becomes of its other jobs
 
+    threading.excepthook = _untold
+    listen()
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
     except Exception as error:
         # Before the task starts only Hydra is at work, on the command line: any error then is bad input.
-        if started and not isinstance(error, InputError | HydraException | OmegaConfBaseException):
+        told = as_told(error)
+        if started and not isinstance(told, InputError | HydraException | OmegaConfBaseException):
             raise
-        give_up(error)
+        give_up(told)
+    except BaseException as error:  # whatever a signal has become on its way
+        number = asked()
+        if number is None:
+            raise
+        leave(number, error.go_on if isinstance(error, Interrupted) else AGAIN)
+    finally:
+        be_deaf()
 
 
-def give_up(error: Exception) -> NoReturn:
+def _untold(of: threading.ExceptHookArgs) -> None:
+    """A thread that meets a full disk, as TensorBoard's does, says nothing: whoever gives it more to write is told."""
+    if not full_disk(of.exc_value):
+        threading.__excepthook__(of)
+
+
+def as_told(error: BaseException) -> BaseException:
+    """An error as it is; a full disk, wherever it showed, as bad input."""
+    if isinstance(error, InputError) or not full_disk(error):
+        return error
+    told = no_room(getattr(error, "filename", None) or Path.cwd())
+    told.__cause__ = error
+    return told
+
+
+def give_up(error: BaseException) -> NoReturn:
     """Prints the error in one line, with its traceback if the environment asks for it, and exits with 2."""
     if os.environ.get(TRACEBACK) == "1":
         traceback.print_exception(error)

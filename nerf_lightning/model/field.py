@@ -27,6 +27,15 @@ class AnyField(torch.nn.Module):
     sizing: str = ""
     """One line on how the field's size follows from the data; "" if it does not."""
 
+    @property
+    def values(self) -> int:
+        """How many numbers it learns at its present size."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
+    def values_grown(self) -> int:
+        """How many it will learn at its full size, as far as that is known beforehand."""
+        return self.values
+
     def warm_start_from(self, smaller: Any) -> None:
         """Copies the function of a smaller field of the same kind, as far as possible, leaving the rest free to learn.
 

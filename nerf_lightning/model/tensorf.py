@@ -1,5 +1,6 @@
 """TensoRF (Chen et al. 2022): volumes as sums of planes times lines, and the field that reads from them."""
 
+import copy
 from typing import Any
 
 import torch
@@ -192,6 +193,11 @@ class TensoRFField(Field):
         products = [mode * has + one for mode in range(3) for one in range(had)]
         columns = torch.tensor([*products, *range(3 * has, 3 * has + smaller.terms)])
         widen_all(self.colour_net, smaller.colour_net, columns)
+
+    def values_grown(self) -> int:
+        grown = copy.deepcopy(self).to("meta")  # shapes without numbers
+        grown.grow(1.0)
+        return grown.values
 
     def grows_at(self, progress: float) -> bool:
         return self.density_volume.cells < self.resolution_at(progress)

@@ -1,6 +1,5 @@
 """python -m nerf_lightning.render: a run along a camera path. Heavy imports wait until there is work."""
 
-import sys
 from typing import TYPE_CHECKING
 
 from nerf_lightning.config import cli
@@ -18,11 +17,7 @@ def task(cfg: "DictConfig") -> None:
 
     from nerf_lightning.render.verb import render
 
-    try:
-        render(RenderOptions(**given))
-    except KeyboardInterrupt:
-        print("interrupted: the same command goes on from here", file=sys.stderr)
-        sys.exit(130)
+    render(RenderOptions(**given))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerf_lightning.config import cli, conf_dir
-from nerf_lightning.errors import InputError
 from nerf_lightning.utils.options import check_options
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ def task(cfg: "DictConfig") -> None:
     """Checks the configuration and searches.
 
     Raises:
-        InputError: for a wrong key, or a folder that holds something already.
+        InputError: for a wrong key, or a folder that holds something else already.
     """
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
@@ -40,17 +39,17 @@ def task(cfg: "DictConfig") -> None:
     if target["psnr"] is None and target["within_db"] is None:
         target["within_db"] = WITHIN_DB
     output = Path(cfg.output).expanduser()
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise InputError(output, "", "something in it already", "a folder for this search alone", "give output=DIR")
 
     from nerf_lightning.rightsize.choose import Target
     from nerf_lightning.rightsize.ladder import read_ladder
     from nerf_lightning.rightsize.report import write_report
     from nerf_lightning.rightsize.search import search
+    from nerf_lightning.rightsize.start import begin
 
     goal = Target(**target)
     ladder = read_ladder(cfg.ladder or cfg.method, conf_dir() / "ladders")
     run = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key not in OWN])
+    begin(output, run, goal, ladder)
     found = search(run, goal, ladder, output)
     write_report(found, run, dict(HydraConfig.get().runtime.choices), output)
 

@@ -13,6 +13,7 @@ from nerf_lightning.rightsize.choose import knee
 from nerf_lightning.rightsize.climb import Rung, set_options
 from nerf_lightning.rightsize.ladder import overrides
 from nerf_lightning.rightsize.search import Found, Full, figures
+from nerf_lightning.rightsize.start import REPORT
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.utils.files import atomic, write_json
 from nerf_lightning.utils.machine import describe_machine
@@ -32,10 +33,10 @@ def write_report(found: Found, cfg: DictConfig, choices: dict[str, Any], output:
         choices: which option of each Hydra group was taken.
         output: the folder.
     """
-    write_json(output / "rightsize.json", as_json(found))
     write_png(output / "chart.png", pixels_of(chart(found)))
     with atomic(output / "best.yaml") as temporary:
         temporary.write_text(experiment(found, cfg, choices), encoding="utf-8")
+    write_json(output / REPORT, as_json(found))  # last: with it the search is done
     one = found.full[found.choice]
     print(found.reason)
     print(

@@ -29,6 +29,7 @@ from nerf_lightning.rightsize.climb import Rung, climb, coarsest_sampler, compac
 from nerf_lightning.rightsize.ladder import Ladder, Options
 from nerf_lightning.runs.folder import load_run, plain_config
 from nerf_lightning.runs.index import read_run
+from nerf_lightning.training.before import left_in
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.quiet import quiet
@@ -73,6 +74,9 @@ class Found:
 
 def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Found:
     """Finds the smallest rung that is good enough, and leaves it trained in full, with its compact file.
+
+    A search that was interrupted climbs again, for as long and to where it did before; what was trained in full
+    is not trained again.
 
     Raises:
         InputError: where the device is not there, or the data, or an option of the ladder, is no good.
@@ -130,9 +134,13 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
 
 
 def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Any, folder: Path) -> Full:
-    """A run of its own, with the whole budget, as if nothing else ran beside it."""
+    """A run of its own, with the whole budget, as if nothing else ran beside it. One that is there is not trained again, one
+    that was interrupted goes on."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
-    train(set_options(whole, "budget", {"alone": True}), folder=folder)
+    whole = set_options(whole, "budget", {"alone": True})
+    done, checkpoint = left_in(folder, whole)
+    if done is None:
+        train(whole, checkpoint, folder)
     results = read_run(folder).results
     run = load_run(folder, device=device_of(cfg))
     size = compact_bytes(run.cfg, run.system, data)

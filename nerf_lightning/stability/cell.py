@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from nerf_lightning.config.resolvers import slug
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.stability.conditions import CONDITIONS, LARGER, Condition
 from nerf_lightning.stability.methods import METHODS, Method
-from nerf_lightning.utils.files import write_json
+from nerf_lightning.utils.files import full_disk, write_json
 
 OUTCOME = "cell.json"
 
@@ -132,9 +132,13 @@ def _train(cell: Cell, folder: Path) -> Outcome:
             psnr = psnr if between is None else between  # None where every byte is right
         recoveries = len(results["recoveries"])
         alarm = "; ".join([*results["warnings"], *([diagnosis] if status == "finished" and diagnosis else [])])
+    except NoRoom:
+        raise  # says nothing about the method
     except InputError as error:
         status, diagnosis = "refused", str(error).replace(str(path), condition.name)
     except Exception as error:  # noqa: BLE001  (failures are what the suite looks for)
+        if full_disk(error):
+            raise
         diagnosis = " ".join(f"{type(error).__name__}: {error}".split())
     path.unlink(missing_ok=True)
     return Outcome(cell.condition, cell.method, cell.seed, method.guard, psnr, status, diagnosis, recoveries, alarm)

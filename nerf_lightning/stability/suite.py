@@ -2,8 +2,10 @@
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from pathlib import Path
 
 from nerf_lightning.stability.cell import Cell, Outcome, run
@@ -32,17 +34,34 @@ def cells_of(conditions: Sequence[str], methods: Sequence[str], seeds: int, step
 
 
 def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Iterator[tuple[Cell, Outcome]]:
-    """Trains cells in processes of one thread each; yields them as they end."""
+    """Trains cells in processes of one thread each; yields them as they end. They end with this process: cells that are done
+    have been written down."""
     count = min(workers or cores(), len(cells))
     context = multiprocessing.get_context("spawn")  # numba and torch's threads do not survive a fork
     with ProcessPoolExecutor(count, context, _prepare) as pool:
-        pending = {pool.submit(run, cell, root): cell for cell in cells}
+        with _unheard():
+            pending = {pool.submit(run, cell, root): cell for cell in cells}
         try:
             for done in as_completed(pending):
                 yield pending[done], done.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            for child in multiprocessing.active_children():
+                child.terminate()
             raise
+
+
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """Processes that start meanwhile never hear Ctrl-C, which a terminal sends to them too: their parent ends them."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _prepare() -> None:

@@ -14,9 +14,10 @@ from hydra.experimental.callback import Callback
 from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.config import cli  # noqa: F401  (a job's process needs its resolvers)
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.runs.index import FINISHED, Run, failed_results, find_runs, read_run, varied
-from nerf_lightning.utils.files import atomic, write_json
+from nerf_lightning.utils.ending import AGAIN, listen_again
+from nerf_lightning.utils.files import atomic, full_disk, write_json
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -32,10 +33,13 @@ STATE = ("final.png", "checkpoints", "snapshots")
 
 
 def job(cfg: "DictConfig") -> float | None:
-    """One job of a sweep: skipped if it is done, resumed if it was stopped. Never raises.
+    """One job of a sweep: skipped if it is done, resumed if it was stopped.
 
     Returns:
         The held-out PSNR in dB; None for a job that failed.
+
+    Raises:
+        NoRoom, OSError: for a full disk, which would end the other jobs too.
     """
     from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
@@ -43,17 +47,15 @@ def job(cfg: "DictConfig") -> float | None:
     root = Path(HydraConfig.get().sweep.dir)
     leader = getattr(rank_zero_only, "rank", 0) == 0  # if several processes share a job, only the first writes
     try:
-        from nerf_lightning.runs.folder import plain_config
+        from nerf_lightning.training.before import left_in
         from nerf_lightning.training.train import train
 
-        before = read_run(folder)
-        same = before.config == plain_config(cfg)
-        if same and before.status in FINISHED:
-            told = "without a figure" if before.psnr is None else f"{before.psnr:.2f} dB"
-            print(f"{folder.name}: done before ({before.status}, {told})", flush=True)
-            return before.psnr
-        last = folder / "checkpoints" / "last.ckpt"
-        checkpoint = last if same and usable(last) else None
+        listen_again()  # this may be a process of a launcher
+        done, checkpoint = left_in(folder, cfg)
+        if done is not None:
+            told = "without a figure" if done.psnr is None else f"{done.psnr:.2f} dB"
+            print(f"{folder.name}: done before ({done.status}, {told})", flush=True)
+            return done.psnr
         if leader:
             for name in OUTCOME if checkpoint else OUTCOME + STATE:
                 remove(folder / name)
@@ -62,22 +64,13 @@ def job(cfg: "DictConfig") -> float | None:
     except Exception as error:  # noqa: BLE001  (recorded with its traceback; the other jobs must go on)
         if leader:
             record(folder, cfg, error)
+        if full_disk(error):  # and for the jobs after it
+            raise
         return None
     finally:
-        with suppress(InputError):  # interrupted before any job wrote something
+        with suppress(InputError):  # interrupted before any job wrote something, or a full disk, which has been told
             if leader:
                 write_table(root, find_runs(root))
-
-
-def usable(checkpoint: Path) -> bool:
-    """Whether a checkpoint exists and is complete."""
-    from nerf_lightning.runs.folder import read_checkpoint
-
-    try:
-        read_checkpoint(checkpoint)
-    except InputError:
-        return False
-    return True
 
 
 def remove(path: Path) -> None:
@@ -88,19 +81,21 @@ def remove(path: Path) -> None:
 
 
 def record(folder: Path, cfg: "DictConfig", error: Exception) -> None:
-    """Writes what went wrong: to results.json, unless the run wrote one itself, and with its traceback to error.txt."""
+    """Writes what went wrong: to results.json, unless the run wrote one itself, and with its traceback to error.txt; on a full
+    disk as much of it as there is room for."""
     from nerf_lightning.runs.folder import save_config
 
     diagnosis = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     diagnosis = " ".join(diagnosis.split())
     print(f"{folder.name}: failed: {diagnosis}", file=sys.stderr, flush=True)
-    if not (folder / "config.yaml").exists():
-        with suppress(OmegaConfBaseException):  # the configuration itself may be what failed
-            save_config(cfg, folder)
-    with atomic(folder / "error.txt") as temporary:
-        temporary.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
-    if read_run(folder).status != "failed":
-        write_json(folder / "results.json", failed_results(cfg.get("method"), cfg.get("seed"), diagnosis))
+    with suppress(NoRoom):
+        if not (folder / "config.yaml").exists():
+            with suppress(OmegaConfBaseException):  # the configuration itself may be what failed
+                save_config(cfg, folder)
+        if read_run(folder).status != "failed":
+            write_json(folder / "results.json", failed_results(cfg.get("method"), cfg.get("seed"), diagnosis))
+        with atomic(folder / "error.txt") as temporary:
+            temporary.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
 
 
 def write_table(root: Path, runs: Sequence[Run]) -> None:
@@ -174,12 +169,15 @@ class SweepReport(Callback):
         runs = find_runs(root)
         write_table(root, runs)
         print_table(root, runs)
-        failed = [run for run in runs if run.status not in FINISHED and run.status != "stopped_early"]
+        failed = [run for run in runs if run.status not in (*FINISHED, "stopped_early", "interrupted")]
+        stopped = [run for run in runs if run.status == "interrupted"]
         try:
             print(f"table: {root / TABLE}; figure: {write_contact_figure(root, runs)}")
             print(f"speed against accuracy: python -m nerf_lightning.chart runs={root}")
         finally:
-            if failed:
-                told = ", ".join(str(run.folder.relative_to(root)) for run in failed)
-                print(f"nerf_lightning: {len(failed)} of {len(runs)} jobs failed: {told}", file=sys.stderr)
+            for some, what in ((failed, "failed"), (stopped, f"were interrupted ({AGAIN})")):
+                if some:
+                    told = ", ".join(str(run.folder.relative_to(root)) for run in some)
+                    print(f"nerf_lightning: {len(some)} of {len(runs)} jobs {what}: {told}", file=sys.stderr)
+            if failed or stopped:
                 sys.exit(1)

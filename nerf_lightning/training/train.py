@@ -13,7 +13,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from nerf_lightning.callbacks import Results
+from nerf_lightning.callbacks import Checkpoints, Results
+from nerf_lightning.callbacks.attached import attached
+from nerf_lightning.callbacks.checkpoints import check_room
 from nerf_lightning.config.build import (
     build_data,
     build_system,
@@ -97,7 +99,10 @@ def train(
     results = Results("results.json", cfg.method, cfg.seed, [doubt.text for doubt in doubts])
     trainer = build_trainer(cfg, folder, device, results)
     check_processes(trainer)
+    checkpoints = attached(trainer, Checkpoints)
     if trainer.is_global_zero:
+        if checkpoints is not None:
+            check_room(folder / checkpoints.folder, system)
         save_config(cfg, folder)
         save_scene(data, folder)
     with trainer.precision_plugin.train_step_context():

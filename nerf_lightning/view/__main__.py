@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from nerf_lightning.config import cli
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.ending import Interrupted
 from nerf_lightning.utils.options import AtLeast, Count, check_options
 from nerf_lightning.view.serve import announcement, find_port, require_viser
 
@@ -49,7 +50,7 @@ def task(cfg: "DictConfig") -> None:
         raise InputError("config", "scene and run", found, "one of the two", "give scene=scene.npz or run=DIR")
     require_viser()
     address, port = find_port(given["host"], given["port"])
-    with suppress(KeyboardInterrupt):
+    with suppress(Interrupted):
         page = (page_of_scene if given["run"] is None else page_of_run)(given, port)
         try:
             print(announcement(page.name, given["host"], address, given["port"], page.port), flush=True)

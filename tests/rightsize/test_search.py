@@ -1,6 +1,7 @@
 """The verb as a user meets it, on small scenes."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,9 +10,15 @@ import yaml
 from nerf_lightning.config import cli
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
+from nerf_lightning.errors import InputError
 from nerf_lightning.rightsize.__main__ import task
+from nerf_lightning.rightsize.choose import Target
+from nerf_lightning.rightsize.ladder import Ladder
+from nerf_lightning.rightsize.start import begin
 from nerf_lightning.runs.compact import load_compact
+from nerf_lightning.runs.folder import load_config
 from nerf_lightning.stability.toys import PILE, toy
+from nerf_lightning.training.before import left_in
 
 RUNGS = [
     {"density_components": 3, "colour_components": 3, "coarsest": 4, "finest": 4, "width": 8, "stages": 1},
@@ -91,6 +98,29 @@ def test_a_target_out_of_reach_is_told(given: list[str], tmp_path: Path):
 def test_bad_input_is_told_in_one_line(extra: list[str], message: str, given: list[str], verb):
     code, _, err = verb(lambda: cli.run("rightsize", task), *given, *extra)
     assert code == 2 and err.count("\n") == 1 and message in err
+
+
+def test_a_search_goes_on_where_the_same_one_was_interrupted(given: list[str], tmp_path: Path):
+    cfg, ladder, output = composed(given, tmp_path, "rightsize"), Ladder(RUNGS, []), tmp_path / "found"
+    begin(output, cfg, Target(psnr=14), ladder)
+    begin(output, cfg, Target(psnr=14), ladder)
+    for target, sizes in ((Target(psnr=15), RUNGS), (Target(psnr=14), RUNGS[:2])):
+        with pytest.raises(InputError, match="another search in it already"):
+            begin(output, cfg, target, Ladder(sizes, []))
+    (output / "rightsize.json").write_text("{}")
+    with pytest.raises(InputError, match="a finished search in it already"):
+        begin(output, cfg, Target(psnr=14), ladder)
+
+
+def test_what_was_trained_in_full_is_not_trained_again(small_run: Path, tmp_path: Path):
+    folder = shutil.copytree(small_run, tmp_path / "run")
+    cfg = load_config(folder)
+    done, checkpoint = left_in(folder, cfg)
+    assert done is not None and checkpoint is None
+    (folder / "results.json").write_text(json.dumps({**done.results, "status": "interrupted"}))
+    assert left_in(folder, cfg) == (None, folder / "checkpoints" / "last.ckpt")
+    cfg.seed += 1
+    assert left_in(folder, cfg) == (None, None), "another run"
 
 
 def test_a_picture_has_a_ladder_too(tmp_path: Path):

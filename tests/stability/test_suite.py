@@ -1,5 +1,6 @@
 """The suite: which cells there are, what becomes of one, and what is made of all."""
 
+import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -76,6 +77,18 @@ def test_a_cell_is_done_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         run(cell, tmp_path)
     with pytest.raises(pytest.fail.Exception):
         run(replace(cell, steps=21), tmp_path)
+
+
+def test_a_full_disk_says_nothing_about_a_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    cell = Cell("2D: clean", "2D mlp", 0, 1)
+
+    def full(cfg: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("nerf_lightning.training.train.train", full)
+    with pytest.raises(OSError):
+        run(cell, tmp_path)
+    assert not (cell.folder(tmp_path) / "cell.json").exists()
 
 
 def test_a_relu_network_dies_without_the_guard_and_lives_with_it(tmp_path: Path):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -82,6 +83,26 @@ def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(
     code, out, err = inside(*small, "budget.steps=10", "name=broken", steps)
     assert "seed=0: done before" in out and "seed=1: starts" in out
     assert not (broken / "error.txt").exists()
+
+
+def test_a_sweep_that_is_interrupted_tells_so_and_goes_on_with_the_same_command(inside, tmp_path: Path, monkeypatch):
+    from nerf_lightning.callbacks import Progress
+
+    def stop(self, trainer, *given):
+        if trainer.global_step == 2 and trainer.lightning_module.seed == 1:
+            signal.raise_signal(signal.SIGTERM)
+
+    line = ["-m", *SMALL, *BARE, "model.width=8", "seed=0,1"]
+    with monkeypatch.context() as patch:
+        patch.setattr(Progress, "on_train_batch_end", stop)
+        code, out, err = inside(*line)
+    assert (code, err) == (143, "nerf_lightning: interrupted (SIGTERM); the same command goes on\n")
+    (root,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
+    rows = table(root)
+    assert rows["seed=1"]["status"] == "interrupted" and "step 2" in rows["seed=1"]["diagnosis"]
+    code, out, err = inside(*line)
+    assert code == 0 and "seed=0: done before" in out and "seed=1: goes on from its last checkpoint" in out, err
+    assert "interrupted" not in {row["status"] for row in table(root).values()}
 
 
 def test_a_sweep_of_an_earlier_version_goes_on(inside, tmp_path: Path):

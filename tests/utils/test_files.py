@@ -1,11 +1,14 @@
 import json
 import os
+import resource
 import stat
 from pathlib import Path
 
 import pytest
+import torch
 
-from nerf_lightning.utils.files import atomic, write_json
+from nerf_lightning.errors import NoRoom
+from nerf_lightning.utils.files import atomic, atomic_folder, write_json
 
 
 def test_a_finished_block_replaces_the_file(tmp_path: Path):
@@ -36,6 +39,22 @@ def test_a_failed_block_leaves_nothing_behind(existing: bool, error: type[BaseEx
         temporary.write_text("half")
         raise error
     assert [p.read_text() for p in tmp_path.iterdir()] == ["old"] * existing
+
+
+def test_on_a_full_disk_what_stood_there_stays_whatever_the_writer_says(tmp_path: Path):
+    path, (soft, hard) = tmp_path / "a.ckpt", resource.getrlimit(resource.RLIMIT_FSIZE)
+    path.write_text("old")
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (5000, hard))
+        with pytest.raises(NoRoom, match="a.ckpt: found no space left"), atomic(path) as temporary:
+            torch.save(torch.zeros(5000), temporary)  # raises a RuntimeError that does not say why
+        with pytest.raises(NoRoom), atomic_folder(tmp_path / "b") as folder:
+            (folder / "c").write_bytes(bytes(9000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["old"]
+    with pytest.raises(RuntimeError, match="something else"), atomic(path):
+        raise RuntimeError("something else")
 
 
 def test_results_are_ordinary_files(tmp_path: Path):

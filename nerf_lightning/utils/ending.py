@@ -1,0 +1,132 @@
+"""How a process ends when it is asked to: Ctrl-C (SIGINT) and SIGTERM do the same. Imports nothing heavy.
+
+A signal raises `Interrupted` wherever the process is, so that blocks are left and temporary files go; inside `held` it only is
+noted, until the block ends or `leave_if_asked` says that here is a good place. Exit codes are those of shells, 128 + signal.
+"""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+AGAIN = "the same command goes on"
+_asked: int | None = None
+_pending = False  # not raised yet
+_holding = 0
+
+
+class Interrupted(BaseException):
+    """The process was asked to end.
+
+    Not an Exception, as nothing has failed; not a KeyboardInterrupt, which Lightning would turn into an exit code of 1.
+
+    Args:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int):
+        super().__init__(number)
+        self.number = number
+        self.go_on = AGAIN
+        """What the user can do, for the line that is printed."""
+
+
+def listen() -> None:
+    """From now on signals raise `Interrupted`; those before are forgotten."""
+    global _asked, _pending
+    _asked, _pending = None, False
+    _take(_raise)
+
+
+def listen_again() -> None:
+    """Takes signals back from libraries, and listens in processes that others have started."""
+    _take(_raise)
+
+
+def end_at_once() -> None:
+    """From now on signals end the process with one line: before `listen`, while there is nothing to lose."""
+    _take(_exit)
+
+
+@contextmanager
+def listening() -> Iterator[None]:
+    """Listens for a while in somebody else's process. The signal then does there what it would have done."""
+    global _asked, _pending
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    listen()
+    try:
+        yield
+    finally:
+        number = _asked
+        _asked, _pending = None, False
+        if threading.current_thread() is threading.main_thread():
+            for one, handler in before.items():
+                signal.signal(one, handler)
+        if number is not None:
+            signal.raise_signal(number)
+
+
+def asked() -> int | None:
+    """The signal that asked this process to end, or None."""
+    return _asked
+
+
+def interrupt(number: int) -> NoReturn:
+    """Raises `Interrupted`, once for the signals that have come so far."""
+    global _pending
+    _pending = False
+    raise Interrupted(number)
+
+
+def leave_if_asked() -> None:
+    """Raises `Interrupted` if a signal has come, also one that was lost: what is raised in a clean-up is."""
+    if _asked is not None:
+        interrupt(_asked)
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Holds signals back for a block that must be done whole or not at all; raises `Interrupted` after it."""
+    global _holding
+    _holding += 1
+    try:
+        yield
+    finally:
+        _holding -= 1
+    if _pending and not _holding:
+        leave_if_asked()
+
+
+def be_deaf() -> None:
+    """From now on signals do nothing: all is done or told, and the process is on its way out."""
+    _take(signal.SIG_IGN)
+
+
+def leave(number: int, told: str) -> NoReturn:
+    """Ends the process after a signal, with one line."""
+    be_deaf()
+    print(f"nerf_lightning: interrupted ({signal.Signals(number).name}); {told}", file=sys.stderr, flush=True)
+    sys.exit(128 + number)
+
+
+def _take(handler: object) -> None:
+    if threading.current_thread() is threading.main_thread():  # elsewhere Python does not allow it
+        for number in SIGNALS:
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    global _asked, _pending
+    _asked, _pending = _asked or number, True
+    if not _holding:
+        interrupt(_asked)
+
+
+def _exit(number: int, frame: FrameType | None) -> None:
+    os.write(2, f"nerf_lightning: interrupted ({signal.Signals(number).name}) before anything began\n".encode())
+    os._exit(128 + number)
