@@ -19,9 +19,9 @@ def train(cfg: "DictConfig") -> float | None:
         from nerf_lightning.training.sweep import job
 
         return job(cfg)
-    from nerf_lightning.training.train import train
+    from nerf_lightning.training.command import run
 
-    return train(cfg)
+    return run(cfg)
 
 
 def main() -> None:
