@@ -1,10 +1,10 @@
 """python -m nerf_lightning.rightsize: the smallest model that is good enough. Heavy imports wait until there is work."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerf_lightning.config import cli, conf_dir
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import output_path
 from nerf_lightning.utils.options import check_options
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ def task(cfg: "DictConfig") -> None:
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
+    from nerf_lightning.runs.owner import LOCK, owned
+
     given = OmegaConf.to_container(cfg.target)
     assert isinstance(given, dict)  # of a DictConfig
     target = {str(key): value for key, value in given.items()}
@@ -39,8 +41,8 @@ def task(cfg: "DictConfig") -> None:
     check_options("target", targets, target)
     if target["psnr"] is None and target["within_db"] is None:
         target["within_db"] = WITHIN_DB
-    output = Path(cfg.output).expanduser()
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+    output = output_path(cfg.output)
+    if output.exists() and (not output.is_dir() or any(one.name != LOCK for one in output.iterdir())):
         raise InputError(output, "", "something in it already", "a folder for this search alone", "give output=DIR")
 
     from nerf_lightning.rightsize.choose import Target
@@ -51,8 +53,9 @@ def task(cfg: "DictConfig") -> None:
     goal = Target(**target)
     ladder = read_ladder(cfg.ladder or cfg.method, conf_dir() / "ladders")
     run = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key not in OWN])
-    found = search(run, goal, ladder, output)
-    write_report(found, run, dict(HydraConfig.get().runtime.choices), output)
+    with owned(output):
+        found = search(run, goal, ladder, output)
+        write_report(found, run, dict(HydraConfig.get().runtime.choices), output)
 
 
 if __name__ == "__main__":
