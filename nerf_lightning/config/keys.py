@@ -47,7 +47,7 @@ def without_nulls(arguments: Sequence[str]) -> list[str]:
     return found
 
 
-def check_keys(cfg: DictConfig, config: str, choices: Mapping[str, str]) -> None:
+def check_keys(cfg: DictConfig, config: str, choices: Mapping[str, str | None]) -> None:
     """Leaves out what was set to null, and refuses keys that nothing reads. Options of a group are checked when it is built.
 
     Args:
