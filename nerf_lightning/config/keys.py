@@ -63,7 +63,7 @@ def check_keys(cfg: DictConfig, config: str, choices: Mapping[str, str | None]) 
             if choices.get(group) == NONE:
                 cfg[group] = None
     known = _known(config)
-    if not set(cfg) <= set(known):
+    if "dataset" in choices and not set(cfg) <= set(known):  # what shipped experiments add
         for file in (conf_dir() / "experiment").glob("*.yaml"):
             known = {**_content(file.stem, "experiment", ("hydra", "defaults")), **known}
     packages = {re.split("[/.]", name.rpartition("@")[2])[0] for name in choices}
