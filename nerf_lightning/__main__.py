@@ -22,10 +22,10 @@ def train(cfg: "DictConfig") -> float | None:
         from nerf_lightning.training.sweep import job
 
         return job(cfg)
-    from nerf_lightning.training.train import train
+    from nerf_lightning.training.command import run
 
     try:
-        return train(cfg)
+        return run(cfg)
     except Interrupted as interrupted:
         folder = Path(HydraConfig.get().runtime.output_dir)
         if (folder / "checkpoints" / "last.ckpt").exists():

@@ -27,10 +27,12 @@ from nerf_lightning.export.verb import export
 from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.runs.open import open_scene_run
+from nerf_lightning.runs.owner import Taken, may_overwrite, own_folder
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train as train_configured
 from nerf_lightning.utils.device import the_device
 from nerf_lightning.utils.ending import listening
+from nerf_lightning.utils.files import user_path
 from nerf_lightning.utils.options import check_options
 from nerf_lightning.utils.quiet import NOISY
 
@@ -80,7 +82,7 @@ class Run:
         Raises:
             InputError: as the verb does.
         """
-        output = Path(path).expanduser()
+        output = user_path(path)
         given = [f"run={self.path}", f"output={output}", f"format={format}", f"device={self.system.device.type}"]
         with undisturbed():
             keys = given_of(composed([*quoted(given, ("run", "output")), *options], self.path, "export"))
@@ -99,7 +101,7 @@ def load_scene(path: str | Path, resize: int | None = None) -> Scene:
     Raises:
         InputError: if there is none, or it is damaged.
     """
-    return open_scene(os.path.abspath(Path(path).expanduser()), resize=resize)
+    return open_scene(os.path.abspath(user_path(path)), resize=resize)
 
 
 def load_run(path: str | Path, device: str = "auto") -> Run:
@@ -112,7 +114,7 @@ def load_run(path: str | Path, device: str = "auto") -> Run:
     Raises:
         InputError: if there is none, it is broken or a picture's, or the device is not available.
     """
-    place = Path(path).expanduser()
+    place = user_path(path)
     with undisturbed():
         found = open_scene_run(place, the_device(device))
     return Run(place, found.system, found.orbit, read_run(place).results if place.is_dir() else {})
@@ -137,20 +139,18 @@ def train(
         seconds, steps: length of the training; with both, whichever ends first; without either, 90 seconds.
         seed: of weights, batches and jitter: the same seed, threads and steps give the same weights.
         device: auto, cpu, cuda or mps.
-        folder: of the run; None creates one below outputs/, named after the scene and the time.
+        folder: of the run, which it owns while it trains; None creates one below outputs/, named after the scene and the time.
         options: anything else the command line takes, such as ["renderer.background=white", "model.width=64"].
 
     Raises:
         InputError: as the command line does, in one line.
-        FileExistsError: if the folder holds a run.
+        FileExistsError: if the folder holds a run (options=["overwrite=true"] replaces it), or one is going on in it.
         KeyboardInterrupt: after Ctrl-C; the last state is saved, and the command line's `resume=` goes on from it.
     """
     if not isinstance(scene, Scene):
         scene = load_scene(scene)
     now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    place = Path("outputs", scene.name, now) if folder is None else Path(folder).expanduser()
-    if (place / "config.yaml").exists():
-        raise FileExistsError(f"{place} holds a run; load_run opens it, another folder= keeps both")
+    place = Path("outputs", scene.name, now) if folder is None else user_path(folder)
     given = [
         "dataset=photos",
         f"dataset.path={scene.source}",
@@ -164,9 +164,12 @@ def train(
     if recipe is not None:
         given.append(f"recipe={recipe}")
     with undisturbed(), listening():
-        train_configured(
-            composed([*quoted(given, ("dataset.path", "name")), *options], place), folder=place, scene=scene
-        )
+        cfg = composed([*quoted(given, ("dataset.path", "name")), *options], place)
+        try:
+            with own_folder(place, may_overwrite(cfg), renamed=folder is None) as place:
+                train_configured(cfg, folder=place, scene=scene)
+        except Taken as error:
+            raise FileExistsError(f"{error}; load_run opens it, another folder= keeps both") from error
     return load_run(place, device)
 
 

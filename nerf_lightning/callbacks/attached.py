@@ -10,6 +10,18 @@ Kind = TypeVar("Kind", bound=L.Callback)
 Value = TypeVar("Value")
 
 
+class ChecksData(L.Callback):
+    """A callback whose options must fit the data."""
+
+    def check(self, data: RayDataModule | PixelDataModule) -> None:
+        """Called before a run writes anything.
+
+        Raises:
+            InputError: where they do not.
+        """
+        raise NotImplementedError
+
+
 def attached(trainer: L.Trainer, kind: type[Kind]) -> Kind | None:
     """The trainer's callback of a kind, or None."""
     return next((callback for callback in trainer.callbacks if isinstance(callback, kind)), None)  # type: ignore[attr-defined]

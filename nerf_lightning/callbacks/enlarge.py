@@ -6,16 +6,16 @@ import cv2
 import lightning as L
 import numpy as np
 
-from nerf_lightning.callbacks.attached import picture_of
+from nerf_lightning.callbacks.attached import ChecksData, picture_of
 from nerf_lightning.callbacks.picture.baselines import quality_of, words
-from nerf_lightning.dataset import pixel_grid
+from nerf_lightning.dataset import PixelDataModule, RayDataModule, pixel_grid
 from nerf_lightning.drawing.panels import panel, to_bytes, write_png
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF2D
 from nerf_lightning.utils.files import write_json
 
 
-class Enlarge(L.Callback):
+class Enlarge(ChecksData):
     """Renders a 2D field at another scale after the test: enlarged.png alone, enlarged_panel.png beside bicubic.
 
     If the picture was shrunk for training (`dataset.max_side`) or is the built-in one, the true larger picture is known, and
@@ -35,9 +35,11 @@ class Enlarge(L.Callback):
             raise InputError("render.scale", "", str(scale), "above 0, or null for none")
         self.scale = scale
 
-    def setup(self, trainer: L.Trainer, pl_module: NeRF2D, stage: str) -> None:
-        width, height = picture_of(trainer).size
-        if self.scale is not None and self.scale**2 * width * height > self.MOST:
+    def check(self, data: RayDataModule | PixelDataModule) -> None:
+        if self.scale is None or not isinstance(data, PixelDataModule):
+            return
+        width, height = data.scene.size
+        if self.scale**2 * width * height > self.MOST:
             raise InputError("render.scale", "", str(self.scale), f"a picture of at most {self.MOST} pixels")
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF2D) -> None:

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import data_of
+from nerf_lightning.callbacks.attached import ChecksData, data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.dataset import Scene
+from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.view.serve import announcement, find_port, require_viser
@@ -21,7 +21,7 @@ ONE = 0.06
 """Seconds that one picture may take."""
 
 
-class Live(L.Callback):
+class Live(ChecksData):
     """Serves a page that shows the field between training steps, with the training clock stopped.
 
     It draws only while somebody is looking, and for at most a share of the time.
@@ -52,13 +52,16 @@ class Live(L.Callback):
         self._credit = 0.0
         self._seen = 0.0
 
+    def check(self, data: RayDataModule | PixelDataModule) -> None:
+        if isinstance(data, PixelDataModule):
+            raise InputError("config", "callbacks", "live", "a scene's run", "pictures have training.gif")
+        require_viser()
+
     def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
         if stage != "fit" or not trainer.is_global_zero:
             return
         scene = data_of(trainer).scene
-        if not isinstance(pl_module, NeRF3D) or not isinstance(scene, Scene):
-            raise InputError("config", "callbacks", "live", "a scene's run", "pictures have training.gif")
-        require_viser()
+        assert isinstance(pl_module, NeRF3D) and isinstance(scene, Scene)  # `check` sees to it
         address, free = find_port(self.host, self.port)
 
         from nerf_lightning.view.field_page import FieldPage

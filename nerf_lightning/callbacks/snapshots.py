@@ -5,8 +5,9 @@ from typing import Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import data_of
+from nerf_lightning.callbacks.attached import ChecksData, data_of
 from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.drawing.panels import narrowed, result_panel, to_bytes, write_png
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
@@ -21,7 +22,7 @@ def log_spaced(step: int) -> bool:
     return digits[0] in "125" and not digits[1:].strip("0")
 
 
-class Snapshots(L.Callback):
+class Snapshots(ChecksData):
     """Writes truth, render and depth of one held-out view as PNG and to TensorBoard, and once more at the end.
 
     `final` is the latest render alone.
@@ -33,7 +34,7 @@ class Snapshots(L.Callback):
         final: the latest render, below the run folder.
 
     Raises:
-        InputError: at the start of training, if there is no such view.
+        InputError: from `check`, if there is no such view.
     """
 
     def __init__(
@@ -47,8 +48,8 @@ class Snapshots(L.Callback):
     def due(self, step: int) -> bool:
         return step in self.steps if self.steps is not None else step >= 10 and log_spaced(step)
 
-    def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
-        views = data_of(trainer).held_out_views
+    def check(self, data: RayDataModule | PixelDataModule) -> None:
+        views = data.held_out_views
         if not 0 <= self.view < views:
             raise InputError("callbacks.snapshots.view", "", str(self.view), f"a held-out view from 0 to {views - 1}")
 

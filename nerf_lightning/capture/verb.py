@@ -6,6 +6,7 @@ from typing import Annotated, Any
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import output_path, user_path
 from nerf_lightning.utils.options import AtLeast, Count, check_options
 
 NEEDED = {
@@ -55,7 +56,7 @@ def capture_from(cfg: DictConfig) -> None:
     check_options("tags.board", board_options, given["tags"]["board"])
     tags = given["tags"]
     if given["print"] is not None:
-        _print(tags, Path(given["print"]))
+        _print(tags, output_path(given["print"]))
         return
     if given["poses"] not in NEEDED:
         raise InputError("config", "poses", given["poses"], "tags or colmap")
@@ -75,14 +76,14 @@ def capture_from(cfg: DictConfig) -> None:
     from nerf_lightning.capture.run import capture
     from nerf_lightning.capture.tags.board import Board
 
-    packing = Packing(Path(given["output"]), given["resize"], given["holdout"], given["orbit"], given["name"])
-    folder, report = Path(given["photos"]), packing.output.with_name(packing.output.stem + "_report")
+    packing = Packing(output_path(given["output"]), given["resize"], given["holdout"], given["orbit"], given["name"])
+    folder, report = user_path(given["photos"]), packing.output.with_name(packing.output.stem + "_report")
     if given["poses"] == "colmap":
         photos, scene = capture_without_tags(folder, packing)
         draw_cameras(photos, scene, report)
     else:
         board = Board(**tags["board"]) if tags["layout"] == "charuco" else None
-        sheets, size = Path(given["calibration"]), float(tags["size"])
+        sheets, size = user_path(given["calibration"]), float(tags["size"])
         found = capture(sheets, folder, size, packing, tags["dictionary"], tags["layout"], board)
         write_report(found, report)
         photos = found.photos

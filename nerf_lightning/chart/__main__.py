@@ -1,10 +1,12 @@
 """python -m nerf_lightning.chart: which method is worth its time. Heavy imports wait until there is work."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from nerf_lightning.config import cli
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import output_path, user_path
 from nerf_lightning.utils.options import AtLeast, check_options
 
 if TYPE_CHECKING:
@@ -35,8 +37,10 @@ def task(cfg: "DictConfig") -> None:
     check_options("", options, given, complete=False)
     if "runs" not in given:
         raise InputError("config", "runs", "nothing", "folders with runs", "give runs=outputs/pareto")
-    folders = split_folders(given["runs"]) if isinstance(given["runs"], str) else [Path(one) for one in given["runs"]]
-    output = folders[0] / "chart" if given["output"] is None else Path(given["output"]).expanduser()
+    folders = (
+        split_folders(given["runs"]) if isinstance(given["runs"], str) else [user_path(one) for one in given["runs"]]
+    )
+    output = folders[0] / "chart" if given["output"] is None else output_path(given["output"])
 
     from nerf_lightning.chart.references import read_references
     from nerf_lightning.chart.report import write_report
@@ -52,8 +56,10 @@ def split_folders(text: str) -> list[Path]:
     """Folders separated by commas. A sweep's job folders have commas in their names: the longest name that exists counts."""
     parts, folders = text.split(","), []
     while parts:
-        longest = next((n for n in range(len(parts), 0, -1) if Path(",".join(parts[:n])).expanduser().is_dir()), 1)
-        folders.append(Path(",".join(parts[:longest])).expanduser())
+        longest = next(
+            (n for n in range(len(parts), 0, -1) if os.path.isdir(os.path.expanduser(",".join(parts[:n])))), 1
+        )
+        folders.append(user_path(",".join(parts[:longest])))
         parts = parts[longest:]
     return folders
 

@@ -7,11 +7,11 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -19,12 +19,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
+from nerf_lightning.config.keys import check_keys, without_nulls
 from nerf_lightning.config.renames import rename_given, renamed_overrides
 from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leave, listen
-from nerf_lightning.utils.files import full_disk, no_room
+from nerf_lightning.utils.files import full_disk, no_room, output_path, remove_empty, user_path
 from nerf_lightning.utils.waiting import wait_briefly
 
+FOLDERS = ("hydra.run.dir", "hydra.sweep.dir")
+"""Keys whose values are folders that Hydra makes."""
 TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
 """Environment variable: set to 1, errors come with the full traceback."""
 
@@ -39,11 +42,39 @@ def by_path(arguments: Sequence[str], folder: Path) -> list[str]:
     found = []
     for argument in arguments:
         key, _, value = argument.partition("=")
-        path = Path(value).expanduser()
-        if key == "+experiment" and path.suffix == ".yaml" and path.is_file():
+        if key == "+experiment" and value.endswith(".yaml") and (path := user_path(value)).is_file():
             argument = f"{key}={os.path.relpath(path.with_suffix(''), folder / 'experiment')}"
         found.append(argument)
     return found
+
+
+def to_folders(arguments: Sequence[str]) -> list[str]:
+    """Rewrites the folders that Hydra makes, with ~ filled in.
+
+    Raises:
+        InputError: where there can be no such folder.
+    """
+    found = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key in FOLDERS and "${" not in value:
+            folder = output_path(value.strip("'\""))
+            if folder.exists() and not folder.is_dir():
+                raise InputError(folder, "", "a file", f"a folder to write into ({key})", "give another one")
+            (argument,) = quoted([f"{key}={folder}"], FOLDERS)
+        found.append(argument)
+    return found
+
+
+def check_flags(arguments: Sequence[str]) -> None:
+    """Raises InputError for flags that Hydra does not know, which it would answer with its usage in many lines."""
+
+    def refused(message: str) -> NoReturn:
+        raise InputError("command line", "", message, "flags that --hydra-help lists, and KEY=VALUE")
+
+    parser = get_args_parser()
+    parser.error = refused  # type: ignore[method-assign]
+    parser.parse_args(arguments)
 
 
 def quoted(arguments: Sequence[str], keys: Sequence[str]) -> list[str]:
@@ -80,7 +111,6 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
     wait_briefly()
-    sys.argv[1:] = renamed_overrides(quoted(by_path(sys.argv[1:], conf_dir()), texts))
     started = False
 
     @functools.wraps(task)
@@ -89,15 +119,12 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
         started = True
         rename_given(cfg)
         try:
+            check_keys(cfg, config, HydraConfig.get().runtime.choices)
             return task(cfg)
         except (Exception, Interrupted) as error:
             told, alone = as_told(error), HydraConfig.get().mode != RunMode.MULTIRUN
             if alone and isinstance(told, InputError | Interrupted):
-                folder, here = Path(HydraConfig.get().runtime.output_dir).resolve(), Path.cwd()
-                with suppress(OSError):  # a folder that is not empty stays
-                    while folder != here:  # a verb may write nothing of its own
-                        folder.rmdir()
-                        folder = folder.parent if here in folder.parents else here
+                remove_empty(Path(HydraConfig.get().runtime.output_dir))
             if isinstance(told, NoRoom) or (alone and isinstance(told, InputError)):
                 give_up(told)  # here, as Hydra would add a line
             raise  # a sweep decides what becomes of its other jobs
@@ -105,6 +132,9 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     threading.excepthook = _untold
     listen()
     try:
+        check_flags(sys.argv[1:])
+        given = to_folders(without_nulls(by_path(sys.argv[1:], conf_dir())))
+        sys.argv[1:] = renamed_overrides(quoted(given, texts))
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
     except Exception as error:
         # Before the task starts only Hydra is at work, on the command line: any error then is bad input.

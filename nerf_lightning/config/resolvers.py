@@ -25,8 +25,8 @@ def slug(text: str) -> str:
 def sweep_folder(arguments: Sequence[str]) -> str:
     """Where a sweep's jobs go: the same command line finds the same folder again.
 
-    It is named after the run's name (or else the experiment) and all other options given; flags and Hydra's own settings do
-    not count.
+    It is named after the run's name (or else the experiment) and all other options given; flags, Hydra's own settings and
+    `overwrite` do not count.
     """
     given: dict[str, str] = {}
     for argument in arguments:
@@ -35,6 +35,7 @@ def sweep_folder(arguments: Sequence[str]) -> str:
             given[key] = value
     experiment = given.pop("experiment", "run")
     name = given.pop("name", experiment)
+    given.pop("overwrite", None)
     return f"outputs/{slug(name)}/{slug('_'.join(['sweep', *(f'{k}={v}' for k, v in sorted(given.items()))]))}"
 
 

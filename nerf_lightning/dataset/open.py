@@ -17,6 +17,7 @@ from nerf_lightning.dataset.resize import resize_scene
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import Reading
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import user_path
 
 SUPPORTED = (
     "photos or a video, an .npz file, a COLMAP folder (sparse/0), poses_bounds.npy beside images, a Blender folder"
@@ -49,7 +50,7 @@ def open_scene(
     Raises:
         InputError: nothing readable at `path`, or what is there is damaged.
     """
-    place = Path(path).expanduser()
+    place = user_path(path)
     reading = Reading(resize, holdout, masked, invert_masks, undistort)
     try:
         scene = _open(place, name, reading)

@@ -19,7 +19,7 @@ from nerf_lightning.dataset.pixels import Picture, PixelDataModule
 from nerf_lightning.dataset.rays import FOCUS, RAYS, SAMPLES, RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import atomic, user_path
 from nerf_lightning.utils.options import AtLeast, Count
 
 log = logging.getLogger(__name__)
@@ -124,7 +124,7 @@ def from_picture(
         # Drawn from formulas: known at any size.
         picture = Picture("sunset", BUILT_IN, builtin_picture(max_side or 256), lambda width, _: builtin_picture(width))
     else:
-        source = Path(path)
+        source = user_path(path)
         original = load_picture(source)
         height, width = original.shape[:2]
         image = torch.from_numpy(area_resize(original.numpy(), *fit_size(width, height, max_side)))

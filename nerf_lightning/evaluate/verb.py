@@ -15,7 +15,7 @@ from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.open import beside, open_run
 from nerf_lightning.system import ViewResult
 from nerf_lightning.utils.device import the_device
-from nerf_lightning.utils.files import write_json
+from nerf_lightning.utils.files import output_path, user_path, write_json
 from nerf_lightning.utils.machine import describe_machine, device_in_words
 from nerf_lightning.utils.progress import tracked
 
@@ -47,10 +47,10 @@ def evaluate(run: str, output: str | None, worst: int, device: str, photos: str 
         InputError: where the device, the run or the photos are no good, or do not fit each other.
     """
     where = the_device(device)
-    source = Path(run).expanduser()
+    source = user_path(run)
     found = open_run(source, where)
     data = data_again(found.cfg, found.scene, photos)
-    folder = beside(source) / "evaluation" if output is None else Path(output).expanduser()
+    folder = beside(source) / "evaluation" if output is None else output_path(output)
     distance, why = perceptual_distance()
     metrics: list[ViewMetrics] = []
     kept: dict[int, ViewResult] = {}

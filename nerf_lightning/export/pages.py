@@ -23,7 +23,7 @@ from nerf_lightning.runs.index import FIELD_PAGE, find_runs, read_run, varied
 from nerf_lightning.runs.open import open_run
 from nerf_lightning.system import NeRF2D, NeRF3D
 from nerf_lightning.utils.evenly import evenly
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import atomic, output_path
 from nerf_lightning.utils.html import address_from
 
 MOST_PHOTOS = 100
@@ -106,7 +106,7 @@ def side_by_side(options: ExportOptions, folder: Path, device: torch.device) -> 
     Raises:
         InputError: where there is no run, or none that can be shown.
     """
-    output = folder / "gallery.html" if options.output is None else Path(options.output).expanduser()
+    output = folder / "gallery.html" if options.output is None else output_path(options.output)
     runs, pages = find_runs(folder), []
     keys = varied(runs)
     for run in runs:

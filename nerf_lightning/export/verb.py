@@ -21,7 +21,7 @@ from nerf_lightning.runs.open import SceneRun, beside, open_run, open_scene_run
 from nerf_lightning.utils.device import the_device
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.extras import require
-from nerf_lightning.utils.files import atomic, atomic_folder
+from nerf_lightning.utils.files import atomic, atomic_folder, output_path, user_path
 from nerf_lightning.utils.machine import device_in_words
 
 NAMES = {
@@ -53,12 +53,12 @@ def export(options: ExportOptions) -> None:
         raise InputError("config", "precision", found, expected)
     if options.box is not None and not (len(options.box) == 6 and all(map(lt, options.box[:3], options.box[3:]))):
         raise InputError("config", "box", str(options.box), "the lower, then the upper corner: [x,y,z,x,y,z]")
-    source = Path(options.run).expanduser()
+    source = user_path(options.run)
     if options.format == "html" and source.is_dir() and not (source / "config.yaml").exists():
         return side_by_side(options, source, device)
     output = beside(source) / NAMES[options.format, options.content]
     if options.output is not None:
-        output = Path(options.output).expanduser()
+        output = output_path(options.output)
     if options.format == "transforms":
         return posed(options, source, output)
     if options.format in ("ply", "glb"):

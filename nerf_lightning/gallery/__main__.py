@@ -1,9 +1,9 @@
 """python -m nerf_lightning.gallery: the figure of any sweep, from its folder alone. Heavy imports wait until there is work."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerf_lightning.config import cli
+from nerf_lightning.utils.files import output_path, user_path
 from nerf_lightning.utils.options import check_options
 
 if TYPE_CHECKING:
@@ -28,10 +28,8 @@ def gallery(runs: str, output: str | None) -> None:
     from nerf_lightning.gallery.figure import write_contact_figure
     from nerf_lightning.runs.index import find_runs
 
-    root = Path(runs).expanduser()
-    print(
-        f"figure: {write_contact_figure(root, find_runs(root), None if output is None else Path(output).expanduser())}"
-    )
+    root, file = user_path(runs), None if output is None else output_path(output)
+    print(f"figure: {write_contact_figure(root, find_runs(root), file)}")
 
 
 if __name__ == "__main__":

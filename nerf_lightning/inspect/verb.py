@@ -1,7 +1,6 @@
 """What the verb does: opens a scene, looks at its photos, and writes one page."""
 
 import logging
-from pathlib import Path
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from nerf_lightning.drawing.ink import pixels_of
 from nerf_lightning.errors import InputError
 from nerf_lightning.inspect.page import inspection_page
 from nerf_lightning.inspect.quality import Photo, judge, look_at
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import atomic, output_path
 
 
 class Heard(logging.Handler):
@@ -53,7 +52,7 @@ def inspect(
     judge(photos, not found.bounds.unbounded)
     bad = [f"{photo.name}: {trouble}" for photo in photos for trouble in photo.troubles]
     cameras = pixels_of(camera_map(poses_of(photos, found), found, {}))
-    path = Path("inspection.html" if output is None else output).expanduser()
+    path = output_path("inspection.html" if output is None else output)
     with atomic(path) as temporary:
         temporary.write_text(
             inspection_page(found.name, facts_of(found), heard.lines + doubts + bad, photos, cameras), encoding="utf-8"

@@ -14,6 +14,7 @@ from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.files import user_path
 
 WORDS = ("orbit", "spiral", "test", "train")
 WITH_PHOTOS = {"test": "val", "train": "train"}
@@ -55,7 +56,7 @@ def find_route(path: str, frames: int | None, orbit: Cameras, scene: Scene | Non
     elif path == "spiral":
         cameras = spiral_like(orbit, SPIRAL_FRAMES if frames is None else frames)
     elif path.endswith(".json"):
-        cameras = read_path(Path(path).expanduser())
+        cameras = read_path(user_path(path))
         cameras = along(cameras, len(cameras) if frames is None else frames, closed=False)
     else:
         raise InputError("config", "path", repr(path), f"one of {', '.join(WORDS)}, or a .json file")

@@ -20,6 +20,7 @@ from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.open import SceneRun, beside, open_scene_run
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.device import synchronize, the_device
+from nerf_lightning.utils.files import output_path, user_path
 from nerf_lightning.utils.machine import device_in_words
 
 
@@ -31,11 +32,11 @@ def render(options: RenderOptions) -> None:
     """
     began = time.perf_counter()
     device = the_device(options.device)
-    source = Path(options.run).expanduser()
+    source = user_path(options.run)
     channels = the_channels(options.channels)
     output = beside(source) / f"render_{Path(options.path).stem}.webp"
     if options.output is not None:
-        output = Path(options.output).expanduser()
+        output = output_path(options.output)
     check_output(output, options.background == "transparent")
     found = open_scene_run(source, device)
     route = the_route(options, found)

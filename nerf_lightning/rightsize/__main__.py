@@ -1,9 +1,9 @@
 """python -m nerf_lightning.rightsize: the smallest model that is good enough. Heavy imports wait until there is work."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerf_lightning.config import cli, conf_dir
+from nerf_lightning.utils.files import output_path
 from nerf_lightning.utils.options import check_options
 
 if TYPE_CHECKING:
@@ -31,6 +31,8 @@ def task(cfg: "DictConfig") -> None:
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
+    from nerf_lightning.runs.owner import owned
+
     given = OmegaConf.to_container(cfg.target)
     assert isinstance(given, dict)  # of a DictConfig
     target = {str(key): value for key, value in given.items()}
@@ -38,20 +40,19 @@ def task(cfg: "DictConfig") -> None:
     check_options("target", targets, target)
     if target["psnr"] is None and target["within_db"] is None:
         target["within_db"] = WITHIN_DB
-    output = Path(cfg.output).expanduser()
+    output = output_path(cfg.output)
 
     from nerf_lightning.rightsize.choose import Target
     from nerf_lightning.rightsize.ladder import read_ladder
     from nerf_lightning.rightsize.report import write_report
     from nerf_lightning.rightsize.search import search
-    from nerf_lightning.rightsize.start import begin
 
     goal = Target(**target)
     ladder = read_ladder(cfg.ladder or cfg.method, conf_dir() / "ladders")
     run = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key not in OWN])
-    begin(output, run, goal, ladder)
-    found = search(run, goal, ladder, output)
-    write_report(found, run, dict(HydraConfig.get().runtime.choices), output)
+    with owned(output):
+        found = search(run, goal, ladder, output)
+        write_report(found, run, dict(HydraConfig.get().runtime.choices), output)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from typing import Any
 import yaml
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import user_path
 
 Options = dict[str, Any]
 
@@ -32,7 +33,7 @@ def read_ladder(name: str, folder: Path) -> Ladder:
         InputError: where there is none of that name, or it holds something else.
     """
     own = name.endswith((".yaml", ".yml"))
-    path = Path(name).expanduser() if own else folder / f"{name}.yaml"
+    path = user_path(name) if own else folder / f"{name}.yaml"
     try:
         plain = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:

@@ -27,6 +27,7 @@ from nerf_lightning.rightsize.choose import (
 )
 from nerf_lightning.rightsize.climb import Rung, climb, coarsest_sampler, compact_bytes, set_options, spread
 from nerf_lightning.rightsize.ladder import Ladder, Options
+from nerf_lightning.rightsize.start import begin
 from nerf_lightning.runs.folder import load_run, plain_config
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.training.before import left_in
@@ -79,7 +80,8 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     is not trained again.
 
     Raises:
-        InputError: where the device is not there, or the data, or an option of the ladder, is no good.
+        InputError: where the device is not there, or the data, or an option of the ladder, is no good; or the folder holds
+            something else.
     """
     began = time.perf_counter()
     device = device_of(cfg)
@@ -87,6 +89,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     use_kernels(cfg.kernels)
     data = build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)
+    begin(output, cfg, target, ladder)
     for doubt in check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []:
         print(f"{data.scene.name}: {doubt.text}", flush=True)
     rungs: list[Rung] = []

@@ -10,6 +10,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.rightsize.choose import Target
 from nerf_lightning.rightsize.ladder import Ladder
 from nerf_lightning.runs.folder import plain_config
+from nerf_lightning.runs.owner import LOCK
 from nerf_lightning.utils.files import write_json
 
 PLAN, REPORT = "search.json", "rightsize.json"
@@ -24,7 +25,7 @@ def begin(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None
     """
     plan = {"target": asdict(target), "ladder": asdict(ladder), "config": plain_config(cfg)}
     plan = json.loads(json.dumps(plan))  # as it is read
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+    if output.exists() and (not output.is_dir() or any(one.name != LOCK for one in output.iterdir())):
         try:
             found = json.loads((output / PLAN).read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):

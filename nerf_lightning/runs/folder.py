@@ -37,7 +37,7 @@ GROUPS = ("dataset", "model", "optimizer", "schedule", "trainer")
 
 def plain_config(cfg: DictConfig) -> dict[str, Any]:
     """The resolved configuration; a relative dataset path becomes absolute, so that it is valid from any folder."""
-    plain = resolved(cfg)
+    plain = {key: value for key, value in resolved(cfg).items() if key != "overwrite"}  # of the command, not of the run
     path = plain["dataset"].get("path")
     if path is not None:
         plain["dataset"]["path"] = os.path.abspath(path)

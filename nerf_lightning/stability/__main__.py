@@ -1,10 +1,10 @@
 """python -m nerf_lightning.stability: methods tried where they are known to fail. Heavy imports wait until there is work."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerf_lightning.config import cli
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import output_path
 from nerf_lightning.utils.options import Count, check_options
 
 if TYPE_CHECKING:
@@ -28,8 +28,9 @@ def stability(
     """Trains all cells and writes what became of them.
 
     Raises:
-        InputError: for a suite or a method that is not known.
+        InputError: for a suite or a method that is not known, and a folder that another process writes into.
     """
+    from nerf_lightning.runs.owner import owned
     from nerf_lightning.stability.conditions import CONDITIONS
     from nerf_lightning.stability.methods import METHODS
     from nerf_lightning.stability.report import write_report
@@ -43,9 +44,10 @@ def stability(
     if unknown:
         raise InputError("config", "methods", unknown[0], f"some of {', '.join(METHODS)}")
     cells = cells_of(QUICK if suite == "quick" else every, methods or list(METHODS), seeds, steps)
-    root = Path(output).expanduser()
-    outcomes = dict(tracked(run_all(cells, root, workers), len(cells), "cells"))
-    write_report([outcomes[cell] for cell in cells], suite, root)
+    root = output_path(output)
+    with owned(root):
+        outcomes = dict(tracked(run_all(cells, root, workers), len(cells), "cells"))
+        write_report([outcomes[cell] for cell in cells], suite, root)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Sweeps: each job runs once, a failing one does not stop the others, and a table lists them all."""
 
 import csv
-import shutil
 import sys
 import traceback
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.config import cli  # noqa: F401  (a job's process needs its resolvers)
@@ -26,10 +26,8 @@ if TYPE_CHECKING:
 
 TABLE = "sweep.csv"
 COLUMNS = ("psnr", "ssim", "train_seconds", "steps", "parameters", "artifact_bytes")
-OUTCOME = ("results.json", "error.txt")
-"""Files that say how a job ended; removed when it starts again."""
-STATE = ("final.png", "checkpoints", "snapshots")
-"""Files of an earlier run with other options, which could be mistaken for the new one's."""
+ERROR = "error.txt"
+"""In the folder of a job that failed, or was refused as another run's results are there."""
 
 
 def job(cfg: "DictConfig") -> float | None:
@@ -41,49 +39,58 @@ def job(cfg: "DictConfig") -> float | None:
     Raises:
         NoRoom, OSError: for a full disk, which would end the other jobs too.
     """
-    from lightning.pytorch.utilities.rank_zero import rank_zero_only
+    from nerf_lightning.runs.owner import Taken, leads, owned
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     root = Path(HydraConfig.get().sweep.dir)
-    leader = getattr(rank_zero_only, "rank", 0) == 0  # if several processes share a job, only the first writes
     try:
-        from nerf_lightning.training.before import left_in
-        from nerf_lightning.training.train import train
-
         listen_again()  # this may be a process of a launcher
-        done, checkpoint = left_in(folder, cfg)
-        if done is not None:
-            told = "without a figure" if done.psnr is None else f"{done.psnr:.2f} dB"
-            print(f"{folder.name}: done before ({done.status}, {told})", flush=True)
-            return done.psnr
-        if leader:
-            for name in OUTCOME if checkpoint else OUTCOME + STATE:
-                remove(folder / name)
-        print(f"{folder.name}: {'starts' if checkpoint is None else 'goes on from its last checkpoint'}", flush=True)
-        return train(cfg, checkpoint)
-    except Exception as error:  # noqa: BLE001  (recorded with its traceback; the other jobs must go on)
-        if leader:
-            record(folder, cfg, error)
-        if full_disk(error):  # and for the jobs after it
-            raise
+        with owned(folder):
+            try:
+                return trained(cfg, folder)
+            except Exception as error:  # noqa: BLE001  (recorded with its traceback; the other jobs must go on)
+                if leads():
+                    record(folder, cfg, error)
+                if full_disk(error):  # and for the jobs after it
+                    raise
+                return None
+    except Taken as error:  # as by the same command a second time: what it does is not done twice
+        print(f"{folder.name}: {error}", file=sys.stderr, flush=True)
         return None
     finally:
         with suppress(InputError):  # interrupted before any job wrote something, or a full disk, which has been told
-            if leader:
+            if leads():
                 write_table(root, find_runs(root))
 
 
-def remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+def trained(cfg: "DictConfig", folder: Path) -> float | None:
+    """The held-out PSNR of a job in a folder that this process owns, from now, from before, or from its last checkpoint on."""
+    from nerf_lightning.runs.folder import plain_config
+    from nerf_lightning.runs.owner import already, holds_run, leads, may_overwrite, remove
+    from nerf_lightning.training.before import left_in
+    from nerf_lightning.training.train import train
+
+    before = read_run(folder)
+    other = holds_run(folder) and before.config != plain_config(cfg)
+    if other and before.status != "failed" and not may_overwrite(cfg):
+        raise already(folder)
+    done, checkpoint = left_in(folder, cfg)
+    if leads():
+        for name in (ERROR,) if done is not None else (ERROR, "results.json"):
+            remove(folder / name)
+    if done is not None:
+        told = "without a figure" if done.psnr is None else f"{done.psnr:.2f} dB"
+        print(f"{folder.name}: done before ({done.status}, {told})", flush=True)
+        return done.psnr
+    print(f"{folder.name}: {'starts' if checkpoint is None else 'goes on from its last checkpoint'}", flush=True)
+    return train(cfg, checkpoint)
 
 
 def record(folder: Path, cfg: "DictConfig", error: Exception) -> None:
-    """Writes what went wrong: to results.json, unless the run wrote one itself, and with its traceback to error.txt; on a full
-    disk as much of it as there is room for."""
+    """Writes what went wrong: to results.json, unless the run wrote one itself or an earlier run's must stay, and with its
+    traceback to error.txt; on a full disk as much of it as there is room for."""
     from nerf_lightning.runs.folder import save_config
+    from nerf_lightning.runs.owner import Taken
 
     diagnosis = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     diagnosis = " ".join(diagnosis.split())
@@ -92,9 +99,9 @@ def record(folder: Path, cfg: "DictConfig", error: Exception) -> None:
         if not (folder / "config.yaml").exists():
             with suppress(OmegaConfBaseException):  # the configuration itself may be what failed
                 save_config(cfg, folder)
-        if read_run(folder).status != "failed":
+        if not isinstance(error, Taken) and read_run(folder).status != "failed":
             write_json(folder / "results.json", failed_results(cfg.get("method"), cfg.get("seed"), diagnosis))
-        with atomic(folder / "error.txt") as temporary:
+        with atomic(folder / ERROR) as temporary:
             temporary.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
 
 
@@ -141,10 +148,14 @@ class SweepReport(Callback):
         self.progress: SweepProgress | None = None
 
     def on_multirun_start(self, config: "DictConfig", **kwargs: Any) -> None:
+        from nerf_lightning.config.keys import check_keys, check_swept
         from nerf_lightning.training.sweep_plan import SweepProgress, devices_asked, planned
         from nerf_lightning.utils.device import the_device
 
         try:
+            check_swept(config.hydra.overrides.task)
+            own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+            check_keys(own, "config", config.hydra.runtime.choices)
             for name in devices_asked(config):
                 the_device(name)
         except InputError as error:  # Hydra would only warn
@@ -169,15 +180,18 @@ class SweepReport(Callback):
         runs = find_runs(root)
         write_table(root, runs)
         print_table(root, runs)
-        failed = [run for run in runs if run.status not in (*FINISHED, "stopped_early", "interrupted")]
+        done = [run for run in runs if run.status in (*FINISHED, "stopped_early") and not (run.folder / ERROR).exists()]
+        going = [run for run in runs if run.status == "unfinished"]
         stopped = [run for run in runs if run.status == "interrupted"]
+        failed = [run for run in runs if run not in (*done, *going, *stopped)]
         try:
             print(f"table: {root / TABLE}; figure: {write_contact_figure(root, runs)}")
             print(f"speed against accuracy: python -m nerf_lightning.chart runs={root}")
         finally:
-            for some, what in ((failed, "failed"), (stopped, f"were interrupted ({AGAIN})")):
+            ended = ((failed, "failed"), (going, "have not ended"), (stopped, f"were interrupted ({AGAIN})"))
+            for some, what in ended:
                 if some:
                     told = ", ".join(str(run.folder.relative_to(root)) for run in some)
                     print(f"nerf_lightning: {len(some)} of {len(runs)} jobs {what}: {told}", file=sys.stderr)
-            if failed or stopped:
+            if failed or going or stopped:
                 sys.exit(1)

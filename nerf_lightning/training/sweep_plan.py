@@ -38,16 +38,16 @@ def planned(config: "DictConfig") -> list[PlannedJob]:
     """All jobs of a sweep in order; empty if the sweeper chooses them as it goes, or the launcher runs several at once."""
     if config.hydra.sweeper._target_ != GRID or config.hydra.launcher._target_ != IN_TURN:
         return []
-    choices = []
+    choices = {}  # as in Hydra, a later value of a key takes the place of an earlier one
     for override in _overrides(config):
         key = override.get_key_element()
         if override.is_sweep_override():
-            choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+            choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
         else:
-            choices.append([override.input_line or ""])
+            choices[key] = [override.input_line or ""]
     fixed = fixed_keys([*config.hydra.overrides.task])
     jobs = []
-    for overrides in itertools.product(*choices):
+    for overrides in itertools.product(*choices.values()):
         jobs.append(PlannedJob(job_name(overrides, fixed), _seconds(config, dict(_halves(overrides)))))
     return jobs
 

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from nerf_lightning.callbacks import Checkpoints, Results
-from nerf_lightning.callbacks.attached import attached
+from nerf_lightning.callbacks.attached import ChecksData, attached
 from nerf_lightning.callbacks.checkpoints import check_room
 from nerf_lightning.config.build import (
     build_data,
@@ -34,6 +34,7 @@ from nerf_lightning.kernels import use_kernels
 from nerf_lightning.refine import summary, told
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, load_scene, read_checkpoint, save_config, save_scene
+from nerf_lightning.runs.owner import clear
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND, check_compiler
 from nerf_lightning.utils.allocator import keep_freed_memory
@@ -62,7 +63,7 @@ def train(
     Args:
         cfg: the configuration; with `resume`, the resumed run's takes its place.
         checkpoint: state of a run with the same configuration, to continue from.
-        folder: where to write; None takes Hydra's.
+        folder: where to write, which the caller owns (see `runs/owner.py`); None takes Hydra's.
         scene: to train on, if already loaded; None loads the configuration's.
 
     Raises:
@@ -99,10 +100,15 @@ def train(
     results = Results("results.json", cfg.method, cfg.seed, [doubt.text for doubt in doubts])
     trainer = build_trainer(cfg, folder, device, results)
     check_processes(trainer)
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]
+        if isinstance(callback, ChecksData):
+            callback.check(data)
     checkpoints = attached(trainer, Checkpoints)
     if trainer.is_global_zero:
         if checkpoints is not None:
             check_room(folder / checkpoints.folder, system)
+        if checkpoint is None:
+            clear(folder)
         save_config(cfg, folder)
         save_scene(data, folder)
     with trainer.precision_plugin.train_step_context():

@@ -1,4 +1,4 @@
-"""Writing files so that no reader ever sees half of one, also where the disk is full or the process is asked to end."""
+"""Paths as users write them, and files of which no reader ever sees half: also on a full disk, or when a process is ended."""
 
 import errno
 import json
@@ -6,16 +6,18 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from nerf_lightning.errors import NoRoom
+from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.utils.ending import held
 
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """A full disk, a quota, a limit on the size of files."""
 BLOCK = 1 << 16
 """Bytes that a full disk certainly does not take: file systems have blocks of 4 to 64 KiB, and a write fills the last one."""
+SHOWN = 60
+"""Letters of a path that is too long which a message shows."""
 
 
 @contextmanager
@@ -110,6 +112,51 @@ def write_json(path: Path, content: object) -> None:
     """Writes strict JSON (no NaN), atomically."""
     with atomic(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def user_path(text: str | os.PathLike[str]) -> Path:
+    """A path as a user writes it, perhaps with ~.
+
+    Raises:
+        InputError: for the home of a user who is not known, and for a name that no file can have.
+    """
+    try:
+        path = Path(text).expanduser()
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            path.lstat()
+    except (RuntimeError, ValueError, OSError) as error:
+        if isinstance(error, OSError) and error.errno != errno.ENAMETOOLONG:
+            raise
+        reasons = {RuntimeError: "the home of a user who is not known", ValueError: str(error)}
+        reason = reasons.get(type(error), f"{len(str(text))} letters")
+        written = str(text) if len(str(text)) <= SHOWN else f"{str(text)[:SHOWN]}..."
+        raise InputError(repr(written), "", reason, "a path that a file or folder can have") from error
+    return path
+
+
+def output_path(text: str | os.PathLike[str]) -> Path:
+    """As `user_path`, of something to write; whether that can be is known before any work is done.
+
+    Raises:
+        InputError: as there, and where no file can be written.
+    """
+    path = user_path(text)
+    places = (path.absolute(), *path.absolute().parents)
+    there = next(one for one in places if os.path.isdir(one) or (one != places[0] and os.path.lexists(one)))
+    if not os.path.isdir(there):
+        raise InputError(path, "", f"{there}, which is a file", "a folder to write into", "give another one")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise InputError(path, "", f"{there}, which may not be written", "a folder to write into", "give another one")
+    return path
+
+
+def remove_empty(folder: Path) -> None:
+    """Removes a folder and, below the current one, those above it, as far as they are empty."""
+    folder, here = folder.resolve(), Path.cwd()
+    with suppress(OSError):
+        while folder != here:
+            folder.rmdir()
+            folder = folder.parent if here in folder.parents else here
 
 
 def cache_folder() -> Path:

@@ -4,12 +4,12 @@ Heavy imports wait until the configuration is checked and a port is found.
 """
 
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from nerf_lightning.config import cli
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.ending import Interrupted
+from nerf_lightning.utils.files import user_path
 from nerf_lightning.utils.options import AtLeast, Count, check_options
 from nerf_lightning.view.serve import announcement, find_port, require_viser
 
@@ -77,7 +77,7 @@ def page_of_run(given: dict[str, Any], port: int) -> "Page":
     from nerf_lightning.runs.open import open_scene_run
     from nerf_lightning.view.field_page import FieldPage
 
-    source = Path(given["run"]).expanduser()
+    source = user_path(given["run"])
     found = open_scene_run(source, device)
     photos = photos_of(found)
     return FieldPage(

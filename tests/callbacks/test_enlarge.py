@@ -45,7 +45,7 @@ def enlarge(trainer_with):
         trainer, system = trainer_with(), NeRF2D(Ramp(data.scene.size), functools.partial(torch.optim.SGD), constant)
         trainer.datamodule = data
         callback = Enlarge(scale)
-        callback.setup(trainer, system, "fit")
+        callback.check(data)
         callback.on_test_end(trainer, system)
 
     return call
@@ -139,10 +139,10 @@ def test_a_scale_that_is_not_above_zero_is_refused(scale: float):
 
 
 @pytest.mark.parametrize(("scale", "fits"), [(2.0**12, True), (2.0**12 + 1, False), (math.inf, False)])
-def test_a_picture_too_large_is_refused_before_training(scale: float, fits: bool, trainer_with, system):
-    trainer = trainer_with()  # on a picture of 4 x 4
+def test_a_picture_too_large_is_refused_before_training(scale: float, fits: bool):
+    data = PixelDataModule(Picture("square", "made", torch.zeros(4, 4, 3, dtype=torch.uint8)))
     if fits:
-        Enlarge(scale).setup(trainer, system, "fit")
+        Enlarge(scale).check(data)
     else:
         with pytest.raises(InputError, match="render.scale"):
-            Enlarge(scale).setup(trainer, system, "fit")
+            Enlarge(scale).check(data)

@@ -20,7 +20,6 @@ def test_pictures_are_written_when_due_and_at_the_end_without_costing_training_t
 ):
     budget, snapshots = Budget(steps=9), Snapshots("pictures", steps=[2, 4], view=3)
     trainer = trainer_with(budget, snapshots)
-    snapshots.setup(trainer, system, "fit")
     budget.on_train_start(trainer, system)
     for trainer.global_step in range(1, 6):
         clock.wait(1)
@@ -35,6 +34,6 @@ def test_pictures_are_written_when_due_and_at_the_end_without_costing_training_t
 
 
 @pytest.mark.parametrize("view", [-1, 10])
-def test_a_view_that_is_not_there_is_refused(view, system, trainer_with):
+def test_a_view_that_is_not_there_is_refused(view, trainer_with):
     with pytest.raises(InputError, match="callbacks.snapshots.view"):
-        Snapshots(view=view).setup(trainer_with(), system, "fit")
+        Snapshots(view=view).check(trainer_with().datamodule)

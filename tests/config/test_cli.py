@@ -1,5 +1,6 @@
 """The command line: help, errors, resuming after a kill, and the installed wheel."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -10,7 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from commands import command, popen
+from commands import BARE, command, popen
+
+from nerf_lightning.config import conf_dir
+from nerf_lightning.config.compose import composed
+from nerf_lightning.errors import InputError
+from nerf_lightning.runs.owner import owned
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -54,6 +60,23 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
         (["callbacks.heldout.at=[0.5,0.1]"], ["callbacks.heldout.at", "[0.5, 0.1]", "ascending"]),
         (["renderer.background=pink"], ["renderer.background", "'pink'", "black, white"]),
         (["resume=nowhere"], ["nowhere/config.yaml", "no such file"]),
+        (["--nope"], ["command line: found unrecognized arguments: --nope"]),
+        (["+foo=1"], ["config: foo", "unknown option"]),
+        (["+buget.steps=1"], ["config: buget", "did you mean budget?"]),
+        (["+limits.chnk=1"], ["limits.chnk", "did you mean chunk?"]),
+        (["+budget.default.step=1"], ["budget.default.step", "did you mean steps?"]),
+        (["+experiment=picture", "+render.foo=1"], ["render.foo", "one of scale"]),
+        (["schedule=null"], ["schedule: found null", "one of constant, cosine, exponential"]),
+        (["sampler=null"], ["sampler: found nothing", "the group sampler"]),
+        (["overwrite=yes"], ["overwrite: found 'yes'", "true or false"]),
+        (["callbacks.snapshots.view=99"], ["callbacks.snapshots.view", "99", "from 0 to 9"]),
+        (["dataset=photos", "dataset.path='~nosuchuser/x'"], ["~nosuchuser/x", "home of a user"]),
+        (["dataset=photos", f"dataset.path={'a' * 5000}"], ["'aaa", "5000 letters"]),
+        (["dataset=picture", f"dataset.path={'a' * 5000}"], ["aaa", "expected"]),
+        (["hydra.run.dir='~nosuchuser/x'"], ["~nosuchuser/x", "home of a user"]),
+        ([f"hydra.run.dir={'a' * 5000}"], ["'aaa", "5000 letters"]),
+        (["hydra.run.dir=notes.txt"], ["notes.txt: found a file", "a folder to write into"]),
+        (["hydra.run.dir=notes.txt/below"], ["notes.txt, which is a file", "a folder to write into"]),
     ],
 )
 def test_bad_input_gets_one_line_and_exit_code_2(arguments: list[str], words: list[str], inside, tmp_path: Path):
@@ -139,6 +162,49 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
     code, _, err = inside(f"resume={run}", "sampler.samples=9")
     assert code == 2
     assert "sampler.samples" in err
+
+
+def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path: Path):
+    small = ["+experiment=smoke_2d", "dataset.max_side=16", *BARE, "callbacks.checkpoints=null", "logger=null"]
+    folder = tmp_path / "mine"
+    assert inside(*small, "budget.steps=5", "callbacks.snapshots.steps=[2]", "hydra.run.dir=mine")[0] == 0
+    (folder / "notes.txt").write_text("not the run's")
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    again = [*small, "budget.steps=3", "callbacks.snapshots.steps=[1]", "hydra.run.dir=mine"]
+    code, _, err = inside(*again)
+    assert code == 2 and err.count("\n") == 1 and "mine: found a run in it already" in err and "overwrite=true" in err
+    code, _, err = inside(*again, "overwrite=true", "callbacks.snapshots.view=7")
+    assert code == 2, "another reason"
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before, "removed once the new run is sound"
+    code, _, err = inside(*again, "overwrite=true")
+    assert code == 0, err
+    assert sorted(path.name for path in (folder / "snapshots").iterdir()) == ["step_0000001.png", "step_0000003.png"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *("config.yaml", "final.png", "notes.txt", "results.json", "scene.json", "snapshots")
+    ]
+    assert "overwrite" not in (folder / "config.yaml").read_text()
+    with owned(folder):
+        code, _, err = inside(f"resume={folder}")
+    assert code == 2 and "a run that is still going on (process" in err and err.count("\n") == 1
+
+
+def test_groups_that_can_be_left_out(inside, tmp_path: Path):
+    """Also what an experiment sets in them."""
+    small = ["dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", "dataset.rays=64", "budget.steps=2"]
+    code, _, err = inside(*small, "callbacks=null", "logger=null", "recipe=null", "hydra.run.dir=bare")
+    assert code == 0, err
+    assert {path.name for path in (tmp_path / "bare").iterdir()} == {"config.yaml", "results.json", "scene.json"}
+    cfg = composed(["+experiment=capture", "dataset.path=x", "callbacks=null", "refine=null"], tmp_path)
+    assert cfg.callbacks is None and cfg.refine is None
+
+
+def test_a_users_own_keys_are_known_where_others_use_them(tmp_path: Path):
+    (tmp_path / "own.yaml").write_text("# @package _global_\nslow: 0.1\noptimizer: {lr: '${slow}'}\n")
+    given = [f"+experiment={os.path.relpath(tmp_path / 'own', conf_dir() / 'experiment')}"]
+    assert composed(given, tmp_path).optimizer.lr == 0.1
+    (tmp_path / "own.yaml").write_text("# @package _global_\nslow: 0.1\n")
+    with pytest.raises(InputError, match="config: slow: found an unknown option"):
+        composed(given, tmp_path)
 
 
 def test_a_users_own_groups(inside, tmp_path: Path):

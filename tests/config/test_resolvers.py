@@ -27,6 +27,7 @@ def test_long_names_are_cut_and_stay_apart():
         (["-m", "+experiment=lego,fox", "seed=0"], "outputs/lego,fox/sweep_seed=0"),
         (["-m", "seed=0,1", "+new.key=2"], "outputs/run/sweep_new.key=2_seed=0,1"),
         (["-m", "+new.key=2", "seed=0,1"], "outputs/run/sweep_new.key=2_seed=0,1"),
+        (["-m", "overwrite=true", "seed=0,1"], "outputs/run/sweep_seed=0,1"),
         (["-m", "~callbacks.orbit", "seed=0,1"], "outputs/run/sweep_seed=0,1_-callbacks.orbit="),
     ],
 )  # fmt: skip

@@ -58,12 +58,17 @@ def test_test_split_is_held_out_where_there_is_no_val(folder: Path):
     assert len(load_blender(folder).val) == 1
 
 
-def test_rgb_renders(folder: Path):
-    write_split(folder, "train", np.full((1, 6, 8, 3), 7, np.uint8), np.eye(4)[None])
+@pytest.mark.parametrize(("border", "background"), [(255, 1.0), (250, 1.0), (0, 0.0), (51, 0.2), (None, 1.0)])
+def test_rgb_renders_stand_on_the_colour_of_their_borders(border: int | None, background: float, folder: Path):
+    """On white where these have none, or nearly that."""
+    random = np.random.default_rng(0).integers(0, 256, (1, 6, 8, 3), dtype=np.uint8)
+    train = random if border is None else np.full_like(random, border)
+    train[:, 2:4, 3:5] = 128
+    write_split(folder, "train", train, np.eye(4)[None])
     write_split(folder, "val", np.full((1, 6, 8, 3), 9, np.uint8), np.eye(4)[None])
     scene = load_blender(folder, "named")
     assert scene.name == "named" and scene.train.images.shape == (1, 6, 8, 3)
-    assert scene.background == (1.0, 1.0, 1.0)
+    assert scene.background == pytest.approx((background,) * 3, abs=1e-6)
 
 
 def test_renders_of_several_sizes(folder: Path):

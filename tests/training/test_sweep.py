@@ -10,6 +10,7 @@ import yaml
 from commands import BARE, command
 
 from nerf_lightning.config.renames import RENAMED
+from nerf_lightning.runs.owner import owned
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3"]
 
@@ -80,8 +81,13 @@ def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(
     assert all(torch.equal(first["state_dict"][key], second["state_dict"][key]) for key in first["state_dict"])
     text = (broken / "config.yaml").read_text()
     (broken / "config.yaml").write_text(text.replace("lr: 0.01", "lr: 0.02"))
+    results = (broken / "results.json").read_bytes()
     code, out, err = inside(*small, "budget.steps=10", "name=broken", steps)
-    assert "seed=0: done before" in out and "seed=1: starts" in out
+    assert code == 1 and "seed=0: done before" in out and "seed=1: starts" not in out
+    assert "seed=1: failed" in err and "overwrite=true" in err and "1 of 2 jobs failed: seed=1" in err
+    assert (broken / "results.json").read_bytes() == results, "nothing is lost without being asked"
+    code, out, err = inside(*small, "budget.steps=10", "name=broken", steps, "overwrite=true")
+    assert code == 0 and "seed=0: done before" in out and "seed=1: starts" in out
     assert not (broken / "error.txt").exists()
 
 
@@ -103,6 +109,31 @@ def test_a_sweep_that_is_interrupted_tells_so_and_goes_on_with_the_same_command(
     code, out, err = inside(*line)
     assert code == 0 and "seed=0: done before" in out and "seed=1: goes on from its last checkpoint" in out, err
     assert "interrupted" not in {row["status"] for row in table(root).values()}
+
+
+def test_a_job_that_another_process_trains_is_left_to_it(inside, tmp_path: Path):
+    job = tmp_path / "sweep" / "seed=1"
+    given = ["-m", *SMALL, *BARE, "callbacks.snapshots.steps=[]", "logger=null", f"hydra.sweep.dir={tmp_path}/sweep"]
+    with owned(job):
+        (job / "config.yaml").write_text("seed: 1")
+        code, out, err = inside(*given, "seed=0,1")
+        assert "seed=0: starts" in out and "seed=1: starts" not in out
+        assert code == 1 and "1 of 2 jobs have not ended: seed=1" in err and "going on (process" in err
+        assert sorted(path.name for path in job.iterdir()) == [".lock", "config.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["dataset.pixels=64", "dataset.pixels=64,32"], "dataset.pixels: found a value twice"),
+        (["seed=0,1", "++seed=2"], "seed: found a value twice"),
+        (["seed=0,1", "+foo=1"], "foo: found an unknown option"),
+        (["model=null,siren"], "model: found null, expected one of fourier"),
+    ],
+)
+def test_a_sweep_that_cannot_be_meant_is_refused_in_a_line(arguments: list[str], words: str, inside, tmp_path: Path):
+    code, out, err = inside("-m", *SMALL, *arguments)
+    assert code == 2 and words in err and err.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
 def test_a_sweep_of_an_earlier_version_goes_on(inside, tmp_path: Path):

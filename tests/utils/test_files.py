@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerf_lightning.errors import NoRoom
-from nerf_lightning.utils.files import atomic, atomic_folder, write_json
+from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.utils.files import atomic, atomic_folder, output_path, remove_empty, user_path, write_json
 
 
 def test_a_finished_block_replaces_the_file(tmp_path: Path):
@@ -74,3 +74,39 @@ def test_json_is_strict(tmp_path: Path):
     with pytest.raises(ValueError):
         write_json(path, {"a": float("nan")})
     assert json.loads(path.read_text())["a"][0] == 1 and list(tmp_path.iterdir()) == [path]
+
+
+def test_paths_as_users_write_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert user_path("~/photos") == tmp_path / "photos" and user_path("a/b") == Path("a/b")
+    assert output_path(tmp_path / "new" / "film.gif") == tmp_path / "new" / "film.gif"
+    assert output_path(tmp_path) == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [("~nosuchuser/a", "a user who is not known"), ("a" * 5000, "found 5000 letters"), ("a\0b", "null byte")],
+)
+def test_a_path_that_can_be_none_is_told_in_a_line(name: str, found: str):
+    with pytest.raises(InputError, match=found) as told:
+        user_path(name)
+    assert len(str(told.value)) < 200
+
+
+@pytest.mark.parametrize("forbidden", [False, True])
+def test_where_nothing_can_be_written_is_known_beforehand(
+    forbidden: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "file").touch()
+    if forbidden:
+        monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != tmp_path)  # for root, all may be written
+    with pytest.raises(InputError, match="may not be written" if forbidden else "which is a file"):
+        output_path(tmp_path / ("new/film.gif" if forbidden else "file/film.gif"))
+
+
+def test_empty_folders_are_removed_up_to_the_current_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a" / "b" / "c").mkdir(parents=True)
+    (tmp_path / "a" / "d").touch()
+    remove_empty(Path("a/b/c"))
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["d"]

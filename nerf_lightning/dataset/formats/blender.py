@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from nerf_lightning.cameras import orbit_like
-from nerf_lightning.dataset.extent import estimate_bounds
+from nerf_lightning.dataset.extent import border_colour, estimate_bounds
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.conventions import opengl_to_opencv
 from nerf_lightning.dataset.formats.decode import find_image, image_header
@@ -15,13 +15,15 @@ from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
 WHITE = (1.0, 1.0, 1.0)
+NEARLY = 8 / 255
+"""Borders that differ from white by less, in all channels, are white: JPEG and resampling move them so far."""
 
 
 def load_blender(folder: Path, name: str | None = None, resize: int | None = None) -> Scene:
     """Reads a Blender scene: OpenGL camera-to-world poses, converted to OpenCV here.
 
     Held out is the val split, or test where there is no val. Renders keep their alpha; the background they are shown on
-    is white by convention.
+    is white by convention, or the one colour along the borders of photos without alpha.
 
     Args:
         folder: holds transforms_train.json and transforms_val.json or transforms_test.json.
@@ -36,14 +38,17 @@ def load_blender(folder: Path, name: str | None = None, resize: int | None = Non
     if held_out is None:
         raise InputError(folder, "", "no transforms_val.json or transforms_test.json", "held-out views in one of them")
     train, val = _load_split(files[0], resize), _load_split(held_out, resize)
+    background = border_colour(train) or WHITE
+    if max(1 - part for part in background) <= NEARLY:
+        background = WHITE
     return Scene(
         name=name or folder.resolve().name.lower(),
         source=str(folder),
         train=train,
         val=val,
         orbit=orbit_like(train.cameras),
-        bounds=estimate_bounds(train, WHITE),
-        background=WHITE,
+        bounds=estimate_bounds(train, background),
+        background=background,
     )
 
 
