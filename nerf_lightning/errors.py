@@ -1,5 +1,11 @@
 """The exception for bad input: one line that a user can act on."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+LONGEST = 500
+"""Most letters of what was found: a file may hold any amount, and the line is for a terminal."""
+
 
 class InputError(ValueError):
     """Bad input from outside: a file, a config key, a command-line value.
@@ -17,5 +23,18 @@ class InputError(ValueError):
 
     def __init__(self, where: object, key: str, found: str, expected: str, todo: str = ""):
         place = f"{where}: {key}" if key else f"{where}"
+        if len(found) > LONGEST:
+            found = f"{found[:LONGEST]}..."
+        self.place, self.found, self.expected, self.todo = place, found, expected, todo
         line = f"{place}: found {found}, expected {expected}" + (f"; {todo}" if todo else "")
         super().__init__(" ".join(line.split()))
+
+
+@contextmanager
+def found_in(path: object) -> Iterator[None]:
+    """Messages about options name the file that holds them, instead of the command line's configuration."""
+    try:
+        yield
+    except InputError as error:
+        key = error.place.removeprefix("config").removeprefix(": ")
+        raise InputError(path, key, error.found, error.expected, error.todo) from error

@@ -158,7 +158,7 @@ def _sheet(figure: SubFigure, cells: list[list[Run | None]], keys: Sequence[str]
 
 def _curves(axes: Axes, runs: Sequence[Run], keys: Sequence[str]) -> None:
     """PSNR over steps, or over seconds where the runs took different numbers of steps."""
-    by_steps = len({run.results.get("steps") for run in runs if run.status in FINISHED}) <= 1
+    by_steps = len({run.figure("steps") for run in runs if run.status in FINISHED}) <= 1
     colours = matplotlib.colormaps["viridis"](np.linspace(0, 0.9, max(len(runs), 1)))
     for run, colour in zip(_ordered(runs, keys), colours, strict=True):
         points = [(p[1] if by_steps else p[0], p[2]) for p in run.curve]

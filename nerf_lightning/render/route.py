@@ -1,6 +1,5 @@
 """Routes: which views a film shows."""
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.untrusted import read_json
 
 WORDS = ("orbit", "spiral", "test", "train")
 WITH_PHOTOS = {"test": "val", "train": "train"}
@@ -98,12 +98,10 @@ def read_path(file: Path) -> Cameras:
     Raises:
         InputError: where it is neither.
     """
+    plain = read_json(file, "a camera path in JSON")
     try:
-        plain = json.loads(file.read_text(encoding="utf-8"))
         cameras = _nerfstudio(plain) if "camera_path" in plain else _own(plain)
-    except FileNotFoundError as error:
-        raise InputError(file, "", "no such file", "a camera path in JSON") from error
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+    except (ArithmeticError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         found = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(file, "", found, "width, height, K and c2w, or nerfstudio's camera_path") from error
     if not len(cameras) or min(cameras.width, cameras.height) < 1:

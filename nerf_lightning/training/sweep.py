@@ -71,10 +71,10 @@ def job(cfg: "DictConfig") -> float | None:
 
 def usable(checkpoint: Path) -> bool:
     """Whether a checkpoint exists and is complete."""
-    from nerf_lightning.runs.folder import read_checkpoint
+    from nerf_lightning.runs.checkpoint import RESUMED, read_checkpoint
 
     try:
-        read_checkpoint(checkpoint)
+        read_checkpoint(checkpoint, RESUMED)
     except InputError:
         return False
     return True

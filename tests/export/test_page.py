@@ -24,7 +24,8 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.export.drawable import voxels_like
 from nerf_lightning.export.page import SCRIPTS, field_page, gallery_page, part, picture_page
 from nerf_lightning.runs.compact import decode, encode, without_folders
-from nerf_lightning.runs.folder import RunFolder, frame_from
+from nerf_lightning.runs.folder import RunFolder
+from nerf_lightning.runs.scene_file import frame_from
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.html import address_from
 

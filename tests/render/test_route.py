@@ -114,5 +114,5 @@ def test_other_words_are_refused():
     words = r"path: found 'dolly', expected one of orbit, spiral, test, train, or a \.json file"
     with pytest.raises(InputError, match=words):
         find_route("dolly", None, circle(), None)
-    with pytest.raises(InputError, match=r"missing\.json: found no such file"):
+    with pytest.raises(InputError, match=r"missing\.json: found nothing there"):
         find_route("missing.json", None, circle(), None)

@@ -10,7 +10,8 @@ import torch
 import yaml
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.folder import load_config, load_run, read_checkpoint
+from nerf_lightning.runs.checkpoint import read_checkpoint
+from nerf_lightning.runs.folder import load_config, load_run
 from nerf_lightning.runs.trusted import TARGETS, TRUST
 
 
@@ -120,10 +121,14 @@ def test_a_truncated_checkpoint_is_told(tmp_path: Path):
 
 def test_damaged_run_folders_are_told(small_run: Path, tmp_path: Path):
     for name, damage, words in (
-        ("scene.json", lambda p: p.unlink(), "scene.json: found no such file"),
-        ("scene.json", lambda p: p.write_text("{"), "scene.json: found JSONDecodeError"),
-        ("scene.json", lambda p: p.write_text('{"aabb": [[0, 0, 0], [1, 1, 1]]}'), "scene.json: found KeyError"),
-        ("checkpoints/last.ckpt", lambda p: p.unlink(), "last.ckpt: found no such file"),
+        ("scene.json", lambda p: p.unlink(), "scene.json: found nothing there, expected the scene of a run"),
+        ("scene.json", lambda p: p.write_text("{"), "scene.json: found broken JSON at line 1"),
+        (
+            "scene.json",
+            lambda p: p.write_text('{"aabb": [[0, 0, 0], [1, 1, 1]]}'),
+            "scene.json: name: found no such key",
+        ),
+        ("checkpoints/last.ckpt", lambda p: p.unlink(), "last.ckpt: found nothing there"),
         ("checkpoints/last.ckpt", lambda p: torch.save({"state_dict": {}}, p), "last.ckpt: state_dict: found"),
     ):
         shutil.rmtree(tmp_path / "run", ignore_errors=True)
