@@ -116,7 +116,7 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     optimizer = make(cfg, "optimizer")
     try:
         optimizer([torch.zeros(1)])  # so that a negative rate is reported now, not when training starts
-    except (ValueError, TypeError, RuntimeError) as error:
+    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
     chunk = limits_of(cfg, device).chunk
     common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
@@ -144,11 +144,13 @@ def _within_memory(cfg: DictConfig, build: Callable[[], list[Any]]) -> list[Any]
     Raises:
         InputError: where they do not.
     """
-    if str(cfg.model.get("_target_")).startswith("nerf_lightning."):  # others may look at numbers while they are built
+    node = cfg.get("model")
+    ours = isinstance(node, DictConfig) and str(node.get("_target_")).startswith("nerf_lightning.")
+    if ours:  # others may look at numbers while they are built
         try:
             with torch.device("meta"):
                 sketch = build()
-        except (OverflowError, RuntimeError) as error:
+        except (OverflowError, RuntimeError, TypeError) as error:
             expected = "sizes of which weights can be counted"
             raise InputError("config", "model or sampler", str(error), expected, "take smaller ones") from error
         tensors = [tensor for module in sketch for tensor in (*module.parameters(), *module.buffers())]

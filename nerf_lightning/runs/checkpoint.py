@@ -2,7 +2,7 @@
 
 import pickle
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,20 @@ from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.untrusted import NONSENSE, existing_file
 
 EXPECTED = "a whole checkpoint of tensors and plain values"
-RESUMED = ("state_dict", "epoch", "global_step", "loops", "callbacks", "optimizer_states", "lr_schedulers")
+RENDERED: dict[str, type] = {"state_dict": dict}
+"""What rendering needs."""
+RESUMED: dict[str, type] = {
+    **dict.fromkeys(("state_dict", "loops", "callbacks"), dict),
+    **dict.fromkeys(("optimizer_states", "lr_schedulers"), list),
+    **dict.fromkeys(("epoch", "global_step"), int),
+}
 """What training needs to go on, as Lightning writes it."""
 DAMAGED = (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, OSError, *NONSENSE)
 """What zipfile and PyTorch raise for a damaged file."""
 
 
-def read_checkpoint(path: Path, needed: Sequence[str] = ("state_dict",)) -> dict[str, Any]:
-    """Reads a checkpoint, which must hold the keys `needed`.
+def read_checkpoint(path: Path, needed: Mapping[str, type] = RENDERED) -> dict[str, Any]:
+    """Reads a checkpoint, which must hold what is `needed`.
 
     It is an archive that keeps a checksum (CRC-32) of each of its parts, as all versions of PyTorch since 1.6 write it. PyTorch
     does not compare them when it loads: here they are compared first, which takes half as long as loading does.
@@ -41,9 +47,11 @@ def read_checkpoint(path: Path, needed: Sequence[str] = ("state_dict",)) -> dict
         if changed is not None:
             raise InputError(path, changed, "other bytes than were written", EXPECTED, todo)
         state = torch.load(path, map_location="cpu", weights_only=True)
-        for key in needed:
-            if not isinstance(state, dict) or key not in state:
-                raise InputError(path, key, f"nothing in a {type(state).__name__}", "a checkpoint of a training")
+        if not isinstance(state, dict):
+            raise InputError(path, "", f"a {type(state).__name__}", EXPECTED)
+        for key, kind in needed.items():
+            if not isinstance(state.get(key), kind):
+                raise InputError(path, key, f"a {type(state.get(key)).__name__}", f"a {kind.__name__}", todo)
         _check_weights(path, state["state_dict"])
     except InputError:
         raise
@@ -52,9 +60,7 @@ def read_checkpoint(path: Path, needed: Sequence[str] = ("state_dict",)) -> dict
     return state
 
 
-def _check_weights(path: Path, weights: Any) -> None:
-    if not isinstance(weights, dict):
-        raise InputError(path, "state_dict", type(weights).__name__, "tensors by name")
+def _check_weights(path: Path, weights: Mapping[str, Any]) -> None:
     for name, tensor in weights.items():
         # A view may show one number any amount of times: it asks for more memory than the file has bytes.
         if not isinstance(tensor, Tensor) or tensor.nbytes > tensor.untyped_storage().nbytes():

@@ -22,8 +22,7 @@ KINDS: dict[str, type] = {
     **dict.fromkeys(("curve", "warnings", "recoveries"), list),
     **dict.fromkeys(("status", "diagnosis"), str),
 }
-"""What stands in a results.json at some keys, or nothing: anything else there is told and left out. Figures are looked at one by
-one."""
+"""What stands in a results.json at some keys, or nothing: anything else there is told and left out."""
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ def numbers(where: object, key: str, value: Any) -> Float[np.ndarray, "..."]:
     try:
         return np.array(value, dtype=np.float64)
     except (ArithmeticError, TypeError, ValueError) as error:
-        raise InputError(where, key, f"something else ({error})", "numbers, in rows of one length") from error
+        raise InputError(where, key, repr(value)[:60], "numbers, in rows of one length") from error
 
 
 def _orbit(where: object, view: Any) -> Cameras:

@@ -54,6 +54,7 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
         (["callbacks.heldout.at=[0.5,0.1]"], ["callbacks.heldout.at", "[0.5, 0.1]", "ascending"]),
         (["renderer.background=pink"], ["renderer.background", "'pink'", "black, white"]),
         (["resume=nowhere"], ["nowhere/config.yaml", "nothing there"]),
+        (["resume=notes.txt"], ["notes.txt: found a file, expected the folder of a run"]),
     ],
 )
 def test_bad_input_gets_one_line_and_exit_code_2(arguments: list[str], words: list[str], inside, tmp_path: Path):
