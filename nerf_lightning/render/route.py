@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.dataset import Scene, Views
+from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.untrusted import read_json
@@ -107,6 +108,7 @@ def read_path(file: Path) -> Cameras:
     if not len(cameras) or min(cameras.width, cameras.height) < 1:
         found = f"{len(cameras)} views of {cameras.width} x {cameras.height}"
         raise InputError(file, "", found, "at least one view of one pixel")
+    checks.view_size(file, "", cameras.width, cameras.height)
     R = cameras.c2w[:, :3, :3]
     if not (torch.isfinite(cameras.c2w).all() and torch.isfinite(cameras.K).all()):
         raise InputError(file, "", "numbers that are not finite", "finite poses and intrinsics")
