@@ -18,7 +18,7 @@ from nerf_lightning.capture.poses.geometry import angle_between
 from nerf_lightning.dataset import Scene
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.runs.data import seen_by_corrected
-from nerf_lightning.runs.folder import load_scene as content_of
+from nerf_lightning.runs.scene_file import load_scene as content_of
 from nerf_lightning.stability import damage
 
 RECIPES = ("tensorf_medium", "voxels_medium", "hashgrid_medium")
@@ -116,7 +116,7 @@ def one(truth: Scene, spoilt: Scene, recipe: str, options: list[str], seed: int,
     options = [*options, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "callbacks.heldout.at=[]"]
     results = nl.train(spoilt, recipe, steps=STEPS, seed=seed, folder=folder, options=options).results
     aligned = results["psnr"] if results["psnr_aligned"] is None else results["psnr_aligned"]
-    found = seen_by_corrected(spoilt, content_of(folder)[0]).train.cameras
+    found = seen_by_corrected(spoilt, content_of(folder)).train.cameras
     figures = {
         "psnr": results["psnr"],
         "psnr_aligned": aligned,

@@ -10,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
 from nerf_lightning.config import cli
+from nerf_lightning.errors import InputError
 from nerf_lightning.utils.ending import Interrupted
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ def main() -> None:
     """The command line. A resumed run continues in its own folder."""
     resumed = [argument.removeprefix("resume=") for argument in sys.argv[1:] if argument.startswith("resume=")]
     if resumed and resumed[-1] not in ("", "null"):
+        if os.path.isfile(resumed[-1]):  # Hydra would try to make a folder of this name
+            cli.give_up(InputError(resumed[-1], "", "a file", "the folder of a run", "give resume=FOLDER"))
         sys.argv.append(f"hydra.run.dir='{Path(resumed[-1]).absolute()}'")
     cli.run("config", train, texts=("resume",))
 

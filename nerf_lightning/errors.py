@@ -1,6 +1,11 @@
 """The exception for bad input: one line that a user can act on."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
+
+LONGEST = 500
+"""Most letters of what was found: a file may hold any amount, and the line is for a terminal."""
 
 
 class InputError(ValueError):
@@ -19,19 +24,26 @@ class InputError(ValueError):
 
     def __init__(self, where: object, key: str, found: str, expected: str, todo: str = ""):
         place = f"{where}: {key}" if key else f"{where}"
+        if len(found) > LONGEST:
+            found = f"{found[:LONGEST]}..."
+        self.place, self.found, self.expected, self.todo = place, found, expected, todo
         line = f"{place}: found {found}, expected {expected}" + (f"; {todo}" if todo else "")
         super().__init__(" ".join(line.split()))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """So that it comes back whole from another process."""
-        return _told, (type(self), str(self))
-
-
-def _told(kind: type[InputError], line: str) -> InputError:
-    error = kind.__new__(kind)
-    error.args = (line,)
-    return error
+        return type(self), (self.place, "", self.found, self.expected, self.todo)
 
 
 class NoRoom(InputError):
     """A disk, a quota or a limit on files is full. Told as bad input is: the user can make room and go on."""
+
+
+@contextmanager
+def found_in(path: object) -> Iterator[None]:
+    """Messages about options name the file that holds them, instead of the command line's configuration."""
+    try:
+        yield
+    except InputError as error:
+        key = error.place.removeprefix("config").removeprefix(": ")
+        raise InputError(path, key, error.found, error.expected, error.todo) from error

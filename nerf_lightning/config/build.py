@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,6 +25,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.utils.device import CPU, the_device
+from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.options import check_options
 
 KNOWN = ("cpu", "cuda", "mps")
@@ -114,21 +116,47 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     optimizer = make(cfg, "optimizer")
     try:
         optimizer([torch.zeros(1)])  # so that a negative rate is reported now, not when training starts
-    except (ValueError, TypeError, RuntimeError) as error:
+    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
     chunk = limits_of(cfg, device).chunk
     common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
     if isinstance(frame, PictureFrame):
-        return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
-    field = build_field(cfg, Field, "three coordinates", bounds=frame.bounds)
+        size = frame.width, frame.height
+        [flat] = _within_memory(cfg, lambda: [build_field(cfg, PictureField, "two coordinates", size=size)])
+        return NeRF2D(flat, **common)
     bounds = frame.bounds
-    sampler = make(cfg, "sampler", bounds=bounds)
+    field, sampler = _within_memory(cfg, lambda: _parts(cfg, bounds))
     seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
     renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
     corrections = None
     if cfg.get("refine") is not None and frame.cameras is not None:
         corrections = make(cfg, "refine", cameras=frame.cameras, bounds=frame.bounds, exposures=frame.exposures)
     return NeRF3D(field, sampler, renderer, **common, corrections=corrections)
+
+
+def _parts(cfg: DictConfig, bounds: Bounds) -> list[Any]:
+    return [build_field(cfg, Field, "three coordinates", bounds=bounds), make(cfg, "sampler", bounds=bounds)]
+
+
+def _within_memory(cfg: DictConfig, build: Callable[[], list[Any]]) -> list[Any]:
+    """Builds modules, if their weights fit into memory: without any numbers first, to count them.
+
+    Raises:
+        InputError: where they do not.
+    """
+    node = cfg.get("model")
+    ours = isinstance(node, DictConfig) and str(node.get("_target_")).startswith("nerf_lightning.")
+    if ours:  # others may look at numbers while they are built
+        try:
+            with torch.device("meta"):
+                sketch = build()
+        except (OverflowError, RuntimeError, TypeError) as error:
+            expected = "sizes of which weights can be counted"
+            raise InputError("config", "model or sampler", str(error), expected, "take smaller ones") from error
+        tensors = [tensor for module in sketch for tensor in (*module.parameters(), *module.buffers())]
+        needed = sum(tensor.nbytes for tensor in tensors)
+        check_memory("config", "model and sampler", "weights", needed, "take smaller sizes")
+    return build()
 
 
 def corrects_poses(cfg: DictConfig) -> bool:

@@ -12,7 +12,7 @@ from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.reach import Cells, confined_to, occupied_cells, seen_cells
 from nerf_lightning.runs.compact import decode, encode
-from nerf_lightning.runs.folder import scene_content
+from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import System
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.progress import tracked

@@ -15,9 +15,10 @@ from nerf_lightning.export.photos import write_photos
 from nerf_lightning.export.smallest import MOST_VIEWS, PRECISIONS, smallest, some_cameras
 from nerf_lightning.export.volume import volume_of
 from nerf_lightning.runs.data import data_again
-from nerf_lightning.runs.folder import load_config, load_scene, plain_config
+from nerf_lightning.runs.folder import load_config, plain_config
 from nerf_lightning.runs.index import FIELD_PAGE
 from nerf_lightning.runs.open import SceneRun, beside, open_run, open_scene_run
+from nerf_lightning.runs.scene_file import load_scene
 from nerf_lightning.utils.device import the_device
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.extras import require
@@ -78,7 +79,7 @@ def posed(options: ExportOptions, source: Path, output: Path) -> None:
         raise InputError(
             output, "", "something", "a folder that is not there yet", "give another output=, or remove it"
         )
-    content, _ = load_scene(source)
+    content = load_scene(source)
     data = data_again(load_config(source), content, options.photos)
     if not isinstance(data, RayDataModule):
         raise InputError(source, "", "a picture's run", "a scene's run")

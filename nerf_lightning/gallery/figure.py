@@ -6,16 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as imageio
 import matplotlib
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
+from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.drawing.ink import BLUE, DPI, GREY, VERMILLION, pixels_of, readable, shortened
 from nerf_lightning.drawing.panels import write_png
+from nerf_lightning.errors import InputError
 from nerf_lightning.runs.index import FINISHED, Run, varied
 
 MOST = 60
@@ -123,10 +124,8 @@ def _arranged(runs: Sequence[Run], keys: Sequence[str]) -> list[list[Run | None]
 def _picture(folder: Path) -> UInt8[np.ndarray, "H W 3"] | None:
     """A run's last render; None where there is none, or none that can be read."""
     try:
-        image = imageio.imread(folder / "final.png", plugin="pillow", extension=".png")
-    except (OSError, ValueError, SyntaxError):  # the last one is what Pillow raises on some broken files
-        return None
-    if image.ndim != 3 or image.shape[2] < 3 or image.dtype != np.uint8:
+        image = read_pixels(folder / "final.png")
+    except InputError:
         return None
     height, width = image.shape[:2]
     return area_resize(np.ascontiguousarray(image[..., :3]), *fit_size(width, height, SIDE))
@@ -158,7 +157,7 @@ def _sheet(figure: SubFigure, cells: list[list[Run | None]], keys: Sequence[str]
 
 def _curves(axes: Axes, runs: Sequence[Run], keys: Sequence[str]) -> None:
     """PSNR over steps, or over seconds where the runs took different numbers of steps."""
-    by_steps = len({run.results.get("steps") for run in runs if run.status in FINISHED}) <= 1
+    by_steps = len({run.figure("steps") for run in runs if run.status in FINISHED}) <= 1
     colours = matplotlib.colormaps["viridis"](np.linspace(0, 0.9, max(len(runs), 1)))
     for run, colour in zip(_ordered(runs, keys), colours, strict=True):
         points = [(p[1] if by_steps else p[0], p[2]) for p in run.curve]

@@ -87,9 +87,11 @@ class VectorMatrix(torch.nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         """Takes the size of the loaded state, which may come from another stage of training."""
-        lines = state_dict.get(f"{prefix}lines")
-        if lines is not None and lines.ndim == 3 and 1 < lines.shape[1] != self.lines.shape[1]:
-            self.resize(lines.shape[1] - 1)
+        planes, lines = (state_dict.get(f"{prefix}{name}") for name in ("planes", "lines"))
+        if planes is not None and lines is not None and lines.ndim == 3 and 1 < lines.shape[1] != self.lines.shape[1]:
+            side = lines.shape[1]
+            if planes.shape[1:3] == (side, side):  # a state of which lines alone are long is refused, see below
+                self.resize(side - 1)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 

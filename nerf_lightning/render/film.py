@@ -1,6 +1,5 @@
 """Films: frames are kept on disk until the film is written, so that an interrupted one can go on."""
 
-import json
 import shutil
 from collections.abc import Callable, Iterator
 from fractions import Fraction
@@ -17,6 +16,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.files import atomic, write_json
 from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.untrusted import read_json
 
 Picture = UInt8[ndarray, "H W C"]
 PLAN = "frames.json"
@@ -80,8 +80,8 @@ def make_film(plan: dict[str, Any], draw: Callable[[int], Picture], count: int, 
 def prepare(folder: Path, plan: dict[str, Any], own: bool) -> None:
     """Prepares a folder for the frames of a plan; frames of another plan are deleted if the folder is our own."""
     try:
-        found = json.loads((folder / PLAN).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = read_json(folder / PLAN, "a plan of frames")
+    except InputError:  # none there, or none whole
         found = None
     if found != plan and folder.exists():
         if own:

@@ -1,6 +1,5 @@
 """Routes: which views a film shows."""
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +11,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.dataset import Scene, Views
+from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.untrusted import read_json
 
 WORDS = ("orbit", "spiral", "test", "train")
 WITH_PHOTOS = {"test": "val", "train": "train"}
@@ -99,17 +100,16 @@ def read_path(file: Path) -> Cameras:
     Raises:
         InputError: where it is neither.
     """
+    plain = read_json(file, "a camera path in JSON")
     try:
-        plain = json.loads(file.read_text(encoding="utf-8"))
         cameras = _nerfstudio(plain) if "camera_path" in plain else _own(plain)
-    except FileNotFoundError as error:
-        raise InputError(file, "", "no such file", "a camera path in JSON") from error
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+    except (ArithmeticError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         found = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(file, "", found, "width, height, K and c2w, or nerfstudio's camera_path") from error
     if not len(cameras) or min(cameras.width, cameras.height) < 1:
         found = f"{len(cameras)} views of {cameras.width} x {cameras.height}"
         raise InputError(file, "", found, "at least one view of one pixel")
+    checks.view_size(file, "", cameras.width, cameras.height)
     R = cameras.c2w[:, :3, :3]
     if not (torch.isfinite(cameras.c2w).all() and torch.isfinite(cameras.K).all()):
         raise InputError(file, "", "numbers that are not finite", "finite poses and intrinsics")

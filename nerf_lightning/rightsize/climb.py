@@ -26,7 +26,8 @@ from nerf_lightning.export.smallest import held_out_psnr, some_cameras
 from nerf_lightning.rightsize.choose import Measured
 from nerf_lightning.rightsize.ladder import Options
 from nerf_lightning.runs.compact import encode
-from nerf_lightning.runs.folder import plain_config, scene_content
+from nerf_lightning.runs.folder import plain_config
+from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.train import prepare_process, warm_up
 from nerf_lightning.utils.evenly import evenly

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.untrusted import read_yaml
 
 Options = dict[str, Any]
 
@@ -33,14 +32,11 @@ def read_ladder(name: str, folder: Path) -> Ladder:
         InputError: where there is none of that name, or it holds something else.
     """
     own = name.endswith((".yaml", ".yml"))
+    known = sorted(one.stem for one in folder.glob("*.yaml"))
+    if not own and name not in known:
+        raise InputError("config", "ladder", repr(name), f"one of {', '.join(known)}, or a YAML file with `rungs`")
     path = user_path(name) if own else folder / f"{name}.yaml"
-    try:
-        plain = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        known = ", ".join(sorted(one.stem for one in folder.glob("*.yaml")))
-        raise InputError("config", "ladder", repr(name), f"one of {known}, or a YAML file with `rungs`") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(path, "", str(error), "a ladder in YAML") from error
+    plain = read_yaml(path, "a ladder in YAML")
     if not isinstance(plain, dict) or not _options(plain.get("rungs")) or len(plain["rungs"]) < 2:
         raise InputError(path, "rungs", "something else", "a list of two or more mappings of model options")
     samplers = plain.get("samplers", [])

@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
@@ -12,6 +13,7 @@ from nerf_lightning.rightsize.ladder import Ladder
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.owner import LOCK
 from nerf_lightning.utils.files import write_json
+from nerf_lightning.utils.untrusted import read_json
 
 PLAN, REPORT = "search.json", "rightsize.json"
 """What is searched for; and what was found, written last."""
@@ -27,8 +29,8 @@ def begin(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None
     plan = json.loads(json.dumps(plan))  # as it is read
     if output.exists() and (not output.is_dir() or any(one.name != LOCK for one in output.iterdir())):
         try:
-            found = json.loads((output / PLAN).read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
+            found: dict[str, Any] | None = read_json(output / PLAN, "what a search is for")
+        except InputError:
             found = None
         if found == plan and not (output / REPORT).exists():
             print(f"{output}: goes on with the search that was interrupted", flush=True)

@@ -7,7 +7,7 @@ NAME:range                 minimum and maximum of each column that is coded as b
 
 import io
 import json
-import zipfile
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,17 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from nerf_lightning.config.build import build_system
+from nerf_lightning.dataset.formats.checks import require_keys
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.folder import RunFolder, frame_from
+from nerf_lightning.runs.checkpoint import check_finite
+from nerf_lightning.runs.folder import RunFolder, system_of
+from nerf_lightning.runs.scene_file import frame_from
 from nerf_lightning.runs.trusted import check_config
 from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.utils.arrays import Headers, read_npz
 from nerf_lightning.utils.device import CPU
+from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.untrusted import NONSENSE, existing_file, parsed_json, read_content
 
 FORMAT, VERSION = "nerf_lightning compact", 1
 WORTH_BYTES = 2048
@@ -81,7 +86,9 @@ def _coded(name: str, array: np.ndarray, code: str) -> Arrays:
 def _decoded(name: str, arrays: Arrays, code: str, shape: list[int]) -> Tensor:
     array = arrays[name]
     if code == "bits":
-        array = np.unpackbits(array, count=int(np.prod(shape))).astype(bool)
+        if math.prod(shape) > 8 * array.size:
+            raise ValueError(f"{name} has {8 * array.size} bits for the shape {shape}")
+        array = np.unpackbits(array, count=math.prod(shape)).astype(bool)
     elif code == "half":
         array = array.astype(np.float32)
     elif code == "byte":
@@ -103,30 +110,49 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
     Raises:
         InputError: if it is not a compact file, is damaged, of another version, or names something not trusted.
     """
-    expected = "a compact file of this package"
+    header, arrays = _unpacked(content, path)
+    expected = "the weights of the model it names"
+    frame, orbit, to_source = frame_from(header["scene"], f"{path}: header.scene")
+    cfg = OmegaConf.create(check_config(header["config"], path))
+    system = system_of(cfg, frame, device, path)
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
-        header = json.loads(arrays.pop("header").tobytes())
-        if (header["format"], header["version"]) != (FORMAT, VERSION):
-            found = f"{header['format']}, version {header['version']}"
-            raise InputError(path, "header", found, f"{FORMAT}, version {VERSION}", "export the run again")
-        config, scene = header["config"], header["scene"]
-        frame, orbit, to_source = frame_from(scene)
+        floats = sum(math.prod(one["shape"]) for one in header["arrays"].values())
+        check_memory(path, "", "weights", 4 * floats)
         tensors = {key: _decoded(key, arrays, one["code"], one["shape"]) for key, one in header["arrays"].items()}
-    except InputError:
-        raise
-    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(path, "", f"{type(error).__name__}: {error}", expected) from error
-    cfg = OmegaConf.create(check_config(config, path))
-    system = build_system(cfg, frame, device)
-    try:
         system.field.import_state(_of("field", tensors))
         if isinstance(system, NeRF3D):
             system.sampler.import_state(_of("sampler", tensors))
-    except (KeyError, RuntimeError) as error:
-        raise InputError(path, "", str(error), "the weights of the model it names") from error
-    return RunFolder(cfg, system.eval().to(device), orbit, to_source, scene)
+    except InputError:
+        raise
+    except NONSENSE as error:
+        raise InputError(path, "", f"{type(error).__name__}: {error}", expected) from error
+    check_finite(system, path)
+    return RunFolder(cfg, system.eval().to(device), orbit, to_source, header["scene"])
+
+
+def _unpacked(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]:
+    """The header and the arrays of a compact file.
+
+    Raises:
+        InputError: as `decode`.
+    """
+    expected = "a compact file of this package"
+
+    def check(headers: Headers) -> None:
+        require_keys(path, headers, ["header"])
+
+    arrays = read_npz(content, None, check, path, expected)
+    header = parsed_json(arrays.pop("header").tobytes(), f"{path}: header", expected)
+    if not isinstance(header, dict):
+        raise InputError(path, "header", f"a {type(header).__name__}", expected)
+    require_keys(f"{path}: header", header, ["format", "version"])
+    if (header["format"], header["version"]) != (FORMAT, VERSION):
+        found = f"{header['format']}, version {header['version']}"
+        raise InputError(path, "header", found, f"{FORMAT}, version {VERSION}", "export the run again")
+    for key in ("config", "scene", "arrays"):
+        if not isinstance(header.get(key), dict):
+            raise InputError(path, f"header.{key}", repr(header.get(key)), expected)
+    return header, arrays
 
 
 def without_folders(content: bytes) -> bytes:
@@ -139,10 +165,8 @@ def without_folders(content: bytes) -> bytes:
             return [bare(value) for value in node]
         return Path(node).name if isinstance(node, str) and Path(node).is_absolute() else node
 
-    with np.load(io.BytesIO(content), allow_pickle=False) as file:
-        arrays: Arrays = {key: file[key] for key in file.files}
-    header = bare(json.loads(arrays["header"].tobytes()))
-    return _packed(header, {key: array for key, array in arrays.items() if key != "header"})
+    header, arrays = _unpacked(content, "compact")
+    return _packed(bare(header), arrays)
 
 
 def _packed(header: dict[str, Any], arrays: Arrays) -> bytes:
@@ -162,10 +186,5 @@ def load_compact(path: Path, device: torch.device = CPU) -> RunFolder:
     Raises:
         InputError: as `decode`, and where there is no such file.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            path, "", error.strerror or str(error), "a compact file", "python -m nerf_lightning.export"
-        ) from error
-    return decode(content, path, device)
+    existing_file(path, "a compact file", "python -m nerf_lightning.export makes one")
+    return decode(read_content(path), path, device)

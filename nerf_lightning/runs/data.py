@@ -13,8 +13,9 @@ from omegaconf import DictConfig
 from nerf_lightning.cameras import Cameras, in_other_frame
 from nerf_lightning.config.build import SceneFrame, build_data, target_of
 from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
+from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.folder import frame_from
+from nerf_lightning.runs.scene_file import frame_from, numbers
 
 
 def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
@@ -25,7 +26,7 @@ def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
         scene: just read.
         content: of the run's scene.json.
     """
-    frame, _, to_source = frame_from(dict(content)) if "aabb" in content else (None, None, None)
+    frame, _, to_source = frame_from(content, "scene.json") if "aabb" in content else (None, None, None)
     if to_source is None or not isinstance(frame, SceneFrame):
         return scene
     if torch.allclose(to_source, scene.to_source, atol=1e-5):
@@ -48,13 +49,12 @@ def seen_by_corrected(scene: Scene, content: Mapping[str, Any]) -> Scene:
     if "corrected" not in content:
         return scene
     cameras = scene.train.cameras
-    try:
-        c2w = torch.tensor(content["corrected"], dtype=torch.float32).view(len(cameras), 4, 4)
-    except (ValueError, TypeError, RuntimeError) as error:
-        expected = f"{len(cameras)} poses, one of each training photo"
-        raise InputError(
-            "scene.json", "corrected", str(error), expected, "have photos been added or removed?"
-        ) from error
+    poses = numbers("scene.json", "corrected", content["corrected"])
+    if poses.shape != (len(cameras), 4, 4):
+        expected, todo = f"{len(cameras)} poses, one of each training photo", "have photos been added or removed?"
+        raise InputError("scene.json", "corrected", f"shape {poses.shape}", expected, todo)
+    poses = checks.rigid_poses("scene.json", "corrected[{}]", poses)
+    c2w = torch.from_numpy(poses).float()
     factor = content.get("focal_factor")
     if factor is not None:
         if not (isinstance(factor, int | float) and 0 < factor < math.inf):

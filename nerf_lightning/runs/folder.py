@@ -7,12 +7,10 @@ results.json           see callbacks/results.py
 snapshots/ orbit.gif   pictures
 """
 
-import json
 import os
-import pickle
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 import yaml
@@ -20,17 +18,18 @@ from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras
-from nerf_lightning.config.build import Frame, PictureFrame, SceneFrame, build_system, frame_of, resolved
-from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
-from nerf_lightning.errors import InputError
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.config.build import Frame, build_system, resolved
+from nerf_lightning.errors import InputError, found_in
+from nerf_lightning.runs.checkpoint import check_finite, read_checkpoint
+from nerf_lightning.runs.scene_file import frame_from, load_scene
 from nerf_lightning.runs.trusted import check_config
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.files import atomic, write_json
+from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.options import AtLeast, check_options
+from nerf_lightning.utils.untrusted import NONSENSE, existing_file, read_yaml
 
-FORMAT = 1
-"""Version of run folders. Goes up when older versions of this package can no longer read newer runs."""
 GROUPS = ("dataset", "model", "optimizer", "schedule", "trainer")
 """Groups of a configuration, in the order written: if a file was cut short, at least the last is missing."""
 
@@ -57,56 +56,31 @@ def load_config(folder: Path) -> DictConfig:
         InputError: if the file is missing, broken or cut short, holds interpolations, or names a target that is not trusted.
     """
     path = folder / "config.yaml"
-    try:
-        plain = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(path, "", "no such file", "the folder of a run", "look below outputs/") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(path, "", str(error), "a run's configuration in YAML") from error
-    checked = check_config(plain, path)
+    existing_file(path, "the folder of a run", "look below outputs/")
+    checked = check_config(read_yaml(path, "a run's configuration in YAML"), path)
     missing = [group for group in GROUPS if group not in checked]
     if missing:
         raise InputError(path, missing[0], "nothing", "a run's whole configuration", "was the file cut short?")
     return OmegaConf.create(checked)
 
 
-def save_scene(
-    data: RayDataModule | PixelDataModule,
-    folder: Path,
-    corrected: Cameras | None = None,
-    focal_factor: float | None = None,
-) -> None:
-    """Writes what rendering needs of the scene, without its photos, and the training cameras if training has corrected them,
-    perhaps with a factor on their focal length."""
-    content = scene_content(data)
-    if corrected is not None:
-        content |= {"corrected": corrected.c2w.tolist(), "focal_factor": focal_factor}
-    write_json(folder / "scene.json", content)
+def _top(seed: Annotated[int, AtLeast(0)], kernels: str) -> None:
+    """What opening a run needs of the top level of its configuration, for checking."""
 
 
-def scene_content(data: RayDataModule | PixelDataModule) -> dict[str, Any]:
-    """The same as plain values."""
-    scene, frame = data.scene, frame_of(data)
-    content: dict[str, Any] = {"format": FORMAT, **scene.describe()}
-    if scene.source != BUILT_IN:
-        content["source"] = os.path.abspath(scene.source)
-    if isinstance(scene, Scene) and isinstance(frame, SceneFrame):
-        content |= {
-            "background": list(frame.background),
-            "aabb": frame.bounds.aabb.tolist(),
-            "unbounded": frame.bounds.unbounded,
-            "near": frame.bounds.near,
-            "far": frame.bounds.far,
-            "pixel": frame.bounds.pixel,
-            "to_source": scene.to_source.tolist(),
-            "orbit": {
-                "K": scene.orbit.K.tolist(),
-                "c2w": scene.orbit.c2w.tolist(),
-                "width": scene.orbit.width,
-                "height": scene.orbit.height,
-            },
-        }
-    return content
+def system_of(cfg: DictConfig, frame: Frame, device: torch.device, where: object) -> System:
+    """Builds the system that a run's configuration describes, without its weights.
+
+    Args:
+        cfg, frame, device: see `build_system`.
+        where: the configuration was read from, which messages name.
+
+    Raises:
+        InputError: where an option is missing or wrong.
+    """
+    with found_in(where):
+        check_options("", _top, {key: cfg[key] for key in ("seed", "kernels") if key in cfg})
+        return build_system(cfg, frame, device)
 
 
 @dataclass(frozen=True)
@@ -123,78 +97,22 @@ class RunFolder:
     """The content of scene.json."""
 
 
-def frame_from(scene: dict[str, Any]) -> tuple[Frame, Cameras | None, Tensor | None]:
-    """Reads what `scene_content` wrote: a system's frame, the orbit, and the transform to the source; None for a picture.
-
-    Raises:
-        ValueError, KeyError, TypeError: if it is incomplete.
-    """
-    if "aabb" not in scene:
-        return PictureFrame(*map(int, scene["resolution"])), None, None
-    near, far, pixel = scene["near"], scene["far"], scene.get("pixel")
-    bounds = Bounds(torch.tensor(scene["aabb"]), scene["unbounded"], near, far, pixel)
-    red, green, blue = map(float, scene["background"])
-    view = scene["orbit"]
-    orbit = Cameras.of_size(torch.tensor(view["K"]), torch.tensor(view["c2w"]), view["width"], view["height"])
-    to_source = torch.tensor(scene["to_source"], dtype=torch.float32).view(4, 4)
-    return SceneFrame(bounds, (red, green, blue)), orbit, to_source
-
-
 def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device = CPU) -> RunFolder:
     """Rebuilds a trained system from its folder alone, on a device.
 
     Raises:
         InputError: if a file is missing, broken, or does not match the others.
     """
-    cfg = load_config(folder)
-    scene, (frame, orbit, to_source) = load_scene(folder)
-    system = build_system(cfg, frame, device)
-    state = read_checkpoint(folder / "checkpoints" / checkpoint)
+    cfg, scene = load_config(folder), load_scene(folder)
+    frame, orbit, to_source = frame_from(scene, folder / "scene.json")
+    system = system_of(cfg, frame, device, folder / "config.yaml")
+    path = folder / "checkpoints" / checkpoint
+    state = read_checkpoint(path)
     try:
         # Corrections are of training photos, which rendering has none of.
         weights = {key: value for key, value in state["state_dict"].items() if not key.startswith("corrections.")}
         system.load_state_dict(weights)
-    except (KeyError, RuntimeError) as error:
-        raise InputError(
-            folder / "checkpoints" / checkpoint, "state_dict", str(error), "the weights of this run's model"
-        ) from error
+    except NONSENSE as error:
+        raise InputError(path, "state_dict", str(error), "the weights of this run's model") from error
+    check_finite(system, path)
     return RunFolder(cfg, system.eval().to(device), orbit, to_source, scene)
-
-
-def load_scene(folder: Path) -> tuple[dict[str, Any], tuple[Frame, Cameras | None, Tensor | None]]:
-    """The content of a run's scene.json, and what `frame_from` makes of it.
-
-    Raises:
-        InputError: where it is missing, broken, or of another version.
-    """
-    path = folder / "scene.json"
-    try:
-        scene = json.loads(path.read_text(encoding="utf-8"))
-        if scene.get("format", FORMAT) != FORMAT:
-            found, expected = f"format {scene['format']}", f"format {FORMAT}, which this version reads"
-            raise InputError(path, "format", found, expected, "use the version of nerf_lightning that made the run")
-        return scene, frame_from(scene)
-    except InputError:
-        raise
-    except FileNotFoundError as error:
-        raise InputError(path, "", "no such file", "the scene of a run") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise InputError(path, "", f"{type(error).__name__}: {error}", "the scene of a run, whole") from error
-
-
-def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Reads a checkpoint: tensors and plain values, never code.
-
-    Raises:
-        InputError: where the file is missing, truncated, or holds anything else.
-    """
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise InputError(
-            path, "", "no such file", "a checkpoint", "the run may have ended before its first one"
-        ) from error
-    except (OSError, EOFError, RuntimeError, pickle.UnpicklingError) as error:
-        raise InputError(
-            path, "", str(error).split(".")[0], "a whole checkpoint of tensors and plain values"
-        ) from error

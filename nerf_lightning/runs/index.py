@@ -1,6 +1,5 @@
 """Run folders as tables and charts read them: tolerant of broken ones, never executing what they hold."""
 
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -8,16 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
-import yaml
-
 from nerf_lightning.config.renames import with_new_names
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.untrusted import read_json, read_yaml
 
 FINISHED = ("finished", "collapsed")
 """Status of completed runs."""
 
 FIELD_PAGE = "field.html"
 """The name of a run's web page in its folder, as the export verb writes it and charts look for it."""
+
+KINDS: dict[str, type] = {
+    **dict.fromkeys(("scene", "machine", "load", "versions"), dict),
+    **dict.fromkeys(("curve", "warnings", "recoveries"), list),
+    **dict.fromkeys(("status", "diagnosis"), str),
+}
+"""What stands in a results.json at some keys, or nothing: anything else there is told and left out."""
 
 
 @dataclass(frozen=True)
@@ -63,22 +68,24 @@ def _finite(value: Any) -> TypeGuard[float]:
 
 def read_run(folder: Path) -> Run:
     """Reads one folder; its status and diagnosis say what is missing or broken."""
-    config: Any = None
     try:
-        config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        config = read_yaml(folder / "config.yaml", "a run's configuration in YAML")
+    except InputError:  # told by the verbs that open runs
         config = {}
     plain = with_new_names(config) if isinstance(config, dict) else {}
-    try:
-        results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not (folder / "results.json").exists():
         return Run(folder, plain, {}, "unfinished", "no results.json yet")
-    except (OSError, ValueError) as error:
-        return Run(folder, plain, {}, "unreadable", f"results.json: {' '.join(str(error).split())}")
+    try:
+        results = read_json(folder / "results.json", "figures", "train it again")
+    except InputError as error:
+        return Run(folder, plain, {}, "unreadable", f"results.json: found {error.found}")
     if not isinstance(results, dict):
         return Run(folder, plain, {}, "unreadable", f"results.json: a {type(results).__name__}, not a mapping")
-    status, diagnosis = results.get("status"), results.get("diagnosis")
-    return Run(folder, plain, results, str(status or "unreadable"), str(diagnosis or ""))
+    odd = [key for key, kind in KINDS.items() if not isinstance(results.get(key), kind | None)]
+    told = [f"results.json: {key} is a {type(results[key]).__name__}, not a {KINDS[key].__name__}" for key in odd]
+    results |= dict.fromkeys(odd)
+    diagnosis = "; ".join(filter(None, [results.get("diagnosis"), *told]))
+    return Run(folder, plain, results, results.get("status") or "unreadable", diagnosis)
 
 
 def find_runs(root: Path) -> list[Run]:

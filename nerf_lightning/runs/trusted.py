@@ -57,7 +57,9 @@ def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
 def _check(path: Path | str, key: str, node: Any) -> None:
     if isinstance(node, dict):
         for name, value in node.items():
-            _check(path, f"{key}.{name}" if key else str(name), value)
+            if not isinstance(name, str):
+                raise InputError(path, key, f"the key {name!r}", "names of options")
+            _check(path, f"{key}.{name}" if key else name, value)
             if name == "_target_" and not _trusted(value):
                 raise InputError(
                     path,
@@ -69,8 +71,10 @@ def _check(path: Path | str, key: str, node: Any) -> None:
     elif isinstance(node, list):
         for index, value in enumerate(node):
             _check(path, f"{key}[{index}]", value)
-    elif isinstance(node, str) and "${" in node:
+    elif isinstance(node, str) and ("${" in node or node == "???"):
         raise InputError(path, key, repr(node), "a resolved value")
+    elif not isinstance(node, str | int | float | None):
+        raise InputError(path, key, f"a {type(node).__name__}", "plain values")
 
 
 def _trusted(target: Any) -> bool:

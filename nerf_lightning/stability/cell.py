@@ -11,6 +11,7 @@ from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.stability.conditions import CONDITIONS, LARGER, Condition
 from nerf_lightning.stability.methods import METHODS, Method
 from nerf_lightning.utils.files import full_disk, write_json
+from nerf_lightning.utils.untrusted import read_json
 
 OUTCOME = "cell.json"
 
@@ -83,10 +84,10 @@ def _identity(cell: Cell) -> dict[str, Any]:
 
 def _read(folder: Path, cell: Cell) -> Outcome | None:
     try:
-        content = json.loads((folder / OUTCOME).read_text(encoding="utf-8"))
+        content = read_json(folder / OUTCOME, "a cell's outcome")
         if {key: content[key] for key in _identity(cell)} == _identity(cell):
             return Outcome(**content["outcome"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (InputError, KeyError, TypeError):
         pass  # missing or cut short: trained again
     return None
 

@@ -5,7 +5,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.folder import plain_config, read_checkpoint
+from nerf_lightning.runs.checkpoint import RESUMED, read_checkpoint
+from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.index import FINISHED, Run, read_run
 
 
@@ -22,7 +23,7 @@ def left_in(folder: Path, cfg: DictConfig) -> tuple[Run | None, Path | None]:
         return run, None
     last = folder / "checkpoints" / "last.ckpt"
     try:
-        read_checkpoint(last)
+        read_checkpoint(last, RESUMED)
     except InputError:  # none yet, or a broken one: from the start
         return None, None
     return None, last

@@ -32,9 +32,11 @@ from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.refine import summary, told
+from nerf_lightning.runs.checkpoint import RESUMED, read_checkpoint
 from nerf_lightning.runs.data import data_again
-from nerf_lightning.runs.folder import load_config, load_scene, read_checkpoint, save_config, save_scene
+from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.owner import clear
+from nerf_lightning.runs.scene_file import load_scene, save_scene
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND, check_compiler
 from nerf_lightning.utils.allocator import keep_freed_memory
@@ -81,7 +83,7 @@ def train(
     if cfg.compile:
         check_compiler(device, BACKEND)
     if resumed:
-        data = data_again(cfg, load_scene(folder)[0], cfg.dataset.get("path"), corrected=False)
+        data = data_again(cfg, load_scene(folder), cfg.dataset.get("path"), corrected=False)
     elif scene is None:
         data = build_data(cfg)
     else:
@@ -138,7 +140,7 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     saved = OmegaConf.create(LATER)
     saved.merge_with(load_config(folder))
     checkpoint = folder / "checkpoints" / "last.ckpt"
-    read_checkpoint(checkpoint)  # fails in one line before anything starts, if it is broken
+    read_checkpoint(checkpoint, RESUMED)  # fails in one line before anything starts, if it is broken
     given = [override.partition("=")[0] for override in HydraConfig.get().overrides.task]
     for key in given:
         if key == "resume":

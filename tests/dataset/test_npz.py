@@ -172,6 +172,8 @@ DAMAGE = {
     "box shape": (_set(aabb=np.zeros(6)), "aabb: found shape (6,)"),
     "unbounded": (_set(aabb=BOX, unbounded=1), "unbounded: found int64"),
     "background": (_set(background=np.zeros(4)), "background: found shape (4,)"),
+    "too many numbers": (_set(near=np.zeros(17)), "near: found shape (17,), expected at most 16 numbers"),
+    "no way back": (_set(to_source=np.zeros((4, 4))), "to_source: found [[0.0"),
 }
 
 

@@ -24,7 +24,8 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.export.drawable import voxels_like
 from nerf_lightning.export.page import SCRIPTS, field_page, gallery_page, part, picture_page
 from nerf_lightning.runs.compact import decode, encode, without_folders
-from nerf_lightning.runs.folder import RunFolder, frame_from
+from nerf_lightning.runs.folder import RunFolder
+from nerf_lightning.runs.scene_file import frame_from
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.html import address_from
 
@@ -57,7 +58,7 @@ def made(recipe: str, precision: str = "byte", unbounded: bool = False) -> bytes
         [f"recipe={recipe}_small", "sampler=occupancy", "sampler.resolution=16", "sampler.samples=48"], Path("unused")
     )
     scene = scene_of(unbounded)
-    system = build_system(cfg, frame_from(scene)[0])
+    system = build_system(cfg, frame_from(scene, "made")[0])
     assert isinstance(system, NeRF3D)
     with torch.no_grad():
         for parameter in system.field.parameters():
@@ -275,7 +276,7 @@ def test_a_picture_fills_its_page(browser: Any, tmp_path: Path):
 
 def test_another_field_becomes_voxels_of_the_same_density():
     cfg = composed(["recipe=mlp_small"], Path("unused"))
-    frame, orbit, _ = frame_from(scene_of(False))
+    frame, orbit, _ = frame_from(scene_of(False), "made")
     system = build_system(cfg, frame)
     assert isinstance(system, NeRF3D) and orbit is not None
     voxels, options = voxels_like(system.eval(), orbit, 16)

@@ -23,7 +23,8 @@ from nerf_lightning.refine.corrections import FIRST
 from nerf_lightning.refine.poses import drifts
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.runs.data import data_again
-from nerf_lightning.runs.folder import load_config, load_scene
+from nerf_lightning.runs.folder import load_config
+from nerf_lightning.runs.scene_file import load_scene
 from nerf_lightning.sampler import Samples, UniformSampler
 from nerf_lightning.stability import damage
 from nerf_lightning.system import aligned
@@ -226,9 +227,7 @@ def test_a_run_says_what_it_corrected_and_is_rendered_without_its_photos(tmp_pat
     assert found["focal_factor"] is None and found["corner_brightness"] is None
     assert max(found["turned_degrees"]) > 0 and min(found["exposure"]) < 1 < max(found["exposure"])
     assert nl.load_run(tmp_path, "cpu").system.corrections is None
-    again = [
-        data_again(load_config(tmp_path), load_scene(tmp_path)[0], corrected=which).scene for which in (True, False)
-    ]
+    again = [data_again(load_config(tmp_path), load_scene(tmp_path), corrected=which).scene for which in (True, False)]
     moved, given = ([poses.train.cameras.centres for poses in again][i] for i in (0, 1))
     torch.testing.assert_close((moved - given).norm(dim=1), torch.tensor(found["moved"]), atol=2e-5, rtol=0)
     assert found["moved"][0] > 0 and torch.equal(again[0].val.cameras.c2w, again[1].val.cameras.c2w)
@@ -245,7 +244,7 @@ def test_a_run_says_what_it_corrected_and_is_rendered_without_its_photos(tmp_pat
     with pytest.raises(InputError, match="posed: found something, expected a folder that is not there yet"):
         export(options)
     with pytest.raises(InputError, match="corrected.*4 poses, one of each training photo"):
-        data_again(load_config(tmp_path), {**load_scene(tmp_path)[0], "corrected": [1.0]})
+        data_again(load_config(tmp_path), {**load_scene(tmp_path), "corrected": [1.0]})
 
 
 def test_poses_by_which_outlines_hardly_fit_are_corrected_before_any_trial(tmp_path: Path):

@@ -101,6 +101,7 @@ PATH = '{"width": 4, "height": 4, "K": [[%s,0,2],[0,1,2],[0,0,1]], "c2w": %s}'
         (PATH % (1, "[]"), "0 views"),
         (PATH % (1, "[[1,2]]"), "invalid for input"),
         (PATH % ("NaN", "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "not finite"),
+        (PATH.replace("4", "10000000") % (1, "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "pixels for which"),
         (PATH % (1, "[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]"), "no rotation"),
     ],
 )
@@ -114,5 +115,5 @@ def test_other_words_are_refused():
     words = r"path: found 'dolly', expected one of orbit, spiral, test, train, or a \.json file"
     with pytest.raises(InputError, match=words):
         find_route("dolly", None, circle(), None)
-    with pytest.raises(InputError, match=r"missing\.json: found no such file"):
+    with pytest.raises(InputError, match=r"missing\.json: found nothing there"):
         find_route("missing.json", None, circle(), None)

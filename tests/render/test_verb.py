@@ -82,8 +82,8 @@ def test_compact_files_too_and_the_same_command_does_nothing_twice(render: Rende
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (["run=nowhere"], "nowhere/config.yaml: found no such file"),
-        (["run=nothing.npz"], "nothing.npz: found No such file"),
+        (["run=nowhere"], "nowhere/config.yaml: found nothing there"),
+        (["run=nothing.npz"], "nothing.npz: found nothing there"),
         (["background=pink"], "background: found 'pink', expected scene, black, white, transparent, or R,G,B"),
         (["background=0.1,0.2"], "background: found '0.1,0.2'"),
         (["background=1,2,3"], "background: found '1,2,3'"),
@@ -94,7 +94,7 @@ def test_compact_files_too_and_the_same_command_does_nothing_twice(render: Rende
         (["scale=0"], "scale: found 0"),
         (["scale=2", "path=test"], "scale: found 2, expected scale=1 and a colour beside photos"),
         (["output=film.mov"], "output: found film.mov"),
-        (["path=nowhere.json"], "nowhere.json: found no such file"),
+        (["path=nowhere.json"], "nowhere.json: found nothing there"),
         (["path=test", "dataset.path=nowhere.npz"], "nowhere.npz"),
     ],
 )

@@ -107,14 +107,14 @@ def a_strangers_checkpoint(run: Path) -> None:
 
 
 DAMAGES: dict[Callable[[Path], None], str] = {
-    nothing: "config.yaml: found no such file, expected the folder of a run",
-    no_configuration: "config.yaml: found no such file",
+    nothing: "config.yaml: found nothing there, expected the folder of a run",
+    no_configuration: "config.yaml: found nothing there",
     half_a_configuration: "expected a run's configuration in YAML",
     a_configuration_cut_between_groups: "config.yaml: schedule: found nothing, expected a run's whole configuration",
-    no_scene: "scene.json: found no such file",
+    no_scene: "scene.json: found nothing there, expected the scene of a run",
     half_a_scene: "expected the scene of a run, whole",
     a_list_for_a_scene: "expected the scene of a run, whole",
-    no_checkpoint: "last.ckpt: found no such file, expected a checkpoint; the run may have ended before its first one",
+    no_checkpoint: "last.ckpt: found nothing there, expected a checkpoint; the run may have ended before its first one",
     half_a_checkpoint: "expected a whole checkpoint of tensors and plain values",
     a_later_format: "found format 99, expected format 1, which this version reads",
     another_model: "expected the weights of this run's model",

@@ -15,7 +15,8 @@ from nerf_lightning.dataset import Views, save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.data import data_again
-from nerf_lightning.runs.folder import load_config, load_scene, save_config, save_scene
+from nerf_lightning.runs.folder import load_config, save_config
+from nerf_lightning.runs.scene_file import load_scene, save_scene
 from tests.dataset.colmap_files import cameras_of, photos, write_colmap
 
 URL = "http://stranger.example/published.npz"
@@ -40,7 +41,7 @@ def a_run(folder: Path, *overrides: str) -> Path:
 
 
 def again(run: Path, photos: str | None = None) -> Any:
-    return data_again(load_config(run), load_scene(run)[0], photos).scene
+    return data_again(load_config(run), load_scene(run), photos).scene
 
 
 @pytest.fixture

@@ -32,6 +32,7 @@ def test_a_whole_run(tmp_path: Path):
     [
         (None, "unfinished", "no results.json"),
         ('{"psnr": 3', "unreadable", "results.json"),
+        ("[" * 5000, "unreadable", "levels"),
         ("[1, 2]", "unreadable", "list"),
         ("{}", "unreadable", ""),
         ({"psnr": None, "status": "failed", "diagnosis": "out of memory", "curve": None}, "failed", "out of memory"),
@@ -44,7 +45,23 @@ def test_a_broken_run_says_what_is_wrong_and_has_no_figures(results: object, sta
     assert run.psnr is None and run.curve == []
 
 
-@pytest.mark.parametrize("text", ["a: [1", "- 1\n- 2", "!!python/object/apply:os.getcwd []", ""])
+def test_what_stands_where_a_mapping_or_a_list_should_is_left_out_and_told(tmp_path: Path):
+    whole = {
+        "psnr": 31.5,
+        "status": "finished",
+        "diagnosis": "late",
+        "scene": ["toy"],
+        "curve": {"a": 1},
+        "machine": None,
+    }
+    run = read_run(made(tmp_path, "a", None, whole))
+    assert (run.psnr, run.status, run.curve, run.results["scene"]) == (31.5, "finished", [], None)
+    assert run.diagnosis == "late; results.json: scene is a list, not a dict; results.json: curve is a dict, not a list"
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 5000, "a: &a [*a]", "a: [1", "- 1\n- 2", "!!python/object/apply:os.getcwd []", ""]
+)
 def test_a_configuration_that_cannot_be_read_is_empty(text: str, tmp_path: Path):
     folder = made(tmp_path, "a", None, {"status": "finished"})
     (folder / "config.yaml").write_text(text)

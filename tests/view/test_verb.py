@@ -124,7 +124,7 @@ def test_ctrl_c_ends_it_cleanly_and_nothing_is_written(scene: Scene, tmp_path: P
     [
         ([], ["scene and run", "nothing", "give scene=scene.npz or run=DIR"]),
         (["scene=a.npz", "run=b"], ["scene and run", "found both"]),
-        (["run=nowhere", "port=0"], ["nowhere/config.yaml", "no such file"]),
+        (["run=nowhere", "port=0"], ["nowhere/config.yaml", "nothing there"]),
         (["scene=a.npz", "rays=0"], ["rays", "found 0", "at least 1"]),
         (["scene=a.npz", "+ray=3"], ["ray", "unknown option", "did you mean rays?"]),
         (["scene=missing.npz", "port=0"], ["missing.npz", "nothing there"]),

@@ -1,14 +1,14 @@
 """TagLayout: the tags, their size, and where they lie in the world."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.untrusted import read_yaml
 
 SQUARE = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) / 2
 """Corners of a tag of side 1 in its own frame, in OpenCV's order: the printed top left first, then clockwise."""
@@ -57,10 +57,7 @@ def read_layout(path: Path, dictionary: str, size: float) -> TagLayout:
     shipped = SHEETS / f"{path.name}.yaml"
     if not path.exists() and path.parent == Path() and shipped.exists():
         path = shipped
-    try:
-        content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(path, "", f"no readable YAML ({error})", "a file with tags: {0: {x: 0.0, y: 0.0}}") from error
+    content = read_yaml(path, "a file with tags: {0: {x: 0.0, y: 0.0}}")
     tags = content.get("tags") if isinstance(content, dict) else None
     if not isinstance(tags, dict) or not tags:
         raise InputError(path, "tags", repr(tags), "a mapping from each tag's id to its x and y in metres")
@@ -71,7 +68,7 @@ def read_layout(path: Path, dictionary: str, size: float) -> TagLayout:
         given = entry if isinstance(entry, dict) else {}
         unknown = sorted(set(given) - {"x", "y", "turn"})
         numbers = [given.get("x"), given.get("y"), given.get("turn", 0.0)]
-        plain = [isinstance(n, int | float) and not isinstance(n, bool) and np.isfinite(n) for n in numbers]
+        plain = [isinstance(n, int | float) and not isinstance(n, bool) and math.isfinite(n) for n in numbers]
         if unknown or not all(plain):
             raise InputError(path, f"tags.{tag}", repr(entry), "x and y in metres, and optionally turn in degrees")
         poses[tag] = flat_pose(*numbers)

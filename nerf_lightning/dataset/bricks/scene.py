@@ -3,11 +3,8 @@
 import math
 import os
 import warnings
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from tokenize import TokenError
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -20,6 +17,7 @@ from nerf_lightning.dataset.bricks.trace import picture, shadow
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.arrays import Header, Headers, read_npz
 from nerf_lightning.utils.files import atomic, cache_folder
 
 VERSION = 1
@@ -101,16 +99,19 @@ def _pictures(cameras: Cameras) -> UInt8[np.ndarray, "V H W 4"]:
 
 def _load(path: Path, train: Cameras, val: Cameras) -> tuple[np.ndarray, np.ndarray] | None:
     """The pictures a file holds, or None where there is none or it is not whole."""
+    wanted = {"images_train": train, "images_val": val}
+
+    def check(headers: Headers) -> None:
+        for key, cameras in wanted.items():
+            shape = (len(cameras), cameras.height, cameras.width, 4)
+            if key not in headers or headers[key] != Header(shape, np.dtype(np.uint8)):
+                raise InputError(path, key, "something else", f"bytes of shape {shape}")
+
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            images = arrays["images_train"], arrays["images_val"]
-    except (OSError, EOFError, ValueError, KeyError, SyntaxError, RuntimeError, BadZipFile, zlib.error, TokenError):
-        # All the ways a damaged archive fails, the last in an array's header. The pictures can be traced again.
+        images = read_npz(path, wanted, check)
+    except InputError:  # the pictures can be traced again
         return None
-    for array, cameras in zip(images, (train, val), strict=True):
-        if array.dtype != np.uint8 or array.shape != (len(cameras), cameras.height, cameras.width, 4):
-            return None
-    return images
+    return images["images_train"], images["images_val"]
 
 
 def _save(path: Path, train: np.ndarray, val: np.ndarray) -> None:

@@ -53,7 +53,7 @@ def load_blender(folder: Path, name: str | None = None, resize: int | None = Non
 
 
 def _load_split(path: Path, resize: int | None) -> Views:
-    content = checks.read_json(path)
+    content = checks.json_object(path)
     checks.require_keys(path, content, ["camera_angle_x", "frames"])
     angle = checks.positive(path, "camera_angle_x", content["camera_angle_x"], "radians")
     if angle >= math.pi:

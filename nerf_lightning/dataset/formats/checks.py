@@ -3,9 +3,6 @@
 Files come from strangers: nothing here unpickles or evaluates anything.
 """
 
-import json
-import zipfile
-import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -13,57 +10,19 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.arrays import Header
+from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.untrusted import read_json
 
+PIXEL_BYTES = 20
+"""Memory for a pixel of a rendered view: colour, depth and opacity as floats."""
 RIGID_TOLERANCE = 1e-3
 """How far R^T R may stand from the identity, entry by entry; files that print six digits stay well below."""
 
-UNREADABLE = (zipfile.BadZipFile, ValueError, EOFError, OSError, KeyError, zlib.error, RuntimeError, MemoryError)
-"""What np.load raises for a damaged archive: RuntimeError for an encrypted entry, MemoryError for a forged shape."""
 
-
-def existing_file(path: Path) -> Path:
-    if path.is_dir():
-        raise InputError(path, "", "a folder", "a file")
-    if not path.is_file():
-        raise InputError(path, "", "nothing there", "a file", "check the path")
-    return path
-
-
-def read_npz(path: Path, known: Iterable[str], needed: Sequence[str]) -> dict[str, np.ndarray]:
-    """The arrays of an .npz file whose names are in `known`; other entries stay unread. Pickled entries are refused."""
-    existing_file(path)
-    key = ""
-    try:
-        # A file handle of our own: np.load leaks its handle when the zip turns out to be broken.
-        with path.open("rb") as file:
-            if file.read(2) != b"PK":
-                raise InputError(path, "", "a file that is no zip archive", "an .npz archive of named arrays")
-            file.seek(0)
-            archive = np.load(file, allow_pickle=False)
-            require_keys(path, archive.files, needed)
-            arrays = {}
-            for key in known:
-                if key in archive.files:
-                    arrays[key] = archive[key]
-            return arrays
-    except InputError:
-        raise
-    except UNREADABLE as error:
-        found = f"something unreadable ({type(error).__name__}: {error})"
-        expected = "plain numeric arrays in a whole .npz file"
-        raise InputError(path, key, found, expected, "save or copy it again") from error
-
-
-def read_json(path: Path) -> dict:
-    existing_file(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except json.JSONDecodeError as error:
-        found = f"broken JSON at line {error.lineno}, column {error.colno} ({error.msg})"
-        raise InputError(path, "", found, "a JSON object", "mend that line or export again") from error
-    except (ValueError, OSError, RecursionError) as error:
-        found = f"something unreadable ({type(error).__name__}: {error})"
-        raise InputError(path, "", found, "a JSON object in UTF-8", "export it again") from error
+def json_object(path: Path) -> dict:
+    """What a JSON file holds, if that is an object."""
+    content = read_json(path, "a JSON object", "mend it or export again")
     if not isinstance(content, dict):
         raise InputError(path, "", f"a JSON {type(content).__name__}", "a JSON object with frames")
     return content
@@ -107,11 +66,16 @@ def numeric(where: object, key: str, array: Shaped[np.ndarray, "..."], shape: st
     return array
 
 
+def pose_array(where: object, key: str, array: Header | np.ndarray) -> None:
+    """Whether an array can be poses, by its shape and type."""
+    if len(array.shape) != 3 or array.shape[1:] != (4, 4) or array.dtype.kind not in "iuf":
+        found = f"shape {array.shape}, {array.dtype}"
+        raise InputError(where, key, found, "camera-to-world matrices of shape (V, 4, 4)")
+
+
 def rigid_poses(where: object, label: str, poses: Shaped[np.ndarray, "V ..."]) -> Float[np.ndarray, "V 4 4"]:
     """Camera-to-world matrices [R t; 0 1] with R a rotation. `label` names pose i in messages: "c2ws_train[{}]"."""
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or poses.dtype.kind not in "iuf":
-        found = f"shape {poses.shape}, {poses.dtype}"
-        raise InputError(where, label.replace("[{}]", ""), found, "camera-to-world matrices of shape (V, 4, 4)")
+    pose_array(where, label.replace("[{}]", ""), poses)
     poses = poses.astype(np.float64)
     expected = "a finite camera-to-world matrix [R t; 0 0 0 1] with R a rotation"
     for i, pose in enumerate(poses):
@@ -154,23 +118,27 @@ def json_frames(path: Path, content: dict) -> tuple[list[str], Float[np.ndarray,
     return [frame["file_path"] for frame in frames], rigid_poses(path, "frames[{}].transform_matrix", np.stack(poses))
 
 
-def uint8_images(where: object, key: str, images: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "V H W C"]:
+def image_array(where: object, key: str, array: Header) -> None:
+    """Whether an array can be images, by its shape and type."""
+    if len(array.shape) != 4 or array.shape[3] not in (3, 4) or 0 in array.shape[1:3]:
+        raise InputError(where, key, f"shape {array.shape}", "images of shape (V, H, W, 3 or 4)")
+    if array.dtype != np.uint8 and array.dtype.kind != "f":
+        raise InputError(where, key, f"dtype {array.dtype}", "uint8, or floats in [0, 1]")
+
+
+def uint8_images(where: object, key: str, images: Shaped[np.ndarray, "V H W C"]) -> UInt8[np.ndarray, "V H W C"]:
     """Images as uint8; floats in [0, 1] are scaled and rounded."""
-    if images.ndim != 4 or images.shape[3] not in (3, 4) or 0 in images.shape[1:3]:
-        raise InputError(where, key, f"shape {images.shape}", "images of shape (V, H, W, 3 or 4)")
     if images.dtype == np.uint8:
         return images
-    if images.dtype.kind != "f":
-        raise InputError(where, key, f"dtype {images.dtype}", "uint8, or floats in [0, 1]")
     if images.size and not (images.min() >= 0 and images.max() <= 1):  # false for nan too
         raise InputError(where, key, f"floats from {images.min():g} to {images.max():g}", "uint8, or floats in [0, 1]")
     return np.rint(images * 255).astype(np.uint8)
 
 
-def image_size(where: object, key: str, image: UInt8[np.ndarray, "*V H W C"], size: tuple[int, ...]) -> None:
+def image_size(where: object, key: str, found_size: tuple[int, ...], size: tuple[int, ...]) -> None:
     """All images of a scene share one (H, W, C)."""
-    if image.shape[-3:] != size:
-        found = "{1}x{0} with {2} channels".format(*image.shape[-3:])
+    if found_size != size:
+        found = "{1}x{0} with {2} channels".format(*found_size)
         wanted = "{1}x{0} with {2} channels".format(*size)
         raise InputError(where, key, found, f"{wanted}, as in the first image", "bring all images to one size")
 
@@ -203,3 +171,21 @@ def box(where: object, key: str, aabb: Shaped[np.ndarray, "..."]) -> Float[np.nd
     if not (aabb[0] < aabb[1]).all():
         raise InputError(where, key, str(aabb.round(4).tolist()), "a lower corner below the upper one on each axis")
     return aabb
+
+
+def similarity(where: object, key: str, matrix: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "4 4"]:
+    """A change of frame that can be undone: [sR t; 0 0 0 1] with a scale s above 0 and no mirror."""
+    matrix = numeric(where, key, matrix, "4 4")
+    if not (np.allclose(matrix[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE) and np.linalg.det(matrix[:3, :3]) > 0):
+        raise InputError(where, key, str(matrix.round(4).tolist()), "[sR t; 0 0 0 1] with a scale s above 0")
+    return matrix
+
+
+def view_size(where: object, key: str, width: object, height: object) -> tuple[int, int]:
+    """Width and height in pixels of views to be rendered, each of which must fit into memory."""
+    for side in (width, height):
+        if not isinstance(side, int) or isinstance(side, bool) or side < 1:
+            raise InputError(where, key, repr(side)[:60], "a width and a height, each at least one pixel")
+    assert isinstance(width, int) and isinstance(height, int)  # as was just checked
+    check_memory(where, key, f"{width}x{height} pixels", PIXEL_BYTES * width * height)
+    return width, height

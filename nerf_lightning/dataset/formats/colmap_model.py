@@ -15,6 +15,7 @@ from jaxtyping import Float
 from nerf_lightning.dataset.formats.colmap_cameras import MODELS, NUMBERS, optics_of
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.untrusted import read_content
 
 FILES = ("cameras", "images", "points3D")
 LONGEST_NAME = 4096
@@ -50,7 +51,7 @@ class Bytes:
 
     def __init__(self, path: Path):
         self.path = path
-        self.content = _content(path)
+        self.content = read_content(path)
         self.at = 0
 
     def take(self, form: str) -> tuple:
@@ -156,17 +157,10 @@ def _points_bin(path: Path) -> Float[np.ndarray, "P 3"]:
     return np.array(points).reshape(-1, 3)
 
 
-def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"something unreadable ({error})", "a COLMAP file") from error
-
-
 def _lines(path: Path) -> Iterator[list[str]]:
     """The words of each line but comments; empty lines too."""
     try:
-        text = _content(path).decode()
+        text = read_content(path).decode()
     except UnicodeDecodeError as error:
         raise InputError(path, "", "something that is no text", "COLMAP's text format") from error
     for line in text.splitlines():

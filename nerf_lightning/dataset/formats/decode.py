@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 from PIL import Image, UnidentifiedImageError
 
-from nerf_lightning.dataset.formats.checks import existing_file
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.extras import require
+from nerf_lightning.utils.untrusted import existing_file
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 THREADS = 4

@@ -13,6 +13,7 @@ from nerf_lightning.dataset.posed import scene_of
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.arrays import Header, read_npy
 
 POSES = "poses_bounds.npy"
 
@@ -49,16 +50,12 @@ def load_llff(folder: Path, name: str | None = None, reading: Reading = AS_IT_IS
 
 def _rows(path: Path) -> tuple[Float[np.ndarray, "V 4 4"], Float[np.ndarray, "V 3"], float | None]:
     """Poses, OpenCV camera to world; height, width and focal length; and the least depth, if it is one."""
-    checks.existing_file(path)
-    try:
-        with path.open("rb") as file:
-            rows = np.load(file, allow_pickle=False)
-    except checks.UNREADABLE as error:
-        found = f"something unreadable ({type(error).__name__}: {error})"
-        raise InputError(path, "", found, "an .npy array of numbers", "copy it again") from error
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "iuf":
-        found = f"shape {rows.shape}, {rows.dtype}" if isinstance(rows, np.ndarray) else "an archive"
-        raise InputError(path, "", found, "numbers of shape (photos, 17)")
+
+    def check(header: Header) -> None:
+        if header.shape[1:] != (17,) or header.dtype.kind not in "iuf":
+            raise InputError(path, "", f"shape {header.shape}, {header.dtype}", "numbers of shape (photos, 17)")
+
+    rows = read_npy(path, check)
     poses = rows[:, :15].astype(np.float64).reshape(-1, 3, 5)
     c2w = np.zeros((len(poses), 4, 4))
     c2w[:, :3, 0], c2w[:, :3, 1] = poses[:, :, 1], poses[:, :, 0]

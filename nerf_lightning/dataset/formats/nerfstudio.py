@@ -52,7 +52,7 @@ def load_nerfstudio(path: Path, name: str | None = None, reading: Reading = AS_I
         InputError: anything missing or malformed, or a lens that is not known here.
     """
     file = path / "transforms.json" if path.is_dir() else path
-    content = checks.read_json(file)
+    content = checks.json_object(file)
     frames = _frames(file, content)
     applied = _applied(file, content)
     optics = [_optics(file, content, frame, *image_header(frame.image)[:2]) for frame in frames]

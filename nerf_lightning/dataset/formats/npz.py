@@ -1,6 +1,7 @@
 """The course format: one .npz file with images, OpenCV camera-to-world poses and a focal length."""
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,12 @@ from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.arrays import Headers, read_npz
 from nerf_lightning.utils.files import atomic
 
 NEEDED = ("images_train", "c2ws_train", "images_val", "c2ws_val")
+MOST_NUMBERS = 16
+"""In what is neither images nor poses of views: `to_source`, a 4 x 4 matrix, has most."""
 OPTIONAL = ("c2ws_test", "focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
 
 
@@ -36,10 +40,9 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
     Raises:
         InputError: anything missing, malformed or contradictory.
     """
-    data = checks.read_npz(path, NEEDED + OPTIONAL, NEEDED)
+    data = read_npz(path, NEEDED + OPTIONAL, partial(_compare, path))
     images = {key: checks.uint8_images(path, key, data[key]) for key in ("images_train", "images_val")}
-    size = images["images_train"].shape[1:]
-    height, width = size[:2]
+    height, width = images["images_train"].shape[1:3]
     if "K" in data:
         K = checks.intrinsics(path, "K", data["K"])
     else:
@@ -52,16 +55,12 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
         return Cameras.of_size(torch.from_numpy(K).float().repeat(len(c2w), 1, 1), c2w, width, height)
 
     def views(split: str) -> Views:
-        key, poses = f"images_{split}", f"c2ws_{split}"
-        checks.split_size(path, key, len(images[key]), len(np.atleast_1d(data[poses])))
-        checks.image_size(path, key, images[key], size)
-        return Views.of(torch.from_numpy(images[key]), cameras(poses))
+        return Views.of(torch.from_numpy(images[f"images_{split}"]), cameras(f"c2ws_{split}"))
 
     train, val = views("train"), views("val")
     orbit = orbit_like(train.cameras)
     if "c2ws_test" in data:
         orbit = cameras("c2ws_test")
-        checks.split_size(path, "c2ws_test", len(orbit))
 
     background = border_colour(train) or (0.0, 0.0, 0.0)
     if "background" in data:
@@ -69,7 +68,7 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
         background = (red, green, blue)
     to_source = torch.eye(4)
     if "to_source" in data:
-        to_source = torch.from_numpy(checks.numeric(path, "to_source", data["to_source"], "4 4")).float()
+        to_source = torch.from_numpy(checks.similarity(path, "to_source", data["to_source"])).float()
     return Scene(
         name=name or re.sub(r"_\d+x\d+$", "", path.stem).lower(),
         source=str(path),
@@ -80,6 +79,24 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
         background=background,
         to_source=to_source,
     )
+
+
+def _compare(path: Path, headers: Headers) -> None:
+    """Compares shapes, before anything is unpacked."""
+    checks.require_keys(path, headers, NEEDED)
+    for key in ("images_train", "images_val"):
+        checks.image_array(path, key, headers[key])
+    for split in ("train", "val"):
+        key, poses = f"images_{split}", f"c2ws_{split}"
+        checks.pose_array(path, poses, headers[poses])
+        checks.split_size(path, key, headers[key].shape[0], headers[poses].shape[0])
+        checks.image_size(path, key, headers[key].shape[1:], headers["images_train"].shape[1:])
+    if "c2ws_test" in headers:
+        checks.pose_array(path, "c2ws_test", headers["c2ws_test"])
+        checks.split_size(path, "c2ws_test", headers["c2ws_test"].shape[0])
+    for key in set(headers) & set(OPTIONAL) - {"c2ws_test"}:
+        if headers[key].size > MOST_NUMBERS:
+            raise InputError(path, key, f"shape {headers[key].shape}", f"at most {MOST_NUMBERS} numbers")
 
 
 def _bounds(path: Path, data: dict[str, np.ndarray], train: Views, background: tuple[float, float, float]) -> Bounds:

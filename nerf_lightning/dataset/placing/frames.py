@@ -8,13 +8,13 @@ import imageio.v3 as imageio
 import numpy as np
 from jaxtyping import Float
 
-from nerf_lightning.dataset.formats.checks import existing_file
 from nerf_lightning.dataset.placing.choose import FEWEST, choose, motion, sharpness, suitable_count
 from nerf_lightning.dataset.placing.kept import find_kept, keep, made_of
 from nerf_lightning.dataset.placing.video import colours, frames, grey, seconds_of
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic_folder
+from nerf_lightning.utils.untrusted import existing_file
 
 log = logging.getLogger(__name__)
 

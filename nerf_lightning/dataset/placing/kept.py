@@ -1,7 +1,6 @@
 """Results that are kept beside what they were made of, so that a second run does not make them again."""
 
 import hashlib
-import json
 import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic_folder, cache_folder, write_json
+from nerf_lightning.utils.untrusted import read_json
 
 log = logging.getLogger(__name__)
 
@@ -84,6 +84,6 @@ def _cached(beside: Path) -> Path:
 def _read(record: Path) -> Any:
     """None where it cannot be read: it fits no sources then."""
     try:
-        return json.loads(record.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return read_json(record, "what it was made of")
+    except InputError:
         return None

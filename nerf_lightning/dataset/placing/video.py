@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import UInt8
 
-from nerf_lightning.dataset.formats.checks import existing_file
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.untrusted import existing_file
 
 if TYPE_CHECKING:
     import av

@@ -1,0 +1,79 @@
+"""Checkpoints as they are read back: tensors and plain values, whole to the last bit, and never code."""
+
+import pickle
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.untrusted import NONSENSE, existing_file
+
+EXPECTED = "a whole checkpoint of tensors and plain values"
+RENDERED: dict[str, type] = {"state_dict": dict}
+"""What rendering needs."""
+RESUMED: dict[str, type] = {
+    **dict.fromkeys(("state_dict", "loops", "callbacks"), dict),
+    **dict.fromkeys(("optimizer_states", "lr_schedulers"), list),
+    **dict.fromkeys(("epoch", "global_step"), int),
+}
+"""What training needs to go on, as Lightning writes it."""
+DAMAGED = (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, OSError, *NONSENSE)
+"""What zipfile and PyTorch raise for a damaged file."""
+
+
+def read_checkpoint(path: Path, needed: Mapping[str, type] = RENDERED) -> dict[str, Any]:
+    """Reads a checkpoint, which must hold what is `needed`.
+
+    It is an archive that keeps a checksum (CRC-32) of each of its parts, as all versions of PyTorch since 1.6 write it. PyTorch
+    does not compare them when it loads: here they are compared first, which takes half as long as loading does.
+
+    Raises:
+        InputError: where the file is missing, truncated, changed since it was written, larger than memory, or holds anything
+            else than a state.
+    """
+    existing_file(path, "a checkpoint", "the run may have ended before its first one")
+    check_memory(path, "", "a checkpoint", path.stat().st_size)
+    best = path.with_name("best.ckpt")
+    todo = f"{best.name} may be whole: copy it over this one" if path != best and best.exists() else ""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            packed = [one.filename for one in archive.infolist() if one.compress_type != zipfile.ZIP_STORED]
+            changed = packed[0] if packed else archive.testzip()  # what is packed may have any size
+        if changed is not None:
+            raise InputError(path, changed, "other bytes than were written", EXPECTED, todo)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict):
+            raise InputError(path, "", f"a {type(state).__name__}", EXPECTED)
+        for key, kind in needed.items():
+            if not isinstance(state.get(key), kind):
+                raise InputError(path, key, f"a {type(state.get(key)).__name__}", f"a {kind.__name__}", todo)
+        _check_weights(path, state["state_dict"])
+    except InputError:
+        raise
+    except DAMAGED as error:
+        raise InputError(path, "", str(error).split(".")[0], EXPECTED, todo) from error
+    return state
+
+
+def _check_weights(path: Path, weights: Mapping[str, Any]) -> None:
+    for name, tensor in weights.items():
+        # A view may show one number any amount of times: it asks for more memory than the file has bytes.
+        if not isinstance(tensor, Tensor) or tensor.nbytes > tensor.untyped_storage().nbytes():
+            raise InputError(path, f"state_dict.{name}", type(tensor).__name__, "a tensor with a number in each place")
+
+
+def check_finite(module: torch.nn.Module, where: object) -> None:
+    """Refuses a system of which nothing can be drawn.
+
+    Raises:
+        InputError: where a weight is not a finite number. Training keeps them finite, unless it has broken down.
+    """
+    for name, tensor in module.state_dict().items():
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            todo = "the run has broken down: see its results.json"
+            raise InputError(where, name, "nan or infinity", "weights that are finite numbers", todo)
