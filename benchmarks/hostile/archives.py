@@ -147,7 +147,8 @@ def npz_file(data: bytes, rng: Random, marker: Path, room: int) -> tuple[bytes, 
             members[at] = name, header(rng, array)
             done = "a header that lies"
         case 3:
-            shape = (2 * room // max(1, array[:1].nbytes), *array.shape[1:])
+            rows = np.atleast_1d(array)
+            shape = (2 * room // max(1, rows[:1].nbytes), *rows.shape[1:])
             about = str({"descr": npy.dtype_to_descr(array.dtype), "fortran_order": False, "shape": shape})
             return with_bomb(members, at, about, 2 * room), f"{word}: unpacks to {2 * room} bytes"
         case 4:

@@ -20,8 +20,6 @@ import psutil
 
 SHARED = 4
 """Times as much of the clock as of the processor: on a machine that others use too, and for what waits instead of working."""
-MODULES = {"train": "nerf_lightning"}
-"""By verb: what stands behind `python -m`; of the others it is this package's folder of that name."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +36,16 @@ class Limits:
 class Command:
     """A command line."""
 
-    verb: str
+    module: str
+    """What stands behind `python -m`."""
     arguments: tuple[str, ...]
+    good: bool = False
+    """Whether nothing is wrong with it, only with what it reads: then it is composed once, for speed. Hydra otherwise composes
+    it before, to see whether its configuration says that it is a sweep."""
 
     @property
-    def module(self) -> str:
-        return MODULES.get(self.verb, f"nerf_lightning.{self.verb}")
+    def verb(self) -> str:
+        return self.module.removeprefix("nerf_lightning").lstrip(".") or "train"
 
 
 @dataclass(frozen=True)
@@ -186,7 +188,11 @@ def _data() -> int:
 
 def _main(command: Command) -> int:
     """Runs the command line as `python -m` would, to its exit code."""
-    sys.argv = [command.verb, *command.arguments]
+    sys.argv = [command.module, *command.arguments]
+    if command.good:
+        from hydra._internal.hydra import Hydra
+
+        Hydra.get_mode = lambda *_, **__: None  # type: ignore[method-assign]
     try:
         runpy.run_module(command.module, run_name="__main__", alter_sys=True)
         code = 0

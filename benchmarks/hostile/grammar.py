@@ -12,246 +12,45 @@ from benchmarks.hostile.case import Command
 ENDLESS = ("budget.", "trainer.max_", "target.", "seconds", "within_db", "smallest_within_db", "steps", "seeds", "fps")
 """Options that may ask for any amount of time: a command that takes long is right then. They get no large numbers."""
 NOT_ASKED = (
-    *(
-        "trainer.devices",
-        "trainer.strategy",
-        "compile",
-        "kernels",
-        "dataset.url",
-        "dataset.download",
-        "resume",
-        "workers",
-    ),
-    *("trainer.num_nodes", "trainer.accelerator", "trainer.profiler"),
-)
+    "trainer.devices", "trainer.strategy", "trainer.num_nodes", "trainer.accelerator", "trainer.profiler", "compile", "kernels",
+    "dataset.url", "dataset.download", "resume", "workers",
+)  # fmt: skip
 """Options that start other processes or compilers, or ask the network."""
 WRITTEN = ("output", "name", "print", "hydra.run.dir")
 """Options that say where to write: nothing outside of the case's folder may be named there."""
 PLACES = (
-    *("scene.npz", "scene.npz/x", "", ".", "..", "new", "new/x.webp", "new.png", "new.nosuch", "x" * 5000, "x/" * 2500),
-    *(
-        "a\0b",
-        "é\u202e",
-        "%s",
-        "'",
-        "[",
-        "/dev/null/x",
-        "~nosuchuser/x",
-        "/proc/nosuch/x",
-        "new.npz",
-        "new.html",
-        "new folder",
-    ),
-)
+    "scene.npz", "scene.npz/x", "", ".", "new", "new/x.webp", "new.png", "new.nosuch", "x" * 5000, "x/" * 2500, "a\0b",
+    "é\u202e", "%s", "'", "[", "/dev/null/x", "~nosuchuser/x", "/proc/nosuch/x", "new.npz", "new.html", "new folder",
+)  # fmt: skip
 WORDS = (
-    *(
-        "null",
-        "nan",
-        "inf",
-        "-inf",
-        "1e39",
-        "1e300",
-        "1e-320",
-        "-0.0",
-        "0",
-        "-1",
-        "1",
-        "2",
-        "0.5",
-        "1e400",
-        "1_000",
-        "0x10",
-    ),
-    *(
-        "true",
-        "false",
-        "",
-        "''",
-        '""',
-        "[]",
-        "{}",
-        "[1,2,3]",
-        "{a:1}",
-        "[[]]",
-        "[null]",
-        "a,b",
-        "'a b'",
-        "abc",
-        "${nope}",
-    ),
-    *(
-        "${seed}",
-        "${oc.env:NOSUCH}",
-        "${oc.env:HOME",
-        "[1",
-        "{a",
-        "'",
-        "a=b",
-        "\\",
-        "x" * 5000,
-        "é",
-        "\u202e",
-        "1,nan",
-        "???",
-    ),
-    *(
-        "range(3)",
-        "choice(1,2)",
-        "glob(*)",
-        "int(1.5)",
-        "[" * 200 + "]" * 200,
-        "auto",
-        "~nosuchuser",
-        "../x",
-        "nosuch.npz",
-    ),
-)
+    "null", "nan", "inf", "-inf", "1e39", "1e300", "1e-320", "-0.0", "0", "-1", "1", "2", "0.5", "1e400", "1_000", "0x10",
+    "true", "false", "", "''", '""', "[]", "{}", "[1,2,3]", "{a:1}", "[[]]", "[null]", "a,b", "'a b'", "abc", "${nope}",
+    "${seed}", "${oc.env:NOSUCH}", "${oc.env:HOME", "[1", "{a", "'", "a=b", "\\", "x" * 5000, "é", "\u202e", "1,nan", "???",
+    "range(3)", "choice(1,2)", "glob(*)", "int(1.5)", "[" * 200 + "]" * 200, "auto", "~nosuchuser", "../x", "nosuch.npz",
+)  # fmt: skip
 LARGE = tuple(str(one) for one in values.INTEGERS if one > 2**32)
 FLAGS = (
-    *(
-        "--nope",
-        "--config-name=nope",
-        "--config-dir=nowhere",
-        "--config-path=/nowhere",
-        "-m",
-        "--multirun",
-        "--cfg",
-        "--cfg=job",
-    ),
-    *(
-        "--cfg=nope",
-        "--help",
-        "--hydra-help",
-        "--info=all",
-        "--info=nope",
-        "--resolve",
-        "--package=nope",
-        "-x",
-        "--",
-        "-",
-    ),
-    *("--version", "--shell-completion", "--run", "--experimental-rerun=nope", "-cn", "-h=1", "---", "--config-name"),
-)
+    "--nope", "--config-name=nope", "--config-dir=nowhere", "--config-path=/nowhere", "-m", "--multirun", "--cfg", "--cfg=job",
+    "--cfg=nope", "--help", "--hydra-help", "--info=all", "--info=nope", "--resolve", "--package=nope", "-x", "--", "-",
+    "--version", "--shell-completion", "--run", "--experimental-rerun=nope", "-cn", "-h=1", "---", "--config-name",
+)  # fmt: skip
 BROKEN = (
-    *(
-        "",
-        "=",
-        "=1",
-        "nope=1",
-        "nope",
-        "a.b.c=1",
-        "model",
-        "model.=1",
-        ".model=1",
-        "model..width=1",
-        "+",
-        "~",
-        "+=1",
-        "~nope",
-    ),
-    *(
-        "+foo=1",
-        "++foo=1",
-        "+foo.bar=1",
-        "++model.nope=1",
-        "+model=mlp",
-        "model@x=mlp",
-        "model@:_global_=mlp",
-        "~model",
-    ),
-    *(
-        "~model.width",
-        "seed",
-        "seed==1",
-        "seed=1=2",
-        "seed =1",
-        "seed= 1",
-        "'seed=1'",
-        "seed:1",
-        "hydra=nope",
-        "hydra.x=1",
-    ),
-    *(
-        "é=1",
-        "a b=1",
-        "$x=1",
-        "model={",
-        "model=[mlp,voxels]",
-        "+experiment=nope",
-        "+experiment=",
-        "+experiment=nope.yaml",
-    ),
-    *(
-        "+experiment=picture.png",
-        "hydra.job.chdir=nope",
-        "hydra/job_logging=nope",
-        "hydra.verbose=nope",
-        "hydra.mode=nope",
-    ),
-    *(
-        "resume=scene.npz",
-        "resume=picture.png",
-        "resume=nowhere",
-        "resume=",
-        "resume=null",
-        "resume=run/config.yaml",
-        "resume=.",
-    ),
-    *(
-        "resume=~nosuchuser/x",
-        "resume=" + "x" * 5000,
-        "resume=[1,2]",
-        "resume=nan",
-        "resume=1e300",
-        "resume=a,b",
-        "resume='",
-    ),
-)
+    "", "=", "=1", "nope=1", "nope", "a.b.c=1", "model", "model.=1", ".model=1", "model..width=1", "+", "~", "+=1", "~nope",
+    "+foo=1", "++foo=1", "+foo.bar=1", "++model.nope=1", "+model=mlp", "model@x=mlp", "model@:_global_=mlp", "~model",
+    "~model.width", "seed", "seed==1", "seed=1=2", "seed =1", "seed= 1", "'seed=1'", "seed:1", "hydra=nope", "hydra.x=1",
+    "é=1", "a b=1", "$x=1", "model={", "model=[mlp,voxels]", "+experiment=nope", "+experiment=", "+experiment=nope.yaml",
+    "+experiment=picture.png", "hydra.job.chdir=nope", "hydra/job_logging=nope", "hydra.verbose=nope", "hydra.mode=nope",
+    "resume=scene.npz", "resume=picture.png", "resume=nowhere", "resume=", "resume=null", "resume=run/config.yaml", "resume=.",
+    "resume=~nosuchuser/x", "resume=" + "x" * 5000, "resume=[1,2]", "resume=nan", "resume=1e300", "resume=a,b", "resume='",
+)  # fmt: skip
 GROUPS = (
-    "dataset",
-    "optimizer",
-    "model",
-    "sampler",
-    "renderer",
-    "refine",
-    "schedule",
-    "callbacks",
-    "logger",
-    "trainer",
-    "recipe",
-)
+    "dataset", "optimizer", "model", "sampler", "renderer", "refine", "schedule", "callbacks", "logger", "trainer", "recipe",
+)  # fmt: skip
 CHOICES = (
-    *(
-        "null",
-        "nope",
-        "",
-        "[]",
-        "[a,b]",
-        "x" * 5000,
-        "1",
-        "nan",
-        "true",
-        "../model/mlp",
-        "/nowhere",
-        "{a:1}",
-        "mlp",
-        "voxels",
-    ),
-    *(
-        "hashgrid",
-        "uniform",
-        "stratified",
-        "importance",
-        "proposal",
-        "occupancy",
-        "both",
-        "light",
-        "poses",
-        "auto",
-        "constant",
-    ),
-    *("cosine", "adamw", "siren", "fourier", "picture", "photos", "mlp_small", "published", "tensorboard"),
-)
+    "null", "nope", "", "[]", "[a,b]", "x" * 5000, "1", "nan", "true", "../model/mlp", "/nowhere", "{a:1}", "mlp", "voxels",
+    "hashgrid", "uniform", "stratified", "importance", "proposal", "occupancy", "both", "light", "poses", "auto", "constant",
+    "cosine", "adamw", "siren", "fourier", "picture", "photos", "mlp_small", "published", "tensorboard",
+)  # fmt: skip
 
 
 def word(rng: Random, key: str) -> str:
@@ -296,7 +95,7 @@ def spoilt(good: Command, rng: Random, options: Mapping[str, Mapping[str, str]])
     whole = tuple(
         one.encode("utf-8", "replace").decode().replace("\0", "") for one in arguments
     )  # none can be given more
-    return Command(good.verb, whole), "; ".join(one[:60] for one in more)
+    return Command(good.module, whole), "; ".join(one[:60] for one in more)
 
 
 def document(rng: Random, depth: int = 0) -> Any:

@@ -102,6 +102,11 @@ KINDS = (
 )
 
 
+def module(verb: str) -> str:
+    """What stands behind its `python -m`."""
+    return "nerf_lightning" if verb == "train" else f"nerf_lightning.{verb}"
+
+
 @dataclass(frozen=True)
 class Case:
     """A case, before its input is written: it follows from its seed and number alone."""
@@ -136,7 +141,7 @@ def prepare(
     verb, *arguments = rng.choice(kind.commands)
     if verb == "train" and "dataset=photos" in arguments:
         arguments += rng.choice(FIELDS)
-    command = Command(verb, tuple(arguments))
+    command = Command(module(verb), tuple(arguments), good=bool(kind.harmed))
     if rng.random() < UNHARMED:
         return command, ""
     if not kind.harmed:

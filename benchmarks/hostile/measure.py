@@ -20,6 +20,7 @@ import nerf_lightning
 from benchmarks.hostile import good, kinds, verdict
 from benchmarks.hostile.case import Command, Ended, Limits, run
 from benchmarks.hostile.verdict import BAD, OUTCOMES, Verdict
+from nerf_lightning.utils.files import write_json
 
 TIMES = 8
 """Limits against what the hungriest good command takes: damage may leave something twice as wide, as high and as many."""
@@ -54,8 +55,9 @@ def get_ready(folder: Path) -> Ready:
             importlib.import_module(module.name)
     options = {verb: good.options_of(verb, folder) for verb in good.VERBS}
     (folder / "good").mkdir(parents=True)
-    commands = [Command("inspect", ("--help",))]  # while it is prepared, everything is written
-    commands += [Command(verb, tuple(one.format(good=folder / "good") for one in words)) for verb, words in good.MADE]
+    commands = [Command(kinds.module("inspect"), ("--help",))]  # while it is prepared, everything is written
+    for verb, words in good.MADE:
+        commands.append(Command(kinds.module(verb), tuple(one.format(good=folder / "good") for one in words)))
     seconds, room = 0.0, 0
     for number, command in enumerate(commands):
 
@@ -80,13 +82,13 @@ def one(case: kinds.Case, ready: Ready, folder: Path) -> tuple[Verdict, Ended, C
 
     def prepare(work: Path, marker: Path) -> Command:
         command, done = kinds.prepare(case, ready.good, ready.limits.room, ready.options, work, marker)
-        about = {"verb": command.verb, "arguments": command.arguments, "done": done}
+        about = {"module": command.module, "arguments": command.arguments, "done": done}
         (work.parent / "said" / "about").write_text(json.dumps(about), encoding="utf-8")
         return command
 
     ended = run(prepare, folder, ready.limits)
     about = json.loads((folder / "said" / "about").read_text(encoding="utf-8"))
-    command = Command(about["verb"], tuple(about["arguments"]))
+    command = Command(about["module"], tuple(about["arguments"]))
     found = verdict.judge(ended, command, ready.limits, folder, harmed=bool(about["done"]))
     return found, ended, command, about["done"]
 
@@ -107,6 +109,7 @@ def measure(seeds: list[int], cases: int, single: int | None, output: Path) -> d
     """
     rows: dict[str, Counter[str]] = {}
     causes: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    accepted: list[dict[str, Any]] = []
     numbers = range(cases) if single is None else [single]
     with tempfile.TemporaryDirectory(prefix="hostile-") as below:
         ready, folder = get_ready(Path(below)), Path(below) / "case"
@@ -116,8 +119,10 @@ def measure(seeds: list[int], cases: int, single: int | None, output: Path) -> d
             found, ended, command, done = one(case, ready, folder)
             counts = rows.setdefault(case.kind.name, Counter())
             counts.update(["tried", found.outcome])
+            about = {"case": again(case), "kind": case.kind.name, "verb": command.verb, "done": done}
+            if found.outcome == "accepted":
+                accepted.append(about)
             if found.outcome in BAD:
-                about = {"case": again(case), "kind": case.kind.name, "verb": command.verb, "done": done}
                 causes.setdefault((found.outcome, found.cause), []).append({**about, "said": ended.err[-2000:]})
                 print(f"{found.outcome}: {again(case)}  # {case.kind.name}, {command.verb}: {done[:100]!r}", flush=True)
             if single is not None:
@@ -136,10 +141,9 @@ def measure(seeds: list[int], cases: int, single: int | None, output: Path) -> d
         }
         for (outcome, cause), alike in frequent
     ]
-    (output / "hostile").mkdir(parents=True, exist_ok=True)
+    write_json(output / "hostile" / "accepted.json", accepted)
     for number, ((outcome, cause), alike) in enumerate(frequent):
-        text = json.dumps({"outcome": outcome, "cause": cause, "cases": alike}, indent=2)
-        (output / "hostile" / f"{number:03d}.json").write_text(text + "\n", encoding="utf-8")
+        write_json(output / "hostile" / f"{number:03d}.json", {"outcome": outcome, "cause": cause, "cases": alike})
     return {"hostile": [*table, {"kind": "all", **_counts(whole)}], "hostile causes": found_causes}
 
 

@@ -82,8 +82,9 @@ def _outcome(ended: Ended, command: Command, limits: Limits, folder: Path) -> tu
         if not warned and (empty := _nothing_came(ended, folder)):
             return "silent", empty
         return ("warned" if warned else "accepted"), ""
-    strange = [line for line in lines if not line.startswith("nerf_lightning: ")] or lines or [""]
-    return "said otherwise", f"exit {ended.code} with {len(lines)} lines: {_short(strange[0])}"
+    strange = [line for line in lines if not line.startswith("nerf_lightning: ")] or lines or ["nothing"]
+    said = re.sub(r"^\S*/(?=nerf_lightning/|site-packages/)", "", strange[0]).split(": ")[0]
+    return "said otherwise", f"exit {ended.code} and {'more than ' * (len(lines) > 1)}a line: {_short(said)}"
 
 
 def leftovers(ended: Ended, finished: bool) -> str:
