@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 from omegaconf import OmegaConf
+from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
 from nerf_lightning.config.compose import composed
@@ -53,7 +54,9 @@ def write(folder: Path) -> None:
     _colmap(scene.train, folder / "colmap", _binary)
     _colmap(scene.train, folder / "colmap_text", _text)
     _llff(scene.train, folder / "llff")
-    write_picture(folder / "picture.png", scene.train.image(0)[..., :3].numpy())
+    picture = scene.train.image(0)[..., :3].numpy()
+    write_picture(folder / "picture.png", picture)
+    _photo(picture, folder / "photo.jpg")
     orbit = scene.orbit
     route = {"width": SIZE, "height": SIZE, "K": orbit.K[0].tolist(), "c2w": orbit.c2w[:2].tolist()}
     documents: dict[str, Any] = {
@@ -89,6 +92,14 @@ def _viewer(poses: list[Any]) -> dict[str, Any]:
         "render_height": SIZE,
         "camera_path": [{"camera_to_world": sum(pose, []), "fov": 50.0} for pose in poses],
     }
+
+
+def _photo(picture: np.ndarray, path: Path) -> None:
+    """A JPEG as a phone writes it: on its side, with a focal length and a place."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Make] = 6, "nobody"
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 28
+    Image.fromarray(picture).save(path, exif=exif)
 
 
 def _blender(scene: Scene, folder: Path) -> None:

@@ -72,7 +72,10 @@ def argument(rng: Random, verb: str, options: Mapping[str, str]) -> str:
     if kind == 2 and verb == "train":
         return f"{rng.choice(('', '', '', '+', '~'))}{rng.choice(GROUPS)}={rng.choice(CHOICES)}"
     known = [key for key in options if key not in NOT_ASKED and not key.endswith("_target_")]
-    key = rng.choice([*known, "hydra.run.dir"] if verb == "train" else known)
+    groups: dict[str, list[str]] = {"hydra": ["hydra.run.dir"]} if verb == "train" else {}
+    for one in known:
+        groups.setdefault(one.split(".")[0], []).append(one)
+    key = rng.choice(groups[rng.choice(list(groups))])  # callbacks and models have most of the options
     form = rng.randrange(12)
     if form == 0:
         return f"~{key}"
@@ -87,7 +90,8 @@ def spoilt(good: Command, rng: Random, options: Mapping[str, Mapping[str, str]])
     more = [argument(rng, good.verb, of_verb) for _ in range(rng.choice((1, 1, 1, 2, 3)))]
     arguments = list(good.arguments)
     for one in more:
-        arguments.insert(rng.choice((0, len(arguments))), one.replace("\0", "") if rng.random() < 0.9 else one)
+        at = rng.choice((0, *[len(arguments)] * 4))  # of two that name one option the last counts
+        arguments.insert(at, one.replace("\0", "") if rng.random() < 0.9 else one)
     if good.verb == "train" and rng.random() < 0.05:
         key = rng.choice(("seed", "dataset.rays", "optimizer.lr", "model", "name"))
         more.append(f"{key}={rng.choice(('0,1', '1,nan', 'a,b', '0,0', 'mlp,nope', 'null,1'))}")

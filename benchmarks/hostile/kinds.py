@@ -80,6 +80,7 @@ KINDS = (
     Kind("COLMAP, text", 5, ("colmap_text",), ("sparse/0/*.txt",), of_photos("colmap_text")),
     Kind("LLFF", 6, ("llff",), (POSES, POSES, POSES, "images/*.png"), of_photos("llff")),
     Kind("picture", 4, ("picture.png",), ("picture.png",), (("train", *PICTURE, "dataset.path=picture.png"),)),
+    Kind("photo", 2, ("photo.jpg",), ("photo.jpg",), (("train", *PICTURE, "dataset.path=photo.jpg"),)),
     Kind("checkpoint", 10, ("run", "scene.npz"), ("checkpoints/last.ckpt",), of_folder("run")),
     Kind("compact file", 9, ("compact.npz", "scene.npz"), ("compact.npz",), of_run("compact.npz")),
     Kind("run folder", 10, ("run", "scene.npz"), ("config.yaml", "scene.json"), of_folder("run")),
@@ -142,7 +143,7 @@ def prepare(
     if verb == "train" and "dataset=photos" in arguments:
         arguments += rng.choice(FIELDS)
     command = Command(module(verb), tuple(arguments), good=bool(kind.harmed))
-    if rng.random() < UNHARMED:
+    if rng.random() < UNHARMED and kind.copied:  # the others have no good input that ends soon
         return command, ""
     if not kind.harmed:
         return grammar.spoilt(command, rng, options)
