@@ -66,9 +66,9 @@ def write(folder: Path) -> None:
         "ladder.yaml": {"rungs": [{"width": 2}, {"width": 4}], "samplers": [{"resolution": 8, "samples": 8}]},
         "experiment.yaml": {
             "name": "mine",
-            "model": {"width": 4},
-            "sampler": {"threshold": 0.01},
+            "dataset": {"focus": 0.25},
             "optimizer": {"lr": 0.01},
+            "renderer": {"background": "scene"},
             "callbacks": {"guard": {"every": 1}},
         },
     }

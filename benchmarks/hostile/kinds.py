@@ -9,7 +9,7 @@ from random import Random
 
 from benchmarks.hostile import archives, code, damage, grammar, trees
 from benchmarks.hostile.case import Command
-from benchmarks.hostile.good import FIELDS, ON_RAYS, PICTURE
+from benchmarks.hostile.good import FIELDS, HASHGRID, ON_RAYS, PICTURE
 
 UNHARMED = 0.03
 """Share of the cases whose input is left as it is: the command line must take it."""
@@ -90,7 +90,7 @@ KINDS = (
     ),
     Kind(
         *("ladder", 1, ("ladder.yaml", "scene.npz"), ("ladder.yaml",)),
-        (("rightsize", *ON_SCENE[1:], "ladder=ladder.yaml", "output=sized"),),
+        (("rightsize", *ON_SCENE[1:], *HASHGRID, "ladder=ladder.yaml", "output=sized"),),
     ),
     Kind("camera path", 2, ("path.json", "compact.npz"), ("path.json",), ((*ALONG, "path=path.json"),)),
     Kind("viewer's path", 1, ("viewer.json", "compact.npz"), ("viewer.json",), ((*ALONG, "path=viewer.json"),)),
