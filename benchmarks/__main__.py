@@ -1,6 +1,7 @@
 """python -m benchmarks: what methods, kernels, framework, cameras, captures, photos, 2D fields, sizes, shapes and videos give.
 
 `python -m benchmarks device` tells whether the GPU at hand gives what the CPU gives, and how fast: its last line says it.
+`python -m benchmarks hostile` tells what becomes of inputs that are damaged, absurd or malicious (where there is fork).
 """
 
 import argparse
@@ -48,8 +49,8 @@ PARTS = (
     "shapes",
     "video",
 )
-ALONE = ("device",)
-"""Runs only when it is named."""
+ALONE = ("device", "hostile")
+"""Run only when they are named."""
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -71,7 +72,8 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    chosen = f"which of {', '.join(PARTS)} (all by default), or device; and overrides KEY=VALUE for all runs but its short ones"
+    chosen = f"which of {', '.join(PARTS)} (all by default), or {', '.join(ALONE)}"
+    chosen += "; and overrides KEY=VALUE for all runs but those that are short"
     parser.add_argument("parts", nargs="*", metavar="part", help=chosen)
     parser.add_argument("--experiments", default="lego,lego_hashgrid,lego_voxels", help="experiments to train")
     parser.add_argument("--budgets", default="60", help="seconds of training, separated by commas")
@@ -83,6 +85,8 @@ def main() -> None:
     )
     parser.add_argument("--recipes", default="", help="of the parts cameras and captures: what to train")
     parser.add_argument("--device", default="auto", help="of the part device: auto, cpu, cuda or mps")
+    parser.add_argument("--cases", type=int, default=5000, help="of the part hostile: inputs of each seed")
+    parser.add_argument("--case", type=int, help="of the part hostile: the number of one input, to see it in full")
     parser.add_argument("--output", type=Path, default=Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S"))
     arguments = parser.parse_intermixed_args()  # overrides may stand behind options
     overrides = [part for part in arguments.parts if "=" in part]
@@ -90,6 +94,8 @@ def main() -> None:
     unknown = sorted(set(parts) - {*PARTS, *ALONE})
     if unknown:
         parser.error(f"found {unknown[0]}, expected some of {', '.join([*PARTS, *ALONE])}, or overrides KEY=VALUE")
+    if "hostile" in parts and not hasattr(os, "fork"):
+        parser.error("hostile: found a system without fork, expected one that has it, such as Linux")
     try:
         chosen_device = the_device(arguments.device)
     except InputError as error:
@@ -121,6 +127,10 @@ def main() -> None:
                 flush=True,
             )
             tables, unequal = device.measure(chosen_device, overrides, budgets[0], seeds[0], arguments.output)
+        elif part == "hostile":
+            from benchmarks.hostile.measure import measure as hostile  # where there is fork
+
+            tables = hostile(seeds, arguments.cases, arguments.case, arguments.output)
         elif part == "capture":
             tables = capture.measure(seeds, arguments.output)
         elif part == "cameras":

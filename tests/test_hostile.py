@@ -1,0 +1,126 @@
+"""Hostile inputs end in a line. The first tests are about the judge: each kind of misbehaviour must be found."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from benchmarks import __main__ as command
+
+if not hasattr(os, "fork"):
+    pytest.skip("cases are forked", allow_module_level=True)
+
+from benchmarks.hostile import damage, trees
+from benchmarks.hostile.kinds import KINDS, Case
+
+ROOT = Path(__file__).resolve().parents[1]
+CASES = (60, pytest.param(400, marks=pytest.mark.long))
+"""Fifteen seconds of one core, and two minutes; `python -m benchmarks hostile` runs thousands."""
+OUTCOMES = {
+    "raises": "traceback",
+    "dies": "traceback",
+    "a job raises": "traceback",
+    "works without end": "hang",
+    "waits without end": "hang",
+    "asks for memory": "over memory",
+    "takes memory": "over memory",
+    "runs code": "code run",
+    "runs code and refuses": "code run",
+    "refuses and leaves a folder": "half-written",
+    "refuses and changes a file": "half-written",
+    "refuses and removes a file": "half-written",
+    "leaves a temporary file": "half-written",
+    "trains nothing": "silent",
+    "measures nothing": "silent",
+    "refuses in two lines": "said otherwise",
+    "refuses without a word": "said otherwise",
+    "fails with another code": "said otherwise",
+    "refuses": "answered",
+    "warns": "warned",
+    "trains": "accepted",
+    "a job refuses": "accepted",
+    "works": "accepted",
+}
+
+
+def process(*arguments: str, cwd: Path) -> str:
+    """What a Python of its own prints: nothing that tests have computed may be in a process that forks."""
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")]),
+        "OMP_NUM_THREADS": "1",
+    }
+    words = [sys.executable, "-m", *arguments]
+    done = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+    """By behaviour: what the judge says of it where the input was damaged, and where it was not."""
+    return json.loads(process("misbehaving", *OUTCOMES, cwd=tmp_path_factory.mktemp("judged")))
+
+
+@pytest.mark.parametrize("how", OUTCOMES)
+def test_what_a_command_does_is_what_the_table_says(how: str, judged: dict[str, list[str]]):
+    good = "good refused" if how == "refuses" else OUTCOMES[how]
+    assert judged[how] == [OUTCOMES[how], good]
+
+
+@pytest.fixture(scope="module", params=CASES)
+def report(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str, Any]]]:
+    """The tables of some cases, whose number is their seed too: the longer run repeats none of the shorter."""
+    folder, cases = tmp_path_factory.mktemp("hostile"), str(request.param)
+    process("benchmarks", "hostile", "--seeds", cases, "--cases", cases, "--output", "found", cwd=folder)
+    found = json.loads((folder / "found" / "benchmarks.json").read_text())
+    assert found["hostile"][-1]["tried"] == request.param
+    return found
+
+
+def test_all_cases_are_in_the_table(report: dict[str, list[dict[str, Any]]]):
+    *rows, whole = report["hostile"]
+    assert whole["tried"] == sum(row["tried"] for row in rows)
+    assert whole["answered"] > whole["accepted"] > 0, "damage is noticed, and what does no harm is taken"
+    for row in report["hostile"]:
+        assert sum(row[key] for key in row if key not in ("kind", "tried")) == row["tried"]
+
+
+def test_a_case_follows_from_its_seed_and_number():
+    first, again, other = ([Case(seed, number).kind.name for number in range(400)] for seed in (1, 1, 2))
+    assert first == again != other
+    assert set(first) == {kind.name for kind in KINDS}
+
+
+def test_documents_hold_what_no_writer_would_write(tmp_path: Path):
+    good = json.dumps({"a": {"b": [1.0, 2.0], "c": "text"}, "d": None})
+    texts = [trees.damaged(good, Random(i), tmp_path / "marker", as_json=i % 2 == 0)[0] for i in range(600)]
+    assert any("[" * 1000 in text for text in texts), "deep nesting"
+    assert any("NaN" in text for text in texts) and any("Infinity" in text for text in texts)
+    assert any(text.count('"a":') == 2 or text.count('"b":') == 2 for text in texts), "a key that stands twice"
+    assert any("*a7" in text for text in texts), "aliases that multiply"
+    assert any("os.system" in text for text in texts)
+    assert not any(trees.AGAIN in text or "RAW0" in text for text in texts), "what stood for these is gone"
+
+
+def test_bytes_are_changed_but_rarely_all_of_them():
+    good = bytes(range(256)) * 4
+    found = [damage.as_bytes(good, Random(i))[0] for i in range(300)]
+    assert sum(one != good for one in found) > 280 and sum(len(one) == len(good) for one in found) > 100
+
+
+def test_the_part_runs_only_when_it_is_named():
+    assert "hostile" in command.ALONE and "hostile" not in command.PARTS
+
+
+def test_a_system_without_fork_is_told_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.delattr(os, "fork")
+    monkeypatch.setattr("sys.argv", ["benchmarks", "hostile"])
+    with pytest.raises(SystemExit) as stopped:
+        command.main()
+    assert stopped.value.code == 2 and "fork" in capsys.readouterr().err
