@@ -24,6 +24,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.utils.device import CPU, the_device
+from nerf_lightning.utils.memory import Frugal
 from nerf_lightning.utils.options import check_options
 
 KNOWN = ("cpu", "cuda", "mps")
@@ -106,7 +107,8 @@ def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> A
         name = getattr(found, "__name__", "nothing")
         advice = "model=hashgrid or model=mlp" if kind is Field else "model=hashgrid2d or model=picture_mlp"
         raise InputError("config", "model", name, f"a field of {dimensions} for this dataset", f"choose {advice}")
-    return make(cfg, "model", **extra)
+    with Frugal("config", "model"):
+        return make(cfg, "model", **extra)
 
 
 def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) -> System:
@@ -120,9 +122,10 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
     if isinstance(frame, PictureFrame):
         return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
-    field = build_field(cfg, Field, "three coordinates", bounds=frame.bounds)
     bounds = frame.bounds
-    sampler = make(cfg, "sampler", bounds=bounds)
+    field = build_field(cfg, Field, "three coordinates", bounds=bounds)
+    with Frugal("config", "sampler"):
+        sampler = make(cfg, "sampler", bounds=bounds)
     seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
     renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
     corrections = None

@@ -19,6 +19,10 @@ def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
     parameter.data = data
 
 
+LEARNED = 16
+"""Bytes of a number that is learned: itself, its gradient and Adam's two moments, in single precision."""
+
+
 class AnyField(torch.nn.Module):
     """What fields in two and in three dimensions have in common."""
 
@@ -26,6 +30,11 @@ class AnyField(torch.nn.Module):
     """Fraction of the budget after which the field keeps its size."""
     sizing: str = ""
     """One line on how the field's size follows from the data; "" if it does not."""
+
+    @property
+    def training_bytes(self) -> int:
+        """Memory that it takes in training at least, at its largest."""
+        return LEARNED * sum(parameter.numel() for parameter in self.parameters())
 
     def warm_start_from(self, smaller: Any) -> None:
         """Copies the function of a smaller field of the same kind, as far as possible, leaving the rest free to learn.

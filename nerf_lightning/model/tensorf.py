@@ -11,13 +11,13 @@ from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import mlp, plane_line_sum, plane_line_sum_and_products
 from nerf_lightning.kernels.planes import PLANE_AXES
-from nerf_lightning.model.field import Field, replace_data
+from nerf_lightning.model.field import LEARNED, Field, replace_data
 from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
 from nerf_lightning.model.layers.activation import density_activation
 from nerf_lightning.model.layers.pruning import vertices_in
 from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
 from nerf_lightning.model.layers.widening import widen_all
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import Count, Layers, Side
 
 FINEST = 160
 """Cells along a side at the end, where photos are of usual size."""
@@ -124,9 +124,9 @@ class TensoRFField(Field):
         bounds: Bounds,
         density_components: Count = 16,
         colour_components: Count = 16,
-        coarsest: Count = 64,
-        finest: Count | None = None,
-        stages: Count = 4,
+        coarsest: Side = 64,
+        finest: Side | None = None,
+        stages: Layers = 4,
         grown: float = 0.3,
         width: Count = 32,
         degree: int = 3,
@@ -155,6 +155,12 @@ class TensoRFField(Field):
     @property
     def finer(self) -> float:
         return max(1.0, self.density_volume.cells / FINEST) if self.follows_photos else 1.0
+
+    @property
+    def training_bytes(self) -> int:
+        side = self.resolutions[-1] + 1
+        components = sum(volume.lines.shape[2] for volume in (self.density_volume, self.colour_volume))
+        return max(super().training_bytes, LEARNED * 3 * side * side * components)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         density, colour = self.density_volume, self.colour_volume

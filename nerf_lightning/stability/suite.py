@@ -6,10 +6,13 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
+import psutil
+
 from nerf_lightning.stability.cell import Cell, Outcome, run
 from nerf_lightning.stability.conditions import CONDITIONS
 from nerf_lightning.stability.methods import METHODS
 from nerf_lightning.utils.machine import cores
+from nerf_lightning.utils.memory import require_room
 
 QUICK = (
     *("clean", "white, small object", "rate x10", "wrong background flag", "OpenGL poses", "shuffled poses"),
@@ -34,6 +37,8 @@ def cells_of(conditions: Sequence[str], methods: Sequence[str], seeds: int, step
 def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Iterator[tuple[Cell, Outcome]]:
     """Trains cells in processes of one thread each; yields them as they end."""
     count = min(workers or cores(), len(cells))
+    if workers is not None:  # each is about as large as this process
+        require_room("config", "workers", f"{count:,} processes", count * psutil.Process().memory_info().rss)
     context = multiprocessing.get_context("spawn")  # numba and torch's threads do not survive a fork
     with ProcessPoolExecutor(count, context, _prepare) as pool:
         pending = {pool.submit(run, cell, root): cell for cell in cells}

@@ -21,6 +21,7 @@ from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic, cache_folder
+from nerf_lightning.utils.memory import require_room
 
 VERSION = 1
 """Part of the cache file's name: raise it whenever model, shading or cameras change."""
@@ -29,6 +30,8 @@ RADIUS = 4.0311
 FIELD_OF_VIEW = 0.6911112
 """Horizontal, radians; from the same scene."""
 ORBIT_ELEVATION = math.radians(30)
+POSE = 116
+"""Bytes of a pose, its intrinsics and size."""
 UP = (0.0, 0.0, 1.0)
 
 
@@ -48,6 +51,9 @@ def bricks(
     for key, value in counts.items():
         if value < 1:
             raise InputError("bricks", key, str(value), "a whole number of at least 1")
+    views = train_views + val_views
+    what = f"{views:,} pictures of {size:,}x{size:,} pixels, with a pose each,"
+    require_room("bricks", "size, train_views, val_views", what, views * (4 * size**2 + POSE) + POSE * orbit_views)
     train = _cameras(_hemisphere(torch.arange(1, train_views + 1)), size)
     val = _cameras(_hemisphere(-torch.arange(1, val_views + 1)), size)
     orbit = _cameras(orbit_around(torch.zeros(3), torch.tensor(UP), RADIUS, ORBIT_ELEVATION, orbit_views), size)
