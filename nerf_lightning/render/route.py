@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.dataset import Scene, Views
+from nerf_lightning.dataset.formats.checks import intrinsics
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.evenly import evenly
 
@@ -103,7 +104,7 @@ def read_path(file: Path) -> Cameras:
         cameras = _nerfstudio(plain) if "camera_path" in plain else _own(plain)
     except FileNotFoundError as error:
         raise InputError(file, "", "no such file", "a camera path in JSON") from error
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError, ArithmeticError) as error:
         found = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(file, "", found, "width, height, K and c2w, or nerfstudio's camera_path") from error
     if not len(cameras) or min(cameras.width, cameras.height) < 1:
@@ -112,6 +113,8 @@ def read_path(file: Path) -> Cameras:
     R = cameras.c2w[:, :3, :3]
     if not (torch.isfinite(cameras.c2w).all() and torch.isfinite(cameras.K).all()):
         raise InputError(file, "", "numbers that are not finite", "finite poses and intrinsics")
+    for K in cameras.K.unique(dim=0):
+        intrinsics(file, "K or fov", K.numpy(), cameras.width, cameras.height)
     if not torch.allclose(R @ R.mT, torch.eye(3).expand_as(R), atol=1e-3):
         raise InputError(file, "", "a pose that is no rotation", "orthonormal rotations, without scale")
     return cameras

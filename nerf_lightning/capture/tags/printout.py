@@ -37,8 +37,12 @@ def page(layout: TagLayout) -> Figure:
     """A flat sheet of tags in the middle of an A4 page.
 
     Raises:
-        InputError: the tags do not fit on the page.
+        InputError: the tags do not fit on the page, or are not in the family.
     """
+    patterns = family(layout.dictionary)
+    if (last := max(layout.poses)) >= len(patterns.bytesList):
+        expected = f"one of the {len(patterns.bytesList)} tags of {layout.dictionary}"
+        raise InputError("config", "tags.layout", f"tag {last}", expected, "name a larger family with tags.dictionary")
     corners = np.concatenate([layout.corners(tag)[:, :2] for tag in layout.poses])
     low, high = corners.min(0), corners.max(0)
     rim = layout.size / 6
@@ -50,10 +54,10 @@ def page(layout: TagLayout) -> Figure:
     centre = (low + high) / 2
     axes.set(xlim=centre[0] + np.array([-0.5, 0.5]) * A4[0], ylim=centre[1] + np.array([-0.5, 0.5]) * A4[1])
     axes.set_axis_off()
-    side = family(layout.dictionary).markerSize + 2
+    side = patterns.markerSize + 2
     module = layout.size / side
     for tag, pose in layout.poses.items():
-        black = cv2.aruco.generateImageMarker(family(layout.dictionary), tag, side) < 128
+        black = cv2.aruco.generateImageMarker(patterns, tag, side) < 128
         turn = float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0])))
         for row, modules in enumerate(black):
             runs = np.flatnonzero(np.diff(np.pad(modules.astype(int), 1))).reshape(-1, 2)
