@@ -1,5 +1,6 @@
 """Budget: how long to train, by the steps or by the clock, and the clock itself."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -47,7 +48,7 @@ class Budget(L.Callback):
         alone: whether seconds are those the machine would need without other work.
 
     Raises:
-        InputError: where steps and seconds are None, or one of the three is not positive.
+        InputError: where steps and seconds are None, or one of the three is not positive and finite.
     """
 
     def __init__(
@@ -60,8 +61,8 @@ class Budget(L.Callback):
         if steps is None and seconds is None:
             raise InputError("budget", "", "neither steps nor seconds", "budget.steps=N or budget.seconds=S")
         for key, value in (("steps", steps), ("seconds", seconds), ("patience", patience)):
-            if value is not None and value <= 0:
-                raise InputError(f"budget.{key}", "", str(value), "more than 0")
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"budget.{key}", "", str(value), "more than 0, and finite")
         self.steps = steps
         self.limit_seconds = seconds
         self.plateau = Plateau(patience) if patience is not None else None

@@ -33,7 +33,7 @@ class InPlace(TorchCheckpointIO):
         torch.save(checkpoint, path)
 
 
-def check_room(folder: Path, system: System) -> None:
+def check_disk(folder: Path, system: System) -> None:
     """Asks, before a run begins, whether its checkpoints fit on the disk: the last, the best, and one that is being written.
 
     Args:

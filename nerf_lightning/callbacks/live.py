@@ -10,6 +10,7 @@ from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.utils.options import Port
 from nerf_lightning.view.serve import announcement, find_port, require_viser
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class Live(ChecksData):
     """
 
     def __init__(
-        self, host: str = "127.0.0.1", port: int = 8080, share: float = 0.06, photo_side: int = 120, side: int = 512
+        self, host: str = "127.0.0.1", port: Port = 8080, share: float = 0.06, photo_side: int = 120, side: int = 512
     ):
         if not 0 < share < 1:
             raise InputError("callbacks.live.share", "", str(share), "above 0 and below 1")

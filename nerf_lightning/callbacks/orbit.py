@@ -18,6 +18,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.options import FramesPerSecond
 
 MOST, FEWEST, SMALLEST = 60, 12, 0.25
 """By default: most and fewest frames of an orbit, and the smallest factor on their size."""
@@ -36,7 +37,7 @@ class Orbit(L.Callback):
         InputError: where frames < 0 or fps <= 0.
     """
 
-    def __init__(self, path: str = "orbit.gif", frames: int | None = None, fps: float = 20):
+    def __init__(self, path: str = "orbit.gif", frames: int | None = None, fps: FramesPerSecond = 20):
         if frames is not None and frames < 0:
             raise InputError("callbacks.orbit.frames", "", str(frames), "0 (no orbit) or more")
         if fps <= 0:

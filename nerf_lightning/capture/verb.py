@@ -7,7 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import output_path, user_path
-from nerf_lightning.utils.options import AtLeast, Count, check_options
+from nerf_lightning.utils.options import AtLeast, AtMost, Count, check_options
 
 NEEDED = {
     "tags": {"calibration": "FOLDER", "photos": "FOLDER", "tags.size": "0.06"},
@@ -34,7 +34,11 @@ def options(
     """The keys of conf/capture.yaml, for checking."""
 
 
-def tag_options(size: float | None, dictionary: str, layout: str, board: dict) -> None:
+TagSize = Annotated[float, AtLeast(1e-4), AtMost(10)]
+"""Metres: printers make no smaller dots, and photos hold no larger tags."""
+
+
+def tag_options(size: TagSize | None, dictionary: str, layout: str, board: dict) -> None:
     """The keys of its `tags`."""
 
 

@@ -2,7 +2,6 @@
 
 import copy
 import inspect
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.utils.device import CPU, the_device
-from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.memory import Frugal
 from nerf_lightning.utils.options import check_options
 
 KNOWN = ("cpu", "cuda", "mps")
@@ -108,7 +107,8 @@ def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> A
         name = getattr(found, "__name__", "nothing")
         advice = "model=hashgrid or model=mlp" if kind is Field else "model=hashgrid2d or model=picture_mlp"
         raise InputError("config", "model", name, f"a field of {dimensions} for this dataset", f"choose {advice}")
-    return make(cfg, "model", **extra)
+    with Frugal("config", "model"):
+        return make(cfg, "model", **extra)
 
 
 def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) -> System:
@@ -121,42 +121,17 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     chunk = limits_of(cfg, device).chunk
     common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
     if isinstance(frame, PictureFrame):
-        size = frame.width, frame.height
-        [flat] = _within_memory(cfg, lambda: [build_field(cfg, PictureField, "two coordinates", size=size)])
-        return NeRF2D(flat, **common)
+        return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
     bounds = frame.bounds
-    field, sampler = _within_memory(cfg, lambda: _parts(cfg, bounds))
+    field = build_field(cfg, Field, "three coordinates", bounds=bounds)
+    with Frugal("config", "sampler"):
+        sampler = make(cfg, "sampler", bounds=bounds)
     seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
     renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
     corrections = None
     if cfg.get("refine") is not None and frame.cameras is not None:
         corrections = make(cfg, "refine", cameras=frame.cameras, bounds=frame.bounds, exposures=frame.exposures)
     return NeRF3D(field, sampler, renderer, **common, corrections=corrections)
-
-
-def _parts(cfg: DictConfig, bounds: Bounds) -> list[Any]:
-    return [build_field(cfg, Field, "three coordinates", bounds=bounds), make(cfg, "sampler", bounds=bounds)]
-
-
-def _within_memory(cfg: DictConfig, build: Callable[[], list[Any]]) -> list[Any]:
-    """Builds modules, if their weights fit into memory: without any numbers first, to count them.
-
-    Raises:
-        InputError: where they do not.
-    """
-    node = cfg.get("model")
-    ours = isinstance(node, DictConfig) and str(node.get("_target_")).startswith("nerf_lightning.")
-    if ours:  # others may look at numbers while they are built
-        try:
-            with torch.device("meta"):
-                sketch = build()
-        except (OverflowError, RuntimeError, TypeError) as error:
-            expected = "sizes of which weights can be counted"
-            raise InputError("config", "model or sampler", str(error), expected, "take smaller ones") from error
-        tensors = [tensor for module in sketch for tensor in (*module.parameters(), *module.buffers())]
-        needed = sum(tensor.nbytes for tensor in tensors)
-        check_memory("config", "model and sampler", "weights", needed, "take smaller sizes")
-    return build()
 
 
 def corrects_poses(cfg: DictConfig) -> bool:

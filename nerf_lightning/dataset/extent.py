@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, focus_point
+from nerf_lightning.cameras import Bounds, Cameras, axes_meet, focus_point
 from nerf_lightning.dataset.views import Views
 
 GRID = 48
@@ -23,6 +23,9 @@ FLAT = 0.9
 """Share of the border's pixels that must have one colour to be the background: the rest is content that leaves the picture."""
 AGREEMENT = 0.95
 """Share of the views seeing a voxel that must find it in the silhouette; the rest forgives dark-on-dark pixels."""
+
+SPOT = 1e-5
+"""Cameras nearer than this share of their coordinates stand on one spot."""
 
 
 def estimate_bounds(
@@ -91,9 +94,12 @@ def border_colour(views: Views) -> tuple[float, float, float] | None:
 
 
 def viewing_distance(c2w: Float[Tensor, "V 4 4"], centre: Float[Tensor, "3"]) -> float:
-    """Median distance of the cameras to `centre`, in the scene's unit; 1 where all stand on that very spot."""
-    distance = float((c2w[:, :3, 3] - centre).norm(dim=-1).median())
-    return distance if distance > 1e-5 * (1 + float(centre.norm())) else 1.0
+    """Median distance of the cameras to `centre`, in the scene's unit; 1 where all stand on that very spot.
+
+    What is near in a small unit may be what all look at; else it is rounding.
+    """
+    distance, apart = float((c2w[:, :3, 3] - centre).norm(dim=-1).median()), SPOT * float(centre.norm())
+    return distance if distance > SPOT + apart or (distance > apart and axes_meet(c2w)) else 1.0
 
 
 def visible_cube(cameras: Cameras) -> Float[np.ndarray, "2 3"]:

@@ -2,17 +2,20 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerf_lightning.cameras import Distortion
+from nerf_lightning.cameras import Cameras, Distortion, Lenses
 from nerf_lightning.cameras.lenses import distort, undistort
 from nerf_lightning.dataset.lens import Lens
 
 FOLDED = 1e-3
 """How far, in flat coordinates, an undistorted place may come to lie from where it was seen."""
+SPOTS, RETURNED = 24, 1.0
+"""Pixels along each side whose rays are tried, and how far from a pixel its ray may appear."""
 FITTED = 1e-5
 """Likewise for a lens of another kind that is replaced by a polynomial."""
 
@@ -47,25 +50,42 @@ class Optics:
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy, (d.k1, d.k2, d.p1, d.p2, d.k3))
 
     def sees_every_pixel(self) -> bool:
-        """Whether each place along the border of the photo has a direction of its own, as a real lens's has."""
-        if not (
-            all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy, *self.distortion))) and self.fx * self.fy > 0
-        ):
-            return False
+        """Whether each place along the border of the photo has a direction of its own, as a real lens's has, and the rays of
+        pixels lead back to them."""
         if not self.bent:
             return True
+        if not all(map(math.isfinite, self.distortion)):
+            return False
         seen = torch.from_numpy(self._border())
         coefficients = torch.tensor([self.distortion], dtype=torch.float64)
         flat = undistort(seen, coefficients)
         back, jacobian = distort(flat, coefficients)
         upright = torch.linalg.det(jacobian) > 0
-        return bool(torch.isfinite(flat).all() and ((back - seen).abs().amax() < FOLDED) and upright.all())
+        unfolded = torch.isfinite(flat).all() and ((back - seen).abs().amax() < FOLDED) and upright.all()
+        return bool(unfolded) and leads_back(self)
 
     def _border(self, steps: int = 16) -> Float[np.ndarray, "B 2"]:
         """Flat coordinates, distorted, along the border of the photo."""
         t = np.linspace(0, 1, steps + 1)
         edges = np.concatenate([[(a, 0.0), (a, 1.0), (0.0, a), (1.0, a)] for a in t])
         return (edges * (self.width, self.height) - (self.cx, self.cy)) / (self.fx, self.fy)
+
+
+@lru_cache(maxsize=1)  # a lens is mostly that of all photos
+def leads_back(optics: Optics) -> bool:
+    """Whether rays through pixels all over the photo appear in it where they were cast: as training makes them, in single
+    precision, which a distortion may be too strong for."""
+    width, height = optics.width, optics.height
+    lenses = Lenses(torch.tensor([optics.distortion]).float(), torch.tensor([optics.fisheye]))
+    cameras = Cameras(
+        torch.from_numpy(optics.K).float()[None], torch.eye(4)[None], torch.tensor([[width, height]]), lenses
+    )
+    across, down = (torch.linspace(0, side - 1, SPOTS).long() for side in (width, height))
+    row, col = torch.cartesian_prod(down, across).T
+    directions = cameras.rays(torch.zeros_like(row), row, col).directions
+    places, _, _ = cameras.project(directions, 0)
+    off = places - torch.stack([col, row], dim=1) - 0.5
+    return bool((off.abs() < RETURNED).all())  # false for nan too
 
 
 def field_of_view_lens(

@@ -62,7 +62,9 @@ def scene_of(
     train, val = (torch.tensor(part, dtype=torch.long) for part in split)
     checks.split_size(source, "train split", len(train))
     checks.split_size(source, "val split", len(val))
-    c2w, to_source = framed(torch.from_numpy(np.stack([shot.c2w for shot in shots])), train)
+    poses = np.stack([shot.c2w for shot in shots])
+    checks.told_apart(source, poses[train])
+    c2w, to_source = framed(torch.from_numpy(poses), train)
     moved = [replace(shot, c2w=pose) for shot, pose in zip(shots, c2w.numpy(), strict=True)]
     views = read_shots(source, moved, reading)
     train_views, val_views = views[train], views[seen(views, val, shots)]

@@ -9,7 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import psutil
 import torch
 from jaxtyping import Bool, Float, UInt8
 
@@ -23,6 +22,7 @@ from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.views import Runs, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.memory import free_memory
 from nerf_lightning.utils.progress import tracked
 
 log = logging.getLogger(__name__)
@@ -204,9 +204,9 @@ def _pinhole(source: Path, shot: Shot, size: tuple[int, int]) -> Lens:
 
 def _check_memory(source: Path, shots: Sequence[Shot], size: int, sides: Sequence[tuple[int, int]]) -> None:
     """Photos must fit into the free memory, twice: they are split into training and held-out ones once."""
-    free = ROOM * psutil.virtual_memory().available
+    free = ROOM * free_memory()
     if 2 * size > free:
         longest = max(max(side) for side in sides)
-        fits = max(1, int(longest * math.sqrt(free / (2 * size))))
+        fits = max(1, int(longest * math.sqrt(max(free, 0) / (2 * size))))
         found = f"{len(shots)} photos that take {size / 2**30:.1f} GiB, twice while they are read"
         raise InputError(source, "", found, f"at most {free / 2**30:.1f} GiB", f"dataset.resize={fits} would fit")

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from nerf_lightning.utils.options import AtLeast, Count
+from nerf_lightning.utils.options import AtLeast, Side
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class ExportOptions:
     precision: str | None
     loss: Annotated[float, AtLeast(0)]
     content: str
-    resolution: Count | None
+    resolution: Side | None
     threshold: float | None
     box: list[float] | None
     device: str

@@ -12,6 +12,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.export.reach import occupied_cells
 from nerf_lightning.runs.open import SceneRun
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.progress import tracked
 
 COARSEST, FINEST = 64, 256
@@ -20,6 +21,9 @@ PIXELS = 1.25
 """Width of a cell in pixels: cells of one pixel add only noise to the surface."""
 PLACES = 4
 """Places evaluated in one call, for each sample rendered in one: bounds the memory."""
+
+CELL = 8
+"""Bytes of a cell: its density, and its opacity."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,8 @@ def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] 
     sides = corners[1] - corners[0]
     cell = float(sides.max()) / resolution
     shape = [max(1, math.ceil(float(side) / cell - 1e-6)) for side in sides]
+    cells = math.prod(shape)
+    check_memory("config", "resolution", f"{cells:,} cells", CELL * cells)
     # Cubic cells may reach beyond the region: equally on both sides.
     low = corners.mean(0) - torch.tensor(shape, device=system.device) * (cell / 2)
     volume = Volume(torch.zeros(shape), low.cpu(), cell)

@@ -19,6 +19,10 @@ def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
     parameter.data = data
 
 
+LEARNED = 16
+"""Bytes of a number that is learned: itself, its gradient and Adam's two moments, in single precision."""
+
+
 class AnyField(torch.nn.Module):
     """What fields in two and in three dimensions have in common."""
 
@@ -35,6 +39,11 @@ class AnyField(torch.nn.Module):
     def values_grown(self) -> int:
         """How many it will learn at its full size, as far as that is known beforehand."""
         return self.values
+
+    @property
+    def training_bytes(self) -> int:
+        """Memory that it takes in training at least, at its largest."""
+        return LEARNED * self.values_grown()
 
     def warm_start_from(self, smaller: Any) -> None:
         """Copies the function of a smaller field of the same kind, as far as possible, leaving the rest free to learn.

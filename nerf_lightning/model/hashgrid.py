@@ -16,7 +16,7 @@ from nerf_lightning.model.layers.activation import density_activation
 from nerf_lightning.model.layers.pruning import vertices_in
 from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
 from nerf_lightning.model.layers.widening import widen_all
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import Count, Entries, Layers, Side
 
 
 def level_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
@@ -42,11 +42,11 @@ class HashGrid(torch.nn.Module):
 
     def __init__(
         self,
-        levels: Count = 8,
-        log2_entries: Count = 17,
+        levels: Layers = 8,
+        log2_entries: Entries = 17,
         features: Count = 2,
-        coarsest: Count = 16,
-        finest: Count = 256,
+        coarsest: Side = 16,
+        finest: Side = 256,
     ):
         super().__init__()
         if not 0 < coarsest <= finest:
@@ -131,11 +131,11 @@ class HashGridField(Field):
     def __init__(
         self,
         bounds: Bounds,
-        levels: Count = 8,
-        log2_entries: Count = 17,
+        levels: Layers = 8,
+        log2_entries: Entries = 17,
         features: Count = 2,
-        coarsest: Count = 16,
-        finest: Count = 256,
+        coarsest: Side = 16,
+        finest: Side = 256,
         width: Count = 64,
         degree: int = 3,
         split_colour: bool = False,

@@ -11,7 +11,7 @@ from nerf_lightning.kernels import hash_interpolate, mlp
 from nerf_lightning.model.field import PictureField
 from nerf_lightning.model.hashgrid import layers, level_resolutions, table_sizes, weights
 from nerf_lightning.model.layers.widening import widen_all
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import Count, Entries, Layers, Side
 
 STEP = 2.4
 """How much finer each level is than the one before, unless their number is given."""
@@ -40,12 +40,12 @@ class HashGrid2DField(PictureField):
     def __init__(
         self,
         size: tuple[int, int],
-        levels: Count | None = None,
-        log2_entries: Count | None = None,
+        levels: Layers | None = None,
+        log2_entries: Entries | None = None,
         share: float = 1.0,
         features: Count = 2,
-        coarsest: Count = 16,
-        finest: Count | None = None,
+        coarsest: Side = 16,
+        finest: Side | None = None,
         width: Count = 64,
         rate: float = 2.0,
     ):

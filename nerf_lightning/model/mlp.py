@@ -10,7 +10,7 @@ from nerf_lightning.model.field import Field
 from nerf_lightning.model.layers.activation import density_activation
 from nerf_lightning.model.layers.encoding import sinusoidal
 from nerf_lightning.model.layers.widening import widen, widen_all
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import Count, Layers, Octaves
 
 
 class MLPField(Field):
@@ -33,11 +33,11 @@ class MLPField(Field):
     def __init__(
         self,
         bounds: Bounds,
-        depth: Count = 8,
+        depth: Layers = 8,
         width: Count = 256,
         skip: int | None = 4,
-        position_frequencies: int = 10,
-        direction_frequencies: int = 4,
+        position_frequencies: Octaves = 10,
+        direction_frequencies: Octaves = 4,
         density: str = "relu",
     ):
         super().__init__(bounds)

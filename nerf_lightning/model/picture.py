@@ -11,7 +11,7 @@ from nerf_lightning.model.field import PictureField
 from nerf_lightning.model.hashgrid import layers
 from nerf_lightning.model.layers.encoding import sinusoidal
 from nerf_lightning.model.layers.widening import widen_all
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import Count, Layers, Octaves
 
 
 def relu_layers(sizes: list[int]) -> torch.nn.Sequential:
@@ -33,7 +33,9 @@ class PictureMLP(PictureField):
         depth: hidden layers.
     """
 
-    def __init__(self, size: tuple[int, int], frequencies: int | None = None, width: Count = 256, depth: Count = 3):
+    def __init__(
+        self, size: tuple[int, int], frequencies: Octaves | None = None, width: Count = 256, depth: Layers = 3
+    ):
         super().__init__(size)
         if frequencies is None:
             # The last octave has 2^(L-1) / 2 cycles over the picture. At the Nyquist frequency itself a sine would have the
@@ -80,7 +82,7 @@ class FourierField(PictureField):
         features: Count = 256,
         spread: float = 0.1,
         width: Count = 256,
-        depth: Count = 3,
+        depth: Layers = 3,
         rate: float = 1.0,
     ):
         super().__init__(size, rate)
@@ -114,7 +116,7 @@ class SirenField(PictureField):
     HIDDEN_FREQUENCY = 30.0  # omega_0 of the later layers, which the paper keeps whatever the signal
 
     def __init__(
-        self, size: tuple[int, int], width: Count = 256, depth: Count = 3, reach: float = 0.15, rate: float = 0.1
+        self, size: tuple[int, int], width: Count = 256, depth: Layers = 3, reach: float = 0.15, rate: float = 0.1
     ):
         super().__init__(size, rate)
         if not reach > 0:

@@ -1,6 +1,5 @@
 """TensoRF (Chen et al. 2022): volumes as sums of planes times lines, and the field that reads from them."""
 
-import copy
 from typing import Any
 
 import torch
@@ -18,7 +17,7 @@ from nerf_lightning.model.layers.activation import density_activation
 from nerf_lightning.model.layers.pruning import vertices_in
 from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
 from nerf_lightning.model.layers.widening import widen_all
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import Count, Layers, Side
 
 FINEST = 160
 """Cells along a side at the end, where photos are of usual size."""
@@ -127,9 +126,9 @@ class TensoRFField(Field):
         bounds: Bounds,
         density_components: Count = 16,
         colour_components: Count = 16,
-        coarsest: Count = 64,
-        finest: Count | None = None,
-        stages: Count = 4,
+        coarsest: Side = 64,
+        finest: Side | None = None,
+        stages: Layers = 4,
         grown: float = 0.3,
         width: Count = 32,
         degree: int = 3,
@@ -197,9 +196,9 @@ class TensoRFField(Field):
         widen_all(self.colour_net, smaller.colour_net, columns)
 
     def values_grown(self) -> int:
-        grown = copy.deepcopy(self).to("meta")  # shapes without numbers
-        grown.grow(1.0)
-        return grown.values
+        components = self.density_volume.lines.shape[2] + self.colour_volume.lines.shape[2]
+        now, last = self.density_volume.cells + 1, self.resolutions[-1] + 1
+        return self.values + 3 * components * (last * last + last - now * now - now)
 
     def grows_at(self, progress: float) -> bool:
         return self.density_volume.cells < self.resolution_at(progress)

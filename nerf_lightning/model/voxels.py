@@ -22,7 +22,7 @@ from nerf_lightning.model.hashgrid import level_resolutions
 from nerf_lightning.model.layers.activation import truncated_exp
 from nerf_lightning.model.layers.pruning import vertices_in, widened
 from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import Layers, Side
 
 EMPTY = -8.0
 """Logarithm of the density (in 1 / half-size) where no vertex is kept: too thin to matter."""
@@ -35,6 +35,9 @@ COUNTS = {"stage": torch.int64, "steps": torch.int32, "started": torch.int32}
 """Whole numbers in checkpoints."""
 CHUNK = 1 << 16
 """Vertices interpolated at a time when growing, to bound the memory."""
+
+VERTEX = 13
+"""Bytes of each vertex of a grid, kept or not, while it grows: whether it is kept, how many are before it, and its row."""
 
 
 class VoxelField(Field):
@@ -67,9 +70,9 @@ class VoxelField(Field):
     def __init__(
         self,
         bounds: Bounds,
-        coarsest: Count = 40,
-        finest: Count = 128,
-        stages: Count = 4,
+        coarsest: Side = 40,
+        finest: Side = 128,
+        stages: Layers = 4,
         grown: float = 0.3,
         degree: int = 1,
         density_rate: float = 6.0,
@@ -110,6 +113,10 @@ class VoxelField(Field):
     def tables(self) -> tuple[torch.nn.Parameter, torch.nn.Parameter, torch.nn.Parameter]:
         """All that vertices hold, one row per vertex."""
         return self.log_density, self.colours, self.views
+
+    @property
+    def training_bytes(self) -> int:
+        return max(super().training_bytes, VERTEX * (self.resolutions[-1] + 1) ** 3)
 
     @property
     def side(self) -> int:

@@ -22,6 +22,8 @@ Picture = UInt8[ndarray, "H W C"]
 PLAN = "frames.json"
 """Beside the frames: what they show, so that frames of something else are never reused."""
 FILMS = (".gif", ".mp4", ".webp")
+JOINED_AT_ONCE = (".gif", ".webp")
+"""Formats whose frames are all in memory when they are joined."""
 OPAQUE = (".gif", ".mp4")
 """Formats without partial transparency."""
 QUALITY = 90

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from nerf_lightning.utils.options import AtLeast, Count
+from nerf_lightning.utils.options import AtLeast, AtMost, Count, FramesPerSecond
 
 
 @dataclass(frozen=True)
@@ -12,10 +12,11 @@ class RenderOptions:
 
     run: str
     path: str
-    frames: Count | None
-    fps: Annotated[float, AtLeast(0.01)]
+    frames: Annotated[Count, AtMost(99_999)] | None
+    """Files of frames are numbered with five digits, which keep them in order."""
+    fps: FramesPerSecond
     background: str | list[float]
-    scale: Annotated[float, AtLeast(0.001)]
+    scale: Annotated[float, AtLeast(0.001), AtMost(1000)]
     channels: str | list[str]
     output: str | None
     device: str

@@ -113,6 +113,8 @@ def read_path(file: Path) -> Cameras:
     R = cameras.c2w[:, :3, :3]
     if not (torch.isfinite(cameras.c2w).all() and torch.isfinite(cameras.K).all()):
         raise InputError(file, "", "numbers that are not finite", "finite poses and intrinsics")
+    for K in cameras.K.unique(dim=0):
+        checks.intrinsics(file, "K or fov", K.numpy(), cameras.width, cameras.height)
     if not torch.allclose(R @ R.mT, torch.eye(3).expand_as(R), atol=1e-3):
         raise InputError(file, "", "a pose that is no rotation", "orthonormal rotations, without scale")
     return cameras

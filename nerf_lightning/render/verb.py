@@ -12,7 +12,7 @@ from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.drawing.frame import CHANNELS, ERROR_TIMES, Style, depth_range, draw, error_picture
 from nerf_lightning.drawing.panels import panel
 from nerf_lightning.errors import InputError
-from nerf_lightning.render.film import Picture, check_output, make_film
+from nerf_lightning.render.film import JOINED_AT_ONCE, Picture, check_output, make_film
 from nerf_lightning.render.options import RenderOptions
 from nerf_lightning.render.route import WITH_PHOTOS, Route, find_route
 from nerf_lightning.renderer.renderer import NAMED
@@ -22,6 +22,10 @@ from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.device import synchronize, the_device
 from nerf_lightning.utils.files import output_path, user_path
 from nerf_lightning.utils.machine import device_in_words
+from nerf_lightning.utils.memory import check_memory
+
+RENDERED = 60
+"""Bytes of a pixel while it is rendered: its number, row, column and view, whole numbers of 64 bits, its ray, and a colour."""
 
 
 def render(options: RenderOptions) -> None:
@@ -40,6 +44,7 @@ def render(options: RenderOptions) -> None:
     check_output(output, options.background == "transparent")
     found = open_scene_run(source, device)
     route = the_route(options, found)
+    check_room(route, output)
     background = the_background(options, found.system, route)
     depths = depth_range(found.system, route.cameras) if "depth" in channels else (0.0, 1.0)
     style = Style(channels, background, depths)
@@ -85,6 +90,20 @@ def the_route(options: RenderOptions, found: SceneRun) -> Route:
     if options.scale == 1:
         return route
     return Route(route.cameras.scaled(options.scale), route.views)
+
+
+def check_room(route: Route, output: Path) -> None:
+    """Refuses frames that certainly do not fit into memory: one while it is rendered, or all while a film is joined.
+
+    Raises:
+        InputError: see there.
+    """
+    pixels = route.cameras.sizes.prod(1)
+    frame, todo = int(pixels.max()), "give less of scale or frames"
+    check_memory("config", "scale", f"a frame's {frame:,} pixels", RENDERED * frame, todo)
+    if output.suffix in JOINED_AT_ONCE:
+        what = f"{len(pixels):,} frames in one film"
+        check_memory("config", "frames", what, 3 * frame * len(pixels), f"{todo}, or output=FILE.mp4")
 
 
 def the_background(options: RenderOptions, system: NeRF3D, route: Route) -> tuple[float, float, float] | None:

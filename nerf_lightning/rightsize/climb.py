@@ -29,6 +29,7 @@ from nerf_lightning.runs.compact import encode
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.training.room import check_room
 from nerf_lightning.training.train import prepare_process, warm_up
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.seeding import Stream, step_generator
@@ -96,6 +97,7 @@ def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = No
         data.start_again()
     device = device_of(cfg)
     system = build_system(cfg, frame_of(data), device)
+    check_room(system, data, device)
     if start is not None:
         system.warm_start_from(start.cpu())  # where a new system is
         start.to(device)

@@ -131,7 +131,7 @@ def _orbit(where: object, view: Any) -> Cameras:
     K = numbers(where, "orbit.K", view["K"])
     if K.shape != (len(c2w), 3, 3) or not len(c2w):
         raise InputError(where, "orbit.K", f"shape {K.shape}", f"shape ({len(c2w)}, 3, 3), of at least one view")
-    K = np.stack([checks.intrinsics(where, f"orbit.K[{number}]", one) for number, one in enumerate(K)])
+    K = np.stack([checks.intrinsics(where, f"orbit.K[{number}]", one, width, height) for number, one in enumerate(K)])
     return Cameras.of_size(torch.from_numpy(K).float(), torch.from_numpy(c2w).float(), width, height)
 
 

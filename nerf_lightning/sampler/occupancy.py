@@ -12,7 +12,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import front_first, keep_visible, mark_cells
 from nerf_lightning.kernels.march import BLOCK, Packed
 from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import Count, Side
 
 RESOLUTION = 64
 """Cells along a side for a field of usual size."""
@@ -27,6 +27,11 @@ UNSEEN = 0.5 / 255
 """Optical thickness that rays of a picture may lose to steps that hold less: half of what 8 bits tell."""
 ROOM = 1.25
 """Room for steps that are not counted, as a multiple of the last count."""
+
+CROSSED = 1 / 8
+"""Share of the diagonal that rays cross: those through a cube cross 0.38 on average, and two in three may miss it."""
+CELL = 56
+"""Bytes of a cell while all are looked at: its number and place, whole numbers of 64 bits, and two positions."""
 
 
 def in_view(camera: Cameras, points: Float[Tensor, "N 3"], near: float) -> Bool[Tensor, "N"]:
@@ -69,7 +74,7 @@ class OccupancySampler(Sampler):
         self,
         bounds: Bounds,
         samples: Count | None = None,
-        resolution: Count | None = None,
+        resolution: Side | None = None,
         threshold: float = 0.01,
         decay: float = 0.8,
         update_every: Count = 16,
@@ -116,6 +121,14 @@ class OccupancySampler(Sampler):
     def rays_at_once(self) -> int:
         """On a CPU more than elsewhere: it goes some steps at a time along rays, front first."""
         return self.chunk if self.thickness.device.type == "cpu" else super().rays_at_once
+
+    @property
+    def first_samples(self) -> int:
+        return math.ceil(self.samples * CROSSED)
+
+    @property
+    def grid_bytes(self) -> int:
+        return CELL * self.resolution**3
 
     def set_resolution(self, cells: int) -> None:
         """Takes so many cells along each side, and steps to match; buffers stay."""

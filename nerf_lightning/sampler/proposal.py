@@ -11,7 +11,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import along, resample
 from nerf_lightning.model.hashgrid import HashGrid
 from nerf_lightning.sampler.samples import DensityFn, Histogram, Proposals, Sampler, Samples, interval_weights
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import Count, Entries, Layers, Side
 
 START = -1.0
 """Logarithm of the density that proposals begin with, 1 / half-size: thin fog."""
@@ -49,10 +49,10 @@ class ProposalSampler(Sampler):
         second: Count = 24,
         anneal: int = 500,
         padding: float = 0.01,
-        levels: Count = 2,
-        coarsest: Count = 32,
-        finest: Count = 128,
-        log2_entries: Count = 18,
+        levels: Layers = 2,
+        coarsest: Side = 32,
+        finest: Side = 128,
+        log2_entries: Entries = 18,
         final: float = 0.02,
     ):
         super().__init__(bounds)
@@ -70,6 +70,10 @@ class ProposalSampler(Sampler):
         self.first_step = 0
         """The step at which training began."""
         self.step = 0
+
+    @property
+    def first_samples(self) -> int:
+        return max(self.first, self.second, self.samples)
 
     @property
     def groups(self) -> list[dict[str, Any]]:

@@ -8,10 +8,13 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
+
 from nerf_lightning.stability.cell import Cell, Outcome, run
 from nerf_lightning.stability.conditions import CONDITIONS
 from nerf_lightning.stability.methods import METHODS
 from nerf_lightning.utils.machine import cores
+from nerf_lightning.utils.memory import check_memory
 
 QUICK = (
     *("clean", "white, small object", "rate x10", "wrong background flag", "OpenGL poses", "shuffled poses"),
@@ -37,6 +40,8 @@ def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Iterator[
     """Trains cells in processes of one thread each; yields them as they end. They end with this process: cells that are done
     have been written down."""
     count = min(workers or cores(), len(cells))
+    if workers is not None:  # each is about as large as this process
+        check_memory("config", "workers", f"{count:,} processes", count * psutil.Process().memory_info().rss)
     context = multiprocessing.get_context("spawn")  # numba and torch's threads do not survive a fork
     with ProcessPoolExecutor(count, context, _prepare) as pool:
         with _unheard():

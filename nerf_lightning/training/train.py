@@ -15,7 +15,7 @@ from rich.console import Console
 
 from nerf_lightning.callbacks import Checkpoints, Results
 from nerf_lightning.callbacks.attached import ChecksData, attached
-from nerf_lightning.callbacks.checkpoints import check_room
+from nerf_lightning.callbacks.checkpoints import check_disk
 from nerf_lightning.config.build import (
     build_data,
     build_system,
@@ -39,10 +39,11 @@ from nerf_lightning.runs.owner import clear
 from nerf_lightning.runs.scene_file import load_scene, save_scene
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND, check_compiler
+from nerf_lightning.training.room import check_room
 from nerf_lightning.utils.allocator import keep_freed_memory
 from nerf_lightning.utils.listing import first_few
 from nerf_lightning.utils.machine import CROWDED, crowding
-from nerf_lightning.utils.options import AtLeast, Count, check_options
+from nerf_lightning.utils.options import AtMost, Count, Seed, check_options
 from nerf_lightning.utils.progress import animates
 from nerf_lightning.utils.quiet import quiet
 from nerf_lightning.utils.seeding import Stream, step_generator
@@ -52,6 +53,8 @@ SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_pe
 NAMED = 10
 """Photos that do not fit which are printed; all stand in results.json."""
 log = logging.getLogger(__name__)
+Threads = Annotated[Count, AtMost(1024)]
+"""Threads of one process; beyond, starting them fails on common systems, and ends the process."""
 LATER = {"device": "auto", "compile": False, "limits": {"batch": None, "chunk": None}}
 """Options that runs of earlier versions lack, and that may be given when they are resumed."""
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
@@ -93,6 +96,7 @@ def train(
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt.text)
     system = build_system(cfg, frame_of(data), device)
+    check_room(system, data, device)
     if isinstance(system, NeRF3D) and system.corrections is not None and any(doubt.far_off for doubt in doubts):
         system.corrections.begin_poses()
     system.backend = BACKEND if cfg.compile else None
@@ -108,7 +112,7 @@ def train(
     checkpoints = attached(trainer, Checkpoints)
     if trainer.is_global_zero:
         if checkpoints is not None:
-            check_room(folder / checkpoints.folder, system)
+            check_disk(folder / checkpoints.folder, system)
         if checkpoint is None:
             clear(folder)
         save_config(cfg, folder)
@@ -153,9 +157,7 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     return saved, checkpoint
 
 
-def prepare_process(
-    seed: Annotated[int, AtLeast(0)], threads: Count | None, kernels: str, compile: bool = False
-) -> None:
+def prepare_process(seed: Seed, threads: Threads | None, kernels: str, compile: bool = False) -> None:
     """Sets what applies to the whole process."""
     if threads is not None:
         torch.set_num_threads(threads)

@@ -1,12 +1,18 @@
 """What memory is left, and the refusal of what would not fit into it: before it is asked for, as a process that asks for too
 much is killed without a word."""
 
+import math
 import sys
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import psutil
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.device import CPU
 
 CONTAINERS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
@@ -15,8 +21,13 @@ CONTAINERS = (
 """Where Linux tells a container's limit and what it uses of it, in its second and first version of control groups."""
 
 
-def free_memory() -> float:
-    """Bytes that this process can still have: of the machine, of its container, and of its own limit of addresses."""
+def free_memory(device: torch.device = CPU) -> float:
+    """Bytes that this process can still have: of an accelerator, or of the machine, its container, and its own limit of
+    addresses."""
+    if device.type == "cuda":
+        return float(torch.cuda.mem_get_info(device)[0])
+    if device.type == "mps":
+        return float(torch.mps.recommended_max_memory() - torch.mps.driver_allocated_memory())
     left = [float(psutil.virtual_memory().available)]
     for most, used in CONTAINERS:
         try:
@@ -43,18 +54,57 @@ def _reclaimable(statistics: Path) -> float:
     return sum(float(line.split()[1]) for line in lines if line.startswith("inactive_file "))
 
 
-def check_memory(where: object, key: str, what: str, needed: float, todo: str = "") -> None:
-    """Refuses what would not fit into memory.
+def check_memory(
+    where: object, key: str, what: str, needed: float, todo: str = "give less", device: torch.device = CPU
+) -> None:
+    """Refuses what certainly needs more memory than is free.
 
     Args:
         where, key, todo: see `InputError`.
-        what: needs the memory, in words.
-        needed: bytes.
+        what: the things, in words.
+        needed: bytes that they take at least.
+        device: whose memory.
 
     Raises:
         InputError: where more is needed than is free.
     """
-    free = free_memory()
+    free = free_memory(device)
     if not needed <= free:
-        found = f"{what} for which {needed / 1e9:,.1f} GB of memory is needed"
-        raise InputError(where, key, found, f"at most the {free / 1e9:,.1f} GB that are left", todo)
+        found, there = (f"{part / 2**30:,.1f} GiB" for part in (needed, free))
+        raise InputError(where, key, f"{what} that take at least {found}", f"at most the {there} that are free", todo)
+
+
+class Frugal(TorchDispatchMode):
+    """While it is entered, tensors that are made from nothing must fit into the free memory, all together and twice: training
+    keeps a copy.
+
+    Args:
+        where, key: what makes them, for the message.
+
+    Raises:
+        InputError: before a tensor is made that does not fit any more.
+    """
+
+    def __init__(self, where: str, key: str):
+        super().__init__()
+        self.place = where, key
+        self.free = free_memory()
+        self.taken = 0
+
+    def __torch_dispatch__(
+        self, func: Any, types: Iterable[type], args: tuple = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if "device" in kwargs:
+            self.taken += _numbers(func, args) * (kwargs.get("dtype") or torch.get_default_dtype()).itemsize
+            if 2 * self.taken > self.free:
+                check_memory(*self.place, "numbers, with the copy that training keeps,", 2 * self.taken)
+        return func(*args, **kwargs)
+
+
+def _numbers(func: Any, args: tuple) -> int:
+    """How many a new tensor holds: a whole number of Python, which does not overflow as a tensor's size would."""
+    if func.overloadpacket is torch.ops.aten.arange:
+        start, end = (0, args[0]) if len(args) == 1 else args[:2]
+        return math.ceil(abs(end - start))
+    return next((math.prod(part) for part in args if isinstance(part, list | tuple)), 0)

@@ -10,6 +10,11 @@ from typing import Annotated, Any
 
 from nerf_lightning.errors import InputError
 
+WHOLE = 2**63 - 1
+"""The largest whole number that tensors and arrays hold: beyond it an option is none."""
+SINGLE = (2 - 2**-23) * 2.0**127
+"""The largest number of single precision, in which nearly everything is computed: beyond it an option would be infinite."""
+
 
 @dataclass(frozen=True)
 class AtLeast:
@@ -18,14 +23,34 @@ class AtLeast:
     value: float
 
 
+@dataclass(frozen=True)
+class AtMost:
+    """An upper bound, likewise."""
+
+    value: float
+
+
 Count = Annotated[int, AtLeast(1)]
 """A whole number of at least one."""
+Side = Annotated[int, AtLeast(1), AtMost(2**20)]
+"""Cells along a side of a grid: single precision tells 16 places within each apart, and their cube is still below `WHOLE`."""
+Entries = Annotated[int, AtLeast(1), AtMost(30)]
+"""Logarithm of the entries of a table, whose places are whole numbers of 32 bits."""
+Layers = Annotated[int, AtLeast(1), AtMost(1024)]
+"""A number of parts that are made and run one after the other, as layers and levels: as many take a second a step."""
+Octaves = Annotated[int, AtLeast(0), AtMost(127)]
+"""A number of frequencies, each twice the one before: the next is infinite in single precision."""
+Seed = Annotated[int, AtLeast(0), AtMost(2**32 - 1)]
+"""What NumPy and Lightning take."""
+Port = Annotated[int, AtLeast(0), AtMost(65535)]
+FramesPerSecond = Annotated[float, AtLeast(0.01), AtMost(1000)]
+"""Films state how long a frame stays in thousandths of a second."""
 
 
 def check_options(
     where: str, target: Callable, options: Mapping[str, Any], given: Container[str] = (), complete: bool = True
 ) -> None:
-    """Raises InputError if an option is unknown, missing, of the wrong type or below its bound.
+    """Raises InputError if an option is unknown, missing, of the wrong type, not finite or out of its bounds.
 
     Args:
         where: the config group, for the message; "" for the top level.
@@ -53,7 +78,7 @@ def check_options(
             )
         hint = hints.get(name, Any)
         if not _fits(value, hint):
-            raise InputError("config", prefix + name, repr(value), _describe(hint))
+            raise InputError("config", prefix + name, repr(value)[:60], _describe(hint), _range_of(value))
     for name, parameter in parameters.items():
         required = parameter.default is inspect.Parameter.empty and parameter.kind in (
             inspect.Parameter.POSITIONAL_OR_KEYWORD,
@@ -69,8 +94,7 @@ def _fits(value: Any, hint: Any) -> bool:
     """Whether a value from YAML fits an annotation; annotations other than plain values always fit."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        bounds = [bound.value for bound in arguments[1:] if isinstance(bound, AtLeast)]
-        return _fits(value, arguments[0]) and (isinstance(value, bool) or all(value >= bound for bound in bounds))
+        return _fits(value, arguments[0]) and all(_within(value, bound) for bound in arguments[1:])
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, argument) for argument in arguments)
     if origin is list:
@@ -78,21 +102,36 @@ def _fits(value: Any, hint: Any) -> bool:
     if origin is dict:
         return isinstance(value, Mapping) and all(_fits(item, arguments[1]) for item in value.values())
     if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= SINGLE
     if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= WHOLE
     if hint in (str, bool, type(None)):
         return isinstance(value, hint)
     # YAML cannot hold other classes, but a mapping may describe one (with a target of its own).
     return not inspect.isclass(hint) or isinstance(value, Mapping | list)
 
 
+def _range_of(value: Any) -> str:
+    """What numbers may be, for one that is too large or none."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) <= WHOLE:
+        return ""
+    return f"numbers are finite, whole ones at most {WHOLE:.3g}, others {SINGLE:.3g}"
+
+
+def _within(value: float, bound: Any) -> bool:
+    """Whether a number keeps a bound; other annotations are none."""
+    if isinstance(bound, AtLeast):
+        return value >= bound.value
+    return not isinstance(bound, AtMost) or value <= bound.value
+
+
 def _describe(hint: Any) -> str:
     """An annotation in words."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        bounds = [f"at least {bound.value:g}" for bound in arguments[1:] if isinstance(bound, AtLeast)]
-        return " ".join([_describe(arguments[0]), *bounds])
+        how = {AtLeast: "at least", AtMost: "at most"}
+        bounds = [f"{how[type(bound)]} {bound.value:.12g}" for bound in arguments[1:] if type(bound) in how]
+        return f"{_describe(arguments[0])} {' and '.join(bounds)}"
     if origin in (typing.Union, types.UnionType):
         return " or ".join(_describe(argument) for argument in arguments)
     if origin is list:

@@ -10,7 +10,7 @@ from nerf_lightning.config import cli
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.ending import Interrupted
 from nerf_lightning.utils.files import user_path
-from nerf_lightning.utils.options import AtLeast, Count, check_options
+from nerf_lightning.utils.options import AtLeast, Count, Port, check_options
 from nerf_lightning.view.serve import announcement, find_port, require_viser
 
 if TYPE_CHECKING:
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from nerf_lightning.dataset import Scene
     from nerf_lightning.runs.open import SceneRun
     from nerf_lightning.view.page import Page
+
+POINT = 24
+"""Bytes of a sample that is shown: a position and a colour."""
 
 
 def options(
@@ -32,7 +35,7 @@ def options(
     side: Count,
     device: str,
     host: str,
-    port: Annotated[int, AtLeast(0)],
+    port: Port,
 ) -> None:
     """The keys of conf/view.yaml, for checking."""
 
@@ -62,8 +65,11 @@ def task(cfg: "DictConfig") -> None:
 def page_of_scene(given: dict[str, Any], port: int) -> "Page":
     """The page about a scene."""
     from nerf_lightning.dataset import open_scene
+    from nerf_lightning.utils.memory import check_memory
     from nerf_lightning.view.scene_page import ScenePage
 
+    points = given["rays"] * given["samples"]
+    check_memory("config", "rays, samples", f"{points:,} samples to show", POINT * points)
     scene = open_scene(given["scene"], resize=given["resize"], holdout=given["holdout"])
     return ScenePage(scene, given["host"], port, given["photo_side"], given["rays"], given["samples"])
 

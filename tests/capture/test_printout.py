@@ -39,5 +39,8 @@ def test_pages_that_cannot_be(tmp_path: Path):
     wide = TagLayout("DICT_4X4_50", 0.06, {0: flat_pose(0, 0), 1: flat_pose(0.16, 0)})
     with pytest.raises(InputError, match="220 x 60 mm of tags"):
         write_page(wide, tmp_path / "a.pdf")
+    beyond = TagLayout("DICT_4X4_50", 0.02, {0: flat_pose(0, 0), 50: flat_pose(0.04, 0)})
+    with pytest.raises(InputError, match="found tag 50, expected one of the 50 tags of DICT_4X4_50"):
+        write_page(beyond, tmp_path / "a.pdf")
     write_page(layout, tmp_path / "b.pdf")
     assert (tmp_path / "b.pdf").read_bytes()[:5] == b"%PDF-" and len(list(tmp_path.iterdir())) == 1

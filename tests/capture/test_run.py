@@ -202,6 +202,9 @@ def test_a_known_sheet(tmp_path: Path):
         ("tags: {0: {x: 0, y: yes}}", "tags.0: found"),
         ("tags: {0: {x: 0, y: 0, z: 1}}", "tags.0: found"),
         ("tags: {0: {x: 0, y: .inf}}", "tags.0: found"),
+        ("tags: {0: {x: 0, y: 1.0e+39}}", "tags.0: found"),
+        ("tags: {0: {x: 0, y: 1" + 400 * "0" + "}}", "tags.0: found"),
+        (f"tags: {{{2**64}: {{x: 0, y: 0}}}}", f"tags.{2**64}: found {2**64}, expected a whole number below 2320"),
         ("tags: [", "no readable YAML"),
     ],
 )

@@ -56,7 +56,7 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
         (["dataset=photos", "dataset.path=notes.txt"], ["notes.txt", "expected"]),
         (["dataset=photos", "dataset.path=broken.npz"], ["broken.npz", "no zip archive", "expected"]),
         (["dataset.rays=0"], ["dataset.rays", "found 0", "at least 1"]),
-        (["callbacks.orbit.fps=0"], ["callbacks.orbit.fps", "found 0", "more than 0"]),
+        (["callbacks.orbit.fps=0"], ["callbacks.orbit.fps", "found 0", "at least 0.01"]),
         (["callbacks.heldout.at=[0.5,0.1]"], ["callbacks.heldout.at", "[0.5, 0.1]", "ascending"]),
         (["renderer.background=pink"], ["renderer.background", "'pink'", "black, white"]),
         (["resume=nowhere"], ["nowhere/config.yaml", "nothing there"]),
@@ -78,6 +78,10 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
         ([f"hydra.run.dir={'a' * 5000}"], ["'aaa", "5000 letters"]),
         (["hydra.run.dir=notes.txt"], ["notes.txt: found a file", "a folder to write into"]),
         (["hydra.run.dir=notes.txt/below"], ["notes.txt, which is a file", "a folder to write into"]),
+        (["budget.seconds=nan"], ["budget.seconds", "found nan", "a number", "finite"]),
+        ([f"seed={2**33}"], ["seed", str(2**33), f"at most {2**32 - 1}"]),
+        (["dataset.rays=1000000000000"], ["dataset.rays", "1,000,000,000,000 rays a step", "GiB that are free"]),
+        (["model=tensorf", "model.size=fixed", "model.finest=1000000"], ["model", "GiB that are free"]),
     ],
 )
 def test_bad_input_gets_one_line_and_exit_code_2(arguments: list[str], words: list[str], inside, tmp_path: Path):

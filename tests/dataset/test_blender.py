@@ -145,6 +145,7 @@ DAMAGE = {
     "angle missing": (_edit("val", lambda c: c.pop("camera_angle_x")), ["val.json: camera_angle_x", "among [frames]"]),
     "angle zero": (_angle(0), ["camera_angle_x: found 0, expected a positive"]),
     "angle huge": (_angle(3.2), ["camera_angle_x: found 3.2"]),
+    "angle of nothing": (_angle(1e-300), ["camera_angle_x: found 1e-300, expected the angle that a photo shows"]),
     "angle text": (_angle("wide"), ["camera_angle_x: found 'wide'"]),
     "angle endless": (_angle(10**400), ["a whole number of 401 digits"]),
     "frames missing": (_edit("train", lambda c: c.pop("frames")), ["frames: found no such key"]),

@@ -207,3 +207,22 @@ def test_llff_tells_where_content_starts(views: Views, tmp_path: Path):
     rows[:, 15] = 4
     np.save(tmp_path / "poses_bounds.npy", rows)
     assert open_scene(str(tmp_path)).bounds.near == pytest.approx(0.25, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("focal", "distortion", "fisheye"),
+    [
+        (30.6, Distortion(k3=-3e5, d2=-8e12), True),
+        (111.0, Distortion(k1=6e9, d2=-6e12), True),
+        (38.0, Distortion(k1=-4e9, d1=-7e6), False),
+        (6443.0, Distortion(k3=2e3, d1=-6e7), False),
+    ],
+)
+def test_a_lens_whose_rays_do_not_lead_back_is_none(focal: float, distortion: Distortion, fisheye: bool):
+    """Their borders unfold in double precision; between, or in single precision, rays go elsewhere."""
+    assert not Optics(640, 480, focal, focal, 320, 240, distortion, fisheye).sees_every_pixel()
+
+
+@pytest.mark.parametrize(("focal", "k1"), [(1e5, -0.2), (1e5, 900.0), (4000.0, 0.1), (6000.0, -0.3)])
+def test_a_strong_lens_on_a_small_sensor_is_one(focal: float, k1: float):
+    assert Optics(6000, 4000, focal, focal, 3000, 2000, Distortion(k1=k1)).sees_every_pixel()

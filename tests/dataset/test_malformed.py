@@ -86,8 +86,8 @@ def flat_row(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def no_focal(array: np.ndarray) -> np.ndarray:
-    array[0, 14] = 0
+def changed(array: np.ndarray, column: int, value: float) -> np.ndarray:
+    array[0, column] = value
     return array
 
 
@@ -124,8 +124,23 @@ BINARY: dict[str, tuple[Spoil, str]] = {
     "endless count": (put(f"{MODEL}/images.bin", 0, "Q", 2**60), "images.bin: found"),
     "unknown camera model": (put(f"{MODEL}/cameras.bin", 12, "i", 99), "camera 1: found model number 99"),
     "size of no photo": (put(f"{MODEL}/cameras.bin", 16, "Q", 0), "camera 1: found 0x40 pixels"),
-    "focal length nan": (put(f"{MODEL}/cameras.bin", 32, "d", math.nan), "camera 1: found PINHOLE with nan"),
-    "focal length negative": (put(f"{MODEL}/cameras.bin", 32, "d", -60.0), "camera 1: found PINHOLE with -60"),
+    "focal length nan": (
+        put(f"{MODEL}/cameras.bin", 32, "d", math.nan),
+        "camera 1: found nan, expected a focal length",
+    ),
+    "focal length negative": (
+        put(f"{MODEL}/cameras.bin", 32, "d", -60.0),
+        "camera 1: found -60, expected a focal length",
+    ),
+    "focal length beyond float": (
+        put(f"{MODEL}/cameras.bin", 32, "d", 1e39),
+        "camera 1: found 1e+39, expected a focal",
+    ),
+    "place on no sensor": (
+        put(f"{MODEL}/cameras.bin", 48, "d", 1e39),
+        "camera 1: found 1e+39, expected at most 8388608",
+    ),
+    "pose far off": (put(f"{MODEL}/images.bin", 44, "d", 1e300), "0000.png: found a camera at 1e+300"),
     "camera that is not there": (put(f"{MODEL}/images.bin", 68, "i", 77), "found camera 77 of 0000.png"),
     "pose nan": (put(f"{MODEL}/images.bin", 44, "d", math.nan), "0000.png: found a pose of nan"),
     "quaternion of no rotation": (put(f"{MODEL}/images.bin", 12, "4d", 0, 0, 0, 0), "0000.png: found a pose"),
@@ -166,7 +181,10 @@ LLFF: dict[str, tuple[Spoil, str]] = {
     "one row": (rows(lambda a: a[0]), "found shape (17,)"),
     "nan": (rows(nan_in_row), "row 2: found nan"),
     "no rotation": (rows(flat_row), "row 1: found R^T R"),
-    "no focal length": (rows(no_focal), "found no photo, or a height, width or focal length that is none"),
+    "pose far off": (rows(lambda a: changed(a, 3, 1e39)), "row 0: found a camera at 1e+39"),
+    "focal length of nothing": (rows(lambda a: changed(a, 14, 1e-300)), "row 0: found 1e-300, expected a focal"),
+    "width beyond float": (rows(lambda a: changed(a, 9, 1e39)), "row 0: found a width of 1e+39"),
+    "no focal length": (rows(lambda a: changed(a, 14, 0)), "row 0: found 0, expected a focal length"),
     "no rows": (rows(lambda a: a[:0]), "found no photo"),
     "text": (text("poses_bounds.npy", "poses"), "poses_bounds.npy: found something unreadable"),
     "pickled": (pickled, "poses_bounds.npy: found something unreadable"),

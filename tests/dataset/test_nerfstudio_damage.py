@@ -47,6 +47,23 @@ DAMAGE = {
     "distortion text": (_first(k1=[1]), "frames[0].k1: found [1]"),
     "distortion k4": (_top(k4=0.1), "k4: found 0.1"),
     "lens of a frame": (_first(camera_model="EQUIRECTANGULAR"), "frames[0].camera_model: found 'EQUIRECTANGULAR'"),
+    "focal beyond float": (_top(fl_x=1e39), "fl_x: found 1e+39, expected a focal length of"),
+    "focal of no angle": (_first(fl_y=1e9), "frames[0].fl_y: found 1e+09, expected a focal length of"),
+    "focal of nothing": (_top(fl_x=1e-300), "fl_x: found 1e-300, expected a focal length of"),
+    "angle of nothing": (
+        lambda c: (_pop("fl_x")(c), _top(camera_angle_x=1e-300)(c)),
+        "camera_angle_x: found 1e-300, expected the angle that a photo shows",
+    ),
+    "centre far off": (_top(cx=1e39), "cx: found 1e+39, expected at most 8388608 pixels"),
+    "distortion beyond float": (_top(k1=1e300), "a distortion that folds the photo over"),
+    "pose far off": (
+        _first(transform_matrix=[[1, 0, 0, 1e39], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+        "frames[0].transform_matrix: found a camera at 1e+39, expected coordinates of at most 1e+12",
+    ),
+    "pose of huge numbers": (
+        _first(transform_matrix=[[1e300, -1e300, 0, 0], [1e300, 1e300, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+        "frames[0].transform_matrix: found R^T R that is 1e+300 away from the identity",
+    ),
     "folded over": (_top(k1=-3.0), "k1, k2, k3, p1, p2: found a distortion that folds the photo over"),
     "mask missing": (_first(mask_path="no.png"), "frames[0].mask_path: found 'no.png', which is not there"),
     "width": (_top(w=161), "w: found 161, expected 160, the size of 0000.png"),

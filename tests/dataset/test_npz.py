@@ -171,9 +171,30 @@ DAMAGE = {
     "box flipped": (_set(aabb=[[1.0, 1, 1], [0, 2, 2]]), "aabb: found [[1.0"),
     "box shape": (_set(aabb=np.zeros(6)), "aabb: found shape (6,)"),
     "unbounded": (_set(aabb=BOX, unbounded=1), "unbounded: found int64"),
+    "pose far off": (_pose(lambda x: x + 1e39 * np.eye(4, k=3)), "c2ws_train[1]: found a camera at 1e+39"),
+    "focal beyond float": (
+        _set(focal=1e39),
+        "focal: found 1e+39, expected a focal length of 9.5e-07 to 8388608 pixels",
+    ),
+    "focal of no angle": (_set(focal=1e9), "focal: found 1e+09, expected a focal length"),
+    "focal of nothing": (_set(focal=1e-300), "focal: found 1e-300, expected a focal length"),
+    "K beyond float": (_set(K=np.diag([1e39, 9, 1])), "K[0][0]: found 1e+39, expected a focal length"),
+    "K of no sensor": (_set(K=[[9, 0, 1e9], [0, 9, 3], [0, 0, 1]]), "K[0][2]: found 1e+09, expected at most"),
+    "K skewed beyond float": (_set(K=[[9, 1e39, 4], [0, 9, 3], [0, 0, 1]]), "K[0][1]: found 1e+39"),
+    "box beyond float": (
+        _set(aabb=[[0, 0, 0], [1e39, 1, 1]]),
+        "aabb: found a corner at 1e+39, expected coordinates of",
+    ),
+    "box of nothing": (_set(aabb=[[1e8, 0, 0], [1e8 + 1e-3, 1, 1]]), "aabb: found [[1000"),
+    "far beyond float": (_set(far=1e39), "far: found 1e+39, expected a distance from 0 to 1e+12"),
+    "similarity of zeros": (_set(to_source=np.zeros((4, 4))), "to_source: found a scale or a shift"),
+    "similarity beyond float": (_set(to_source=np.diag([1e300] * 3 + [1])), "to_source: found a scale or a shift"),
+    "sheared": (_set(to_source=np.eye(4) + np.eye(4, k=1) * [0, 1, 0, 0]), "to_source: found [[1.0, 1.0"),
+    "mirrored": (_set(to_source=np.diag([1, 1, -1, 1])), "to_source: found [[1.0, 0.0"),
+    "similarity transposed": (_set(to_source=np.eye(4) + 5 * np.eye(4, k=-3)), "to_source: found bottom row [5.0"),
+    "colour of none": (_set(background=[0, 2, 1e39]), "background: found [0.0, 2.0"),
     "background": (_set(background=np.zeros(4)), "background: found shape (4,)"),
     "too many numbers": (_set(near=np.zeros(17)), "near: found shape (17,), expected at most 16 numbers"),
-    "no way back": (_set(to_source=np.zeros((4, 4))), "to_source: found [[0.0"),
 }
 
 
@@ -234,3 +255,57 @@ def test_nothing_in_a_file_is_executed(arrays: Arrays, path: Path, tmp_path: Pat
     with pytest.raises(InputError, match="Object arrays cannot be loaded"):
         load_npz(path)
     assert not target.exists()
+
+
+@pytest.mark.parametrize("unit", [1e-11, 1e-6, 1e-3, 1e6, 1e11])
+def test_a_scene_in_any_unit_gets_the_same_box(unit: float, ball: Scene, path: Path):
+    save_npz(ball, path)
+    with np.load(path) as file:
+        arrays = {key: file[key].astype(np.float64) if key.startswith("c2ws") else file[key] for key in file}
+    del arrays["aabb"]
+    np.savez(path, **arrays)
+    expected = load_npz(path).bounds.aabb
+    for key in ("c2ws_train", "c2ws_val", "c2ws_test"):
+        arrays[key][:, :3, 3] *= unit
+    np.savez(path, **arrays)
+    torch.testing.assert_close(load_npz(path).bounds.aabb / unit, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("unit", "shift", "words"),
+    [
+        (1e-13, 0, "e-13 from what they look at, expected a distance of 1e-12 to 1e+12; take another unit"),
+        (1e-300, 0, "from what they look at, expected a distance"),
+        (1, 1e7, "found cameras 1e+07 from the origin, whose pixels show 0.0"),
+        (
+            1,
+            1e11,
+            "expected places that single precision, of seven digits, tells apart; move the origin to the subject",
+        ),
+    ],
+)
+def test_cameras_that_single_precision_cannot_tell_apart(
+    unit: float, shift: float, words: str, ball: Scene, path: Path
+):
+    save_npz(ball, path)
+    with np.load(path) as file:
+        arrays = dict(file)
+    for key in ("c2ws_train", "c2ws_val", "c2ws_test"):
+        arrays[key] = arrays[key].astype(np.float64)
+        arrays[key][:, :3, 3] = arrays[key][:, :3, 3] * unit + shift
+    np.savez(path, **arrays)
+    with pytest.raises(InputError) as caught:
+        load_npz(path)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("shift", [0, 1e6])
+def test_cameras_on_one_spot_are_a_panorama_wherever_that_is(shift: float, ball: Scene, path: Path):
+    save_npz(ball, path)
+    with np.load(path) as file:
+        arrays = dict(file)
+    for key in ("c2ws_train", "c2ws_val", "c2ws_test"):
+        arrays[key] = arrays[key].astype(np.float64)
+        arrays[key][:, :3, 3] = shift
+    np.savez(path, **arrays)
+    assert load_npz(path).bounds.aabb.isfinite().all()

@@ -89,6 +89,10 @@ def test_own_files(tmp_path: Path):
     torch.testing.assert_close(read.K, path.K)
 
 
+THEIRS = (
+    '{"render_width": %s, "render_height": 4, "camera_path": [{"camera_to_world": '
+    '[1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1], "fov": %s}]}'
+)
 PATH = '{"width": 4, "height": 4, "K": [[%s,0,2],[0,1,2],[0,0,1]], "c2w": %s}'
 
 
@@ -101,7 +105,12 @@ PATH = '{"width": 4, "height": 4, "K": [[%s,0,2],[0,1,2],[0,0,1]], "c2w": %s}'
         (PATH % (1, "[]"), "0 views"),
         (PATH % (1, "[[1,2]]"), "invalid for input"),
         (PATH % ("NaN", "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "not finite"),
-        (PATH.replace("4", "10000000") % (1, "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "pixels for which"),
+        (PATH.replace("4", "10000000") % (1, "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "pixels that take at least"),
+        (PATH % (0, "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "K or fov: found"),
+        (PATH % ("1e9", "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "K or fov.*a focal length of"),
+        ('{"render_width": 1e999, "render_height": 4, "camera_path": []}', "cannot convert float infinity"),
+        (THEIRS % (4, 0), "division by zero"),
+        (THEIRS % (10**30, 90), "path.json: found"),
         (PATH % (1, "[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]"), "no rotation"),
     ],
 )

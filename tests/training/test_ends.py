@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from nerf_lightning.callbacks import Checkpoints, HeldOut, Progress
-from nerf_lightning.callbacks.checkpoints import InPlace, check_room
+from nerf_lightning.callbacks.checkpoints import InPlace, check_disk
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import NoRoom
@@ -183,9 +183,9 @@ def test_a_run_asks_beforehand_whether_its_checkpoints_fit(undisturbed: Path, in
     one = 4 * 3 * sum(p.numel() for p in system.parameters())
     assert one <= size < one + 60_000, "the rest does not grow with the model"
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=one))
-    check_room(folder, system)  # two are there already, and are replaced
+    check_disk(folder, system)  # two are there already, and are replaced
     with pytest.raises(NoRoom):
-        check_room(undisturbed / "elsewhere", system)
+        check_disk(undisturbed / "elsewhere", system)
 
 
 def test_a_field_that_grows_asks_for_its_last_size():

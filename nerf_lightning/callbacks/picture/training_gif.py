@@ -12,6 +12,7 @@ from nerf_lightning.drawing.panels import narrowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.options import FramesPerSecond
 
 
 class TrainingGif(L.Callback):
@@ -26,7 +27,7 @@ class TrainingGif(L.Callback):
         InputError: where fps <= 0 or width < 1.
     """
 
-    def __init__(self, path: str = "training.gif", fps: float = 3, width: int = 640):
+    def __init__(self, path: str = "training.gif", fps: FramesPerSecond = 3, width: int = 640):
         if not fps > 0:
             raise InputError("callbacks.training_gif.fps", "", str(fps), "more than 0")
         if width < 1:

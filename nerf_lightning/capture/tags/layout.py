@@ -1,17 +1,20 @@
 """TagLayout: the tags, their size, and where they lie in the world."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from nerf_lightning.dataset.formats.checks import FARTHEST
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.untrusted import read_yaml
 
 SQUARE = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) / 2
 """Corners of a tag of side 1 in its own frame, in OpenCV's order: the printed top left first, then clockwise."""
+
+MOST_TAGS = 2320
+"""In the largest of OpenCV's families, DICT_APRILTAG_36h10."""
 
 SHEETS = Path(__file__).parent / "sheets"
 """Layouts that come with the package."""
@@ -63,12 +66,12 @@ def read_layout(path: Path, dictionary: str, size: float) -> TagLayout:
         raise InputError(path, "tags", repr(tags), "a mapping from each tag's id to its x and y in metres")
     poses = {}
     for tag, entry in tags.items():
-        if not isinstance(tag, int) or tag < 0:
-            raise InputError(path, f"tags.{tag}", repr(tag), "a whole number, the tag's id")
+        if not isinstance(tag, int) or not 0 <= tag < MOST_TAGS:
+            raise InputError(path, f"tags.{tag}", repr(tag), f"a whole number below {MOST_TAGS}, the tag's id")
         given = entry if isinstance(entry, dict) else {}
         unknown = sorted(set(given) - {"x", "y", "turn"})
         numbers = [given.get("x"), given.get("y"), given.get("turn", 0.0)]
-        plain = [isinstance(n, int | float) and not isinstance(n, bool) and math.isfinite(n) for n in numbers]
+        plain = [isinstance(n, int | float) and not isinstance(n, bool) and abs(n) <= FARTHEST for n in numbers]
         if unknown or not all(plain):
             raise InputError(path, f"tags.{tag}", repr(entry), "x and y in metres, and optionally turn in degrees")
         poses[tag] = flat_pose(*numbers)

@@ -37,8 +37,12 @@ def page(layout: TagLayout) -> Figure:
     """A flat sheet of tags in the middle of an A4 page.
 
     Raises:
-        InputError: the tags do not fit on the page, or the family does not have them.
+        InputError: the tags do not fit on the page, or are not in the family.
     """
+    patterns = family(layout.dictionary)
+    if (last := max(layout.poses)) >= len(patterns.bytesList):
+        expected = f"one of the {len(patterns.bytesList)} tags of {layout.dictionary}"
+        raise InputError("config", "tags.layout", f"tag {last}", expected, "name a larger family with tags.dictionary")
     corners = np.concatenate([layout.corners(tag)[:, :2] for tag in layout.poses])
     low, high = corners.min(0), corners.max(0)
     rim = layout.size / 6
@@ -50,10 +54,6 @@ def page(layout: TagLayout) -> Figure:
     centre = (low + high) / 2
     axes.set(xlim=centre[0] + np.array([-0.5, 0.5]) * A4[0], ylim=centre[1] + np.array([-0.5, 0.5]) * A4[1])
     axes.set_axis_off()
-    patterns = family(layout.dictionary)
-    if max(layout.poses) >= len(patterns.bytesList):
-        found, most = f"tag {max(layout.poses)}", len(patterns.bytesList) - 1
-        raise InputError("config", "tags.layout", found, f"at most tag {most}, the last of {layout.dictionary}")
     side = patterns.markerSize + 2
     module = layout.size / side
     for tag, pose in layout.poses.items():

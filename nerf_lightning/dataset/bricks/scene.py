@@ -16,9 +16,10 @@ from nerf_lightning.dataset.bricks.model import bulldozer
 from nerf_lightning.dataset.bricks.trace import picture, shadow
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.utils.arrays import Header, Headers, read_npz
 from nerf_lightning.utils.files import atomic, cache_folder
+from nerf_lightning.utils.memory import check_memory
 
 VERSION = 1
 """Part of the cache file's name: raise it whenever model, shading or cameras change."""
@@ -27,6 +28,8 @@ RADIUS = 4.0311
 FIELD_OF_VIEW = 0.6911112
 """Horizontal, radians; from the same scene."""
 ORBIT_ELEVATION = math.radians(30)
+POSE = 116
+"""Bytes of a pose, its intrinsics and size."""
 UP = (0.0, 0.0, 1.0)
 
 
@@ -46,6 +49,9 @@ def bricks(
     for key, value in counts.items():
         if value < 1:
             raise InputError("bricks", key, str(value), "a whole number of at least 1")
+    views = train_views + val_views
+    what = f"{views:,} pictures of {size:,}x{size:,} pixels, with a pose each,"
+    check_memory("bricks", "size, train_views, val_views", what, views * (4 * size**2 + POSE) + POSE * orbit_views)
     train = _cameras(_hemisphere(torch.arange(1, train_views + 1)), size)
     val = _cameras(_hemisphere(-torch.arange(1, val_views + 1)), size)
     orbit = _cameras(orbit_around(torch.zeros(3), torch.tensor(UP), RADIUS, ORBIT_ELEVATION, orbit_views), size)
@@ -119,5 +125,5 @@ def _save(path: Path, train: np.ndarray, val: np.ndarray) -> None:
     try:
         with atomic(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, images_train=train, images_val=val)
-    except OSError as error:
+    except (OSError, NoRoom) as error:
         warnings.warn(f"the built-in scene is not cached, the next run traces it again: {error}", stacklevel=3)

@@ -1,7 +1,8 @@
 """The Blender format of the original NeRF scenes: transforms_{train,val,test}.json beside RGBA renders."""
 
-import math
 from pathlib import Path
+
+import numpy as np
 
 from nerf_lightning.cameras import orbit_like
 from nerf_lightning.dataset.extent import border_colour, estimate_bounds
@@ -56,14 +57,13 @@ def _load_split(path: Path, resize: int | None) -> Views:
     content = checks.json_object(path)
     checks.require_keys(path, content, ["camera_angle_x", "frames"])
     angle = checks.positive(path, "camera_angle_x", content["camera_angle_x"], "radians")
-    if angle >= math.pi:
-        raise InputError(path, "camera_angle_x", f"{angle:g}", "radians below pi")
     names, poses = checks.json_frames(path, content)
     shots = []
     for i, (file_path, c2w) in enumerate(zip(names, opengl_to_opencv(poses), strict=True)):
         if (file := find_image(path.parent, file_path)) is None:
             raise InputError(path, f"frames[{i}].file_path", f"{file_path!r}, which is not there", "an image file")
         width, height, _ = image_header(file)
-        focal = 0.5 * width / math.tan(0.5 * angle)
+        focal = checks.field_of_view(path, "camera_angle_x", angle, width)
         shots.append(Shot(file_path, file, c2w, Optics(width, height, focal, focal, width / 2, height / 2)))
+    checks.told_apart(path, np.stack([shot.c2w for shot in shots]), np.array([shot.optics.fx for shot in shots]))
     return read_shots(path, shots, Reading(resize))

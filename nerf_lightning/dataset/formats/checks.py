@@ -3,12 +3,15 @@
 Files come from strangers: nothing here unpickles or evaluates anything.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, Shaped, UInt8
 
+from nerf_lightning.cameras import axes_meet, focus_point
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.arrays import Header
 from nerf_lightning.utils.memory import check_memory
@@ -18,6 +21,17 @@ PIXEL_BYTES = 20
 """Memory for a pixel of a rendered view: colour, depth and opacity as floats."""
 RIGID_TOLERANCE = 1e-3
 """How far R^T R may stand from the identity, entry by entry; files that print six digits stay well below."""
+
+FARTHEST, NEAREST = 1e12, 1e-12
+"""Largest coordinate, and smallest distance of cameras from what they look at, in a file's unit: single precision holds the
+cubes of these lengths, which a similarity's scale is taken from, and no more."""
+PIXELS = 2.0**23
+"""Largest focal length, and largest place on a sensor, pixels. Directions have length 1 and a pixel is 1 / focal length wide:
+single precision cannot tell the directions of two pixels beyond, nor their places."""
+STEP = 2.0**-23
+"""Between neighbouring numbers of single precision, as a share of them."""
+ROUNDING = 1e-13
+"""Cameras nearer than this share of their coordinates stand on one spot, but for the rounding of double precision."""
 
 
 def json_object(path: Path) -> dict:
@@ -53,6 +67,36 @@ def positive(where: object, key: str, value: object, unit: str = "pixels") -> fl
     return value
 
 
+def focal_length(where: object, key: str, value: float, side: float) -> float:
+    """Pixels, of a photo with that many along this side: directions of its pixels must differ, the outermost still point ahead.
+
+    Raises:
+        InputError: where single precision could not hold that.
+    """
+    least = side / PIXELS
+    if not least <= value <= PIXELS:
+        expected = f"a focal length of {least:.2g} to {PIXELS:.0f} pixels"
+        raise InputError(where, key, f"{value:g}", expected, "is it in pixels?")
+    return value
+
+
+def field_of_view(where: object, key: str, angle: float, side: int, fisheye: bool = False) -> float:
+    """The focal length in pixels of a photo that shows this angle, radians, along a side."""
+    if not 0 < angle < math.pi:
+        raise InputError(where, key, f"{angle:g}", "radians between 0 and pi")
+    wide = angle if fisheye else 2 * math.tan(0.5 * angle)
+    if not side / PIXELS <= wide <= PIXELS:
+        raise InputError(where, key, f"{angle:g}", "the angle that a photo shows, in radians")
+    return side / wide
+
+
+def sensor(where: object, key: str, place: float) -> float:
+    """A place on the sensor, or a skew, in pixels: whole ones must differ."""
+    if not abs(place) <= PIXELS:
+        raise InputError(where, key, f"{place:g}", f"at most {PIXELS:.0f} pixels from the photo's corner")
+    return place
+
+
 def numeric(where: object, key: str, array: Shaped[np.ndarray, "..."], shape: str) -> Float[np.ndarray, "..."]:
     """The array as float64; `shape` is what it must have, like "4 4"."""
     wanted = f"numbers of shape ({', '.join(shape.split())})"
@@ -77,21 +121,83 @@ def rigid_poses(where: object, label: str, poses: Shaped[np.ndarray, "V ..."]) -
     """Camera-to-world matrices [R t; 0 1] with R a rotation. `label` names pose i in messages: "c2ws_train[{}]"."""
     pose_array(where, label.replace("[{}]", ""), poses)
     poses = poses.astype(np.float64)
-    expected = "a finite camera-to-world matrix [R t; 0 0 0 1] with R a rotation"
     for i, pose in enumerate(poses):
-        found = todo = ""
-        if not np.isfinite(pose).all():
-            found, todo = "nan or infinity", "leave out views without a pose"
-        elif not np.allclose(pose[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE):
-            found, todo = f"bottom row {pose[3].round(4).tolist()}", "the matrix may be transposed"
-        elif (error := np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max()) > RIGID_TOLERANCE:
-            found = f"R^T R that is {error:.2g} away from the identity"
-            todo = "the rotation may carry a scale: divide it out"
-        elif np.linalg.det(pose[:3, :3]) < 0:
-            found, todo = "a mirror (det R = -1)", "the handedness of the axes may be wrong"
-        if found:
-            raise InputError(where, label.format(i), found, expected, todo)
+        rigid_pose(where, label.format(i), pose)
     return poses
+
+
+def rigid_pose(where: object, key: str, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """One camera-to-world matrix, likewise."""
+    expected = "a finite camera-to-world matrix [R t; 0 0 0 1] with R a rotation"
+    found = todo = ""
+    if not np.isfinite(pose).all():
+        found, todo = "nan or infinity", "leave out views without a pose"
+    elif not np.allclose(pose[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE):
+        found, todo = f"bottom row {pose[3].round(4).tolist()}", "the matrix may be transposed"
+    elif (error := off_rotation(pose[:3, :3])) > RIGID_TOLERANCE:
+        found = f"R^T R that is {error:.2g} away from the identity"
+        todo = "the rotation may carry a scale: divide it out"
+    elif np.linalg.det(pose[:3, :3]) < 0:
+        found, todo = "a mirror (det R = -1)", "the handedness of the axes may be wrong"
+    elif (far := np.abs(pose[:3, 3]).max()) > FARTHEST:
+        found, expected = f"a camera at {far:.3g}", f"coordinates of at most {FARTHEST:g}"
+        todo = "leave it out, or take a larger unit"
+    if found:
+        raise InputError(where, key, found, expected, todo)
+    return pose
+
+
+def off_rotation(matrix: Float[np.ndarray, "3 3"]) -> float:
+    """How far R^T R stands from the identity; a column's length says it where squares would be infinite."""
+    longest = np.abs(matrix).max()
+    return float(longest if longest > 1e6 else np.abs(matrix.T @ matrix - np.eye(3)).max())
+
+
+def told_apart(
+    where: object, c2w: Float[np.ndarray, "V 4 4"], focal: Float[np.ndarray, "#V"] | None = None
+) -> Float[np.ndarray, "V 4 4"]:
+    """Cameras whose places differ from each other, and from what they look at, in single precision too.
+
+    Args:
+        where: the file.
+        c2w: of cameras, in its frame.
+        focal: their focal lengths, pixels, where the frame is kept; None where the origin moves to the subject.
+
+    Raises:
+        InputError: where single precision could not tell what a pixel shows.
+    """
+    poses, places = torch.from_numpy(c2w), c2w[:, :3, 3]
+    far = float(np.abs(places).max(initial=0.0))
+    if len(c2w) < 3 or np.ptp(places, axis=0).max() <= ROUNDING * far or not axes_meet(poses):
+        return c2w  # a fly-through or a panorama: nothing says how far the subject is
+    distance = float((poses[:, :3, 3] - focus_point(poses)).abs().amax(1).median())
+    if not NEAREST <= distance <= FARTHEST:
+        expected = f"a distance of {NEAREST:g} to {FARTHEST:g}"
+        raise InputError(
+            where, "poses", f"cameras {distance:.3g} from what they look at", expected, "take another unit"
+        )
+    if focal is not None and far * STEP > (pixel := distance / float(np.median(focal))):
+        found = f"cameras {far:.3g} from the origin, whose pixels show {pixel:.3g}"
+        expected = "places that single precision, of seven digits, tells apart"
+        raise InputError(where, "poses", found, expected, "move the origin to the subject")
+    return c2w
+
+
+def similarity(where: object, key: str, matrix: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "4 4"]:
+    """[s R t; 0 1] with R a rotation and s a positive scale."""
+    matrix = numeric(where, key, matrix, "4 4")
+    expected = "a similarity [s R t; 0 0 0 1]: a rotation times a scale, and a shift"
+    columns = np.linalg.norm(np.clip(matrix[:3, :3], -2 * FARTHEST, 2 * FARTHEST), axis=0)
+    scale = float(columns.mean())
+    if not NEAREST <= scale <= FARTHEST or np.abs(matrix[:3, 3]).max() > FARTHEST:
+        found, expected = "a scale or a shift that no file's unit has", f"{expected} of at most {FARTHEST:g}"
+    elif np.linalg.det(matrix[:3, :3] / scale) <= 0 or off_rotation(matrix[:3, :3] / scale) > RIGID_TOLERANCE:
+        found = str(matrix[:3, :3].round(3).tolist())
+    elif not np.allclose(matrix[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE):
+        found = f"bottom row {matrix[3].round(4).tolist()}"
+    else:
+        return matrix
+    raise InputError(where, key, found, expected, "leave it out, and the frame is the file's own")
 
 
 def json_frames(path: Path, content: dict) -> tuple[list[str], Float[np.ndarray, "V 4 4"]]:
@@ -116,6 +222,14 @@ def json_frames(path: Path, content: dict) -> tuple[list[str], Float[np.ndarray,
             raise InputError(path, key, f"shape {pose.shape}", "4 rows of 4 numbers")
         poses.append(pose)
     return [frame["file_path"] for frame in frames], rigid_poses(path, "frames[{}].transform_matrix", np.stack(poses))
+
+
+def colour(where: object, key: str, value: Shaped[np.ndarray, "..."]) -> tuple[float, float, float]:
+    """sRGB in [0, 1]."""
+    red, green, blue = numeric(where, key, value, "3").tolist()
+    if not all(0 <= part <= 1 for part in (red, green, blue)):
+        raise InputError(where, key, str([red, green, blue]), "three numbers from 0 to 1")
+    return red, green, blue
 
 
 def image_array(where: object, key: str, array: Header) -> None:
@@ -151,34 +265,35 @@ def split_size(where: object, key: str, count: int, poses: int | None = None) ->
         raise InputError(where, key, f"{count} images for {poses} poses", "one pose for each image")
 
 
-def intrinsics(where: object, key: str, K: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "3 3"]:
+def intrinsics(
+    where: object, key: str, K: Shaped[np.ndarray, "..."], width: int, height: int
+) -> Float[np.ndarray, "3 3"]:
     K = numeric(where, key, K, "3 3")
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
         expected = "[[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels with fx, fy > 0"
         raise InputError(where, key, str(K.round(3).tolist()), expected)
+    for side, (row, focal) in zip((width, height), ((0, K[0, 0]), (1, K[1, 1])), strict=True):
+        focal_length(where, f"{key}[{row}][{row}]", float(focal), side)
+        for column in range(row + 1, 3):
+            sensor(where, f"{key}[{row}][{column}]", float(K[row, column]))
     return K
 
 
 def near_far(where: object, near: float | None, far: float | None) -> None:
-    if near is not None and near < 0:
-        raise InputError(where, "near", f"{near:g}", "a distance >= 0")
+    for key, distance in (("near", near), ("far", far)):
+        if distance is not None and not 0 <= distance <= FARTHEST:
+            raise InputError(where, key, f"{distance:g}", f"a distance from 0 to {FARTHEST:g}")
     if far is not None and far <= (near or 0.0):
         raise InputError(where, "far", f"{far:g}", f"more than near, {near or 0.0:g}")
 
 
 def box(where: object, key: str, aabb: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "2 3"]:
     aabb = numeric(where, key, aabb, "2 3")
-    if not (aabb[0] < aabb[1]).all():
+    if np.abs(aabb).max() > FARTHEST:
+        raise InputError(where, key, f"a corner at {np.abs(aabb).max():.3g}", f"coordinates of at most {FARTHEST:g}")
+    if not (aabb[1] - aabb[0] > np.abs(aabb).max(0) * STEP + NEAREST).all():
         raise InputError(where, key, str(aabb.round(4).tolist()), "a lower corner below the upper one on each axis")
     return aabb
-
-
-def similarity(where: object, key: str, matrix: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "4 4"]:
-    """A change of frame that can be undone: [sR t; 0 0 0 1] with a scale s above 0 and no mirror."""
-    matrix = numeric(where, key, matrix, "4 4")
-    if not (np.allclose(matrix[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE) and np.linalg.det(matrix[:3, :3]) > 0):
-        raise InputError(where, key, str(matrix.round(4).tolist()), "[sR t; 0 0 0 1] with a scale s above 0")
-    return matrix
 
 
 def view_size(where: object, key: str, width: object, height: object) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.colmap_model import FILES, Image, Model, count_images, holds_model, read_model
 from nerf_lightning.dataset.formats.decode import EXTENSIONS, image_header
 from nerf_lightning.dataset.masks import find_masks
@@ -84,7 +85,14 @@ def load_colmap(
     scene_folder = root.parent if root.name in PHOTO_FOLDERS else root
     masks = find_masks([root / image.name for image in kept], scene_folder)
     shots = [
-        Shot(image.name, path, np.linalg.inv(image.w2c), model.cameras[image.camera], mask, upright)
+        Shot(
+            image.name,
+            path,
+            checks.rigid_pose(folder, image.name, np.linalg.inv(image.w2c)),
+            model.cameras[image.camera],
+            mask,
+            upright,
+        )
         for image, path, mask in zip(kept, paths, masks, strict=True)
     ]
     return scene_of(place, name or scene_folder.resolve().name, shots, reading, points=model.points)

@@ -1,6 +1,7 @@
 """COLMAP's camera models (https://colmap.github.io/cameras.html)."""
 
 from nerf_lightning.cameras import Distortion
+from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.optics import Optics, field_of_view_lens
 from nerf_lightning.errors import InputError
 
@@ -26,8 +27,11 @@ def optics_of(where: object, key: str, name: str, width: int, height: int, p: tu
     )
     fx, fy, cx, cy, *more = (p[0], *p) if one_focal else p
     fisheye = "FISHEYE" in name
+    for focal, side, place in ((fx, width, cx), (fy, height, cy)):
+        checks.focal_length(where, key, focal, side)
+        checks.sensor(where, key, place)
     if name == "FOV":
-        found = field_of_view_lens(width, height, fx, fy, cx, cy, more[0]) if fx > 0 and fy > 0 else None
+        found = field_of_view_lens(width, height, fx, fy, cx, cy, more[0])
         if found is None:
             raise InputError(where, key, f"FOV with {p}", "a field of view that the photo fits into")
         return found
@@ -45,7 +49,5 @@ def optics_of(where: object, key: str, name: str, width: int, height: int, p: tu
     optics = Optics(width, height, fx, fy, cx, cy, distortion, fisheye)
     if not optics.sees_every_pixel():
         found_text = f"{name} with {', '.join(f'{value:g}' for value in p)}"
-        raise InputError(
-            where, key, found_text, "positive focal lengths, and a distortion that does not fold the photo"
-        )
+        raise InputError(where, key, found_text, "a distortion that does not fold the photo")
     return optics

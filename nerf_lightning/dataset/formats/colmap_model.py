@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.colmap_cameras import MODELS, NUMBERS, optics_of
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.errors import InputError
@@ -106,7 +107,7 @@ def read_model(folder: Path) -> Model:
     cameras = readers[0](paths[0])
     images = readers[1](paths[1])
     points = readers[2](paths[2]) if paths[2].is_file() else np.zeros((0, 3))
-    return Model(cameras, images, points[np.isfinite(points).all(1)])
+    return Model(cameras, images, points[(np.abs(points) <= checks.FARTHEST).all(1)])
 
 
 def _pose(path: Path, name: str, numbers: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:

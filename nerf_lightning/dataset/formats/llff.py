@@ -62,10 +62,15 @@ def _rows(path: Path) -> tuple[Float[np.ndarray, "V 4 4"], Float[np.ndarray, "V 
     c2w[:, :3, 2], c2w[:, :3, 3] = -poses[:, :, 2], poses[:, :, 3]
     c2w[:, 3, 3] = 1
     sizes = poses[:, :, 4]
-    if not len(poses) or not (np.isfinite(sizes).all() and (sizes > 0).all()):
-        raise InputError(path, "", "no photo, or a height, width or focal length that is none", "positive numbers")
+    for i, (height, width, focal) in enumerate(sizes.tolist()):
+        for what, side in (("height", height), ("width", width)):
+            if not 0 < side <= checks.PIXELS:
+                raise InputError(path, f"row {i}", f"a {what} of {side:g}", "the pixels of a photo")
+        checks.focal_length(path, f"row {i}", focal, max(width, height))
+    if not len(poses):
+        raise InputError(path, "", "no photo", "a row for each")
     nearest = float(rows[:, 15].min())
-    return checks.rigid_poses(path, "row {}", c2w), sizes, nearest if 0 < nearest < np.inf else None
+    return checks.rigid_poses(path, "row {}", c2w), sizes, nearest if 0 < nearest <= checks.FARTHEST else None
 
 
 def _photos(folder: Path, count: int) -> list[Path]:

@@ -1,7 +1,6 @@
 """The nerfstudio / instant-ngp format: photos and one transforms.json with poses, intrinsics and lens distortion."""
 
 import logging
-import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -174,12 +173,10 @@ def _optics(file: Path, content: dict, frame: Frame, width: int, height: int) ->
 
     def focal(key: str, angle_key: str, size: int) -> float | None:
         if (value := number(key)) is not None:
-            return checks.positive(file, key_of(key), value)
+            return checks.focal_length(file, key_of(key), checks.positive(file, key_of(key), value), size)
         if (angle := number(angle_key)) is None:
             return None
-        if not 0 < angle < math.pi:
-            raise InputError(file, key_of(angle_key), f"{angle:g}", "radians between 0 and pi")
-        return 0.5 * size / (0.5 * angle if fisheye else math.tan(0.5 * angle))
+        return checks.field_of_view(file, key_of(angle_key), angle, size, fisheye)
 
     fx = focal("fl_x", "camera_angle_x", width)
     if fx is None:
@@ -189,8 +186,9 @@ def _optics(file: Path, content: dict, frame: Frame, width: int, height: int) ->
     # `number` gives None only where the default is None.
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2")
     distortion = Distortion(**{key: number(key, 0.0) for key in names})  # type: ignore[arg-type]
-    centre = number("cx", width / 2), number("cy", height / 2)
-    optics = Optics(width, height, fx, fy, *centre, distortion, fisheye)  # type: ignore[arg-type]
+    middle = {"cx": width / 2, "cy": height / 2}
+    cx, cy = (checks.sensor(file, key_of(key), number(key, half)) for key, half in middle.items())  # type: ignore[arg-type]
+    optics = Optics(width, height, fx, fy, cx, cy, distortion, fisheye)
     if not optics.sees_every_pixel():
         expected = "that of a real lens"
         raise InputError(file, ", ".join(map(key_of, names)), "a distortion that folds the photo over", expected)

@@ -44,14 +44,16 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
     images = {key: checks.uint8_images(path, key, data[key]) for key in ("images_train", "images_val")}
     height, width = images["images_train"].shape[1:3]
     if "K" in data:
-        K = checks.intrinsics(path, "K", data["K"])
+        K = checks.intrinsics(path, "K", data["K"], width, height)
     else:
         checks.require_keys(path, data, ["focal"])
         focal = checks.positive(path, "focal", data["focal"])
+        checks.focal_length(path, "focal", focal, max(width, height))
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
     def cameras(key: str) -> Cameras:
-        c2w = torch.from_numpy(checks.rigid_poses(path, key + "[{}]", data[key])).float()
+        poses = checks.told_apart(path, checks.rigid_poses(path, key + "[{}]", data[key]), K[:1, 0])
+        c2w = torch.from_numpy(poses).float()
         return Cameras.of_size(torch.from_numpy(K).float().repeat(len(c2w), 1, 1), c2w, width, height)
 
     def views(split: str) -> Views:
@@ -64,8 +66,7 @@ def load_npz(path: Path, name: str | None = None) -> Scene:
 
     background = border_colour(train) or (0.0, 0.0, 0.0)
     if "background" in data:
-        red, green, blue = checks.numeric(path, "background", data["background"], "3").tolist()
-        background = (red, green, blue)
+        background = checks.colour(path, "background", data["background"])
     to_source = torch.eye(4)
     if "to_source" in data:
         to_source = torch.from_numpy(checks.similarity(path, "to_source", data["to_source"])).float()

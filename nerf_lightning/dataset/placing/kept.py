@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.utils.files import atomic_folder, cache_folder, write_json
 from nerf_lightning.utils.untrusted import read_json
 
@@ -59,9 +59,9 @@ def keep(beside: Path, sources: dict[str, Any], fill: Callable[[Path], None]) ->
     """
     try:
         return _filled(beside, sources, fill)
-    except OSError as error:
+    except (OSError, NoRoom) as error:
         cached = _cached(beside)
-        log.warning("%s cannot be written (%s): %s is, instead", beside, error.strerror, cached)
+        log.warning("%s cannot be written (%s): %s is, instead", beside, error, cached)
     try:
         return _filled(cached, sources, fill)
     except OSError as error:
