@@ -17,6 +17,7 @@ if not hasattr(os, "fork"):
 
 from benchmarks.hostile import damage, trees
 from benchmarks.hostile.kinds import KINDS, Case
+from benchmarks.hostile.verdict import BAD
 
 ROOT = Path(__file__).resolve().parents[1]
 CASES = (60, pytest.param(400, marks=pytest.mark.long))
@@ -81,6 +82,11 @@ def report(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     found = json.loads((folder / "found" / "benchmarks.json").read_text())
     assert found["hostile"][-1]["tried"] == request.param
     return found
+
+
+@pytest.mark.parametrize("outcome", BAD)
+def test_hostile_inputs_end_in_a_line(outcome: str, report: dict[str, list[dict[str, Any]]]):
+    assert [row for row in report["hostile causes"] if row["outcome"] == outcome] == []
 
 
 def test_all_cases_are_in_the_table(report: dict[str, list[dict[str, Any]]]):
