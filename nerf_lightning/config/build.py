@@ -30,6 +30,9 @@ from nerf_lightning.utils.options import check_options
 KNOWN = ("cpu", "cuda", "mps")
 """Devices that Lightning knows; for any other it would silently take the CPU."""
 
+MOST_DEVICES = 1024
+"""Lightning lists all, and starts a process for each: no machine has as many."""
+
 
 def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
     """Builds what the node at `path` describes, passing `extra`; errors name the config's keys.
@@ -210,6 +213,11 @@ def build_trainer(cfg: DictConfig, folder: Path, device: torch.device, results: 
     callbacks = [make(cfg, f"callbacks.{name}") for name in chosen]
     # The budget comes first, as the others read its clock; results before the orbit, as figures should not wait for a GIF.
     callbacks = [build_budget(cfg), *([results] if results else []), *callbacks]
+    devices = str(OmegaConf.select(cfg, "trainer.devices"))
+    if devices.isdecimal() and int(devices) > MOST_DEVICES:
+        raise InputError(
+            "config", "trainer.devices", devices[:60], f"at most {MOST_DEVICES}, the processes of one machine"
+        )
     where: dict[str, Any] = {"accelerator": device.type}
     if device.type not in KNOWN:
         where["strategy"] = SingleDeviceStrategy(device)

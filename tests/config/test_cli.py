@@ -49,6 +49,7 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
         (["budget.seconds=-3"], ["budget.seconds", "-3", "more than 0"]),
         (["optimizer.lr=-1"], ["optimizer", "-1", "torch.optim.Adam"]),
         (["trainer.precision=foo"], ["trainer", "foo"]),
+        (["trainer.devices=1000000000"], ["trainer.devices", "at most 1024"]),
         (["threads=0"], ["threads", "found 0", "at least 1"]),
         (["seed=x"], ["seed", "'x'", "a whole number"]),
         (["dataset=photos"], ["dataset.path", "nothing", "give dataset.path="]),
