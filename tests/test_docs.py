@@ -43,7 +43,7 @@ SMALLER: list[tuple[str, str]] = [
     ("experiment=picture", PICTURE),
     (
         "model=ball",
-        "dataset.size=16 dataset.train_views=4 dataset.val_views=1 budget.steps=2 callbacks.orbit.frames=2 seed=0",
+        "dataset.size=16 dataset.train_views=4 dataset.val_views=1 budget.steps=2 callbacks.orbit.frames=2",
     ),
     ("nerf_lightning.stability", "methods=[tensorf] seeds=1 steps=2 workers=1"),
     ("capture calibration", f"tags.size={SIZE} resize=60"),

@@ -203,9 +203,9 @@ def test_a_known_sheet(tmp_path: Path):
         ("tags: {0: {x: 0, y: 0, z: 1}}", "tags.0: found"),
         ("tags: {0: {x: 0, y: .inf}}", "tags.0: found"),
         ("tags: {0: {x: 0, y: 1.0e+39}}", "tags.0: found"),
-        ("tags: {0: {x: 0, y: 1" + 400 * "0" + "}}", "tags.0: found"),
+        ("tags: {0: {x: 0, y: 1" + 400 * "0" + "}}", "sheet.yaml: found no YAML"),
         (f"tags: {{{2**64}: {{x: 0, y: 0}}}}", f"tags.{2**64}: found {2**64}, expected a whole number below 2320"),
-        ("tags: [", "no readable YAML"),
+        ("tags: [", "sheet.yaml: found no YAML"),
     ],
 )
 def test_a_malformed_sheet_is_refused(tmp_path: Path, text: str, words: str):
@@ -213,7 +213,7 @@ def test_a_malformed_sheet_is_refused(tmp_path: Path, text: str, words: str):
     file.write_text(text)
     with pytest.raises(InputError, match=words):
         read_layout(file, "DICT_4X4_50", SIZE)
-    with pytest.raises(InputError, match="no readable YAML"):
+    with pytest.raises(InputError, match="none.yaml: found nothing there"):
         read_layout(tmp_path / "none.yaml", "DICT_4X4_50", SIZE)
 
 

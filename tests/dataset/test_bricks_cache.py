@@ -58,7 +58,7 @@ def test_failed_write_leaves_nothing(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(module.np, "savez_compressed", full)
-    with pytest.warns(UserWarning, match="No space left"):
+    with pytest.warns(UserWarning, match="no space left"):
         bricks(**TINY, cache=str(tmp_path))
     assert list(tmp_path.iterdir()) == []
 

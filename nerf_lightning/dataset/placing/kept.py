@@ -61,7 +61,8 @@ def keep(beside: Path, sources: dict[str, Any], fill: Callable[[Path], None]) ->
         return _filled(beside, sources, fill)
     except (OSError, NoRoom) as error:
         cached = _cached(beside)
-        log.warning("%s cannot be written (%s): %s is, instead", beside, error, cached)
+        reason = error.strerror if isinstance(error, OSError) else error
+        log.warning("%s cannot be written (%s): %s is, instead", beside, reason, cached)
     try:
         return _filled(cached, sources, fill)
     except OSError as error:
