@@ -26,6 +26,8 @@ from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leav
 from nerf_lightning.utils.files import full_disk, no_room, output_path, remove_empty, user_path
 from nerf_lightning.utils.waiting import wait_briefly
 
+BAD_INPUT = InputError | HydraException | OmegaConfBaseException
+"""What a user can mend. Hydra and OmegaConf also notice it late, as a reference to a key that is not there."""
 FOLDERS = ("hydra.run.dir", "hydra.sweep.dir")
 """Keys whose values are folders that Hydra makes."""
 TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
@@ -117,15 +119,15 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     def job(cfg: DictConfig) -> object:
         nonlocal started
         started = True
-        rename_given(cfg)
         try:
+            rename_given(cfg)
             check_keys(cfg, config, HydraConfig.get().runtime.choices)
             return task(cfg)
         except (Exception, Interrupted) as error:
             told, alone = as_told(error), HydraConfig.get().mode != RunMode.MULTIRUN
-            if alone and isinstance(told, InputError | Interrupted):
+            if alone and isinstance(told, BAD_INPUT | Interrupted):
                 remove_empty(Path(HydraConfig.get().runtime.output_dir))
-            if isinstance(told, NoRoom) or (alone and isinstance(told, InputError)):
+            if isinstance(told, NoRoom) or (alone and isinstance(told, BAD_INPUT)):
                 give_up(told)  # here, as Hydra would add a line
             raise  # a sweep decides what becomes of its other jobs
 
@@ -139,7 +141,7 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     except Exception as error:
         # Before the task starts only Hydra is at work, on the command line: any error then is bad input.
         told = as_told(error)
-        if started and not isinstance(told, InputError | HydraException | OmegaConfBaseException):
+        if started and not isinstance(told, BAD_INPUT):
             raise
         give_up(told)
     except BaseException as error:  # whatever a signal has become on its way
