@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import pytest
 
@@ -62,38 +61,22 @@ def process(*arguments: str, cwd: Path) -> str:
     return done.stdout
 
 
-@pytest.fixture(scope="module")
-def judged(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+def test_what_a_command_does_is_what_the_table_says(tmp_path: Path):
     """By behaviour: what the judge says of it where the input was damaged, and where it was not."""
-    return json.loads(process("misbehaving", *OUTCOMES, cwd=tmp_path_factory.mktemp("judged")))
+    judged = json.loads(process("misbehaving", *OUTCOMES, cwd=tmp_path))
+    assert judged == {how: [found, "good refused" if how == "refuses" else found] for how, found in OUTCOMES.items()}
 
 
-@pytest.mark.parametrize("how", OUTCOMES)
-def test_what_a_command_does_is_what_the_table_says(how: str, judged: dict[str, list[str]]):
-    good = "good refused" if how == "refuses" else OUTCOMES[how]
-    assert judged[how] == [OUTCOMES[how], good]
-
-
-@pytest.fixture(scope="module", params=CASES)
-def report(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str, Any]]]:
-    """The tables of some cases, whose number is their seed too: the longer run repeats none of the shorter."""
-    folder, cases = tmp_path_factory.mktemp("hostile"), str(request.param)
-    process("benchmarks", "hostile", "--seeds", cases, "--cases", cases, "--output", "found", cwd=folder)
-    found = json.loads((folder / "found" / "benchmarks.json").read_text())
-    assert found["hostile"][-1]["tried"] == request.param
-    return found
-
-
-@pytest.mark.parametrize("outcome", BAD)
-def test_hostile_inputs_end_in_a_line(outcome: str, report: dict[str, list[dict[str, Any]]]):
-    assert [row for row in report["hostile causes"] if row["outcome"] == outcome] == []
-
-
-def test_all_cases_are_in_the_table(report: dict[str, list[dict[str, Any]]]):
-    *rows, whole = report["hostile"]
-    assert whole["tried"] == sum(row["tried"] for row in rows)
+@pytest.mark.parametrize("cases", CASES)
+def test_hostile_inputs_end_in_a_line(cases: int, tmp_path: Path):
+    """The number of cases is their seed too: the longer run repeats none of the shorter."""
+    process("benchmarks", "hostile", "--seeds", str(cases), "--cases", str(cases), "--output", "found", cwd=tmp_path)
+    found = json.loads((tmp_path / "found" / "benchmarks.json").read_text())
+    assert [row for row in found["hostile causes"] if row["outcome"] in BAD] == []
+    *rows, whole = found["hostile"]
+    assert whole["tried"] == sum(row["tried"] for row in rows) == cases
     assert whole["answered"] > whole["accepted"] > 0, "damage is noticed, and what does no harm is taken"
-    for row in report["hostile"]:
+    for row in found["hostile"]:
         assert sum(row[key] for key in row if key not in ("kind", "tried")) == row["tried"]
 
 

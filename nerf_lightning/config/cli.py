@@ -14,14 +14,13 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
 from nerf_lightning.config.keys import check_keys, without_nulls
 from nerf_lightning.config.renames import rename_given, renamed_overrides
-from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.errors import InputError
 from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leave, listen
 from nerf_lightning.utils.files import full_disk, no_room, output_path, remove_empty, user_path
 from nerf_lightning.utils.waiting import wait_briefly
@@ -124,12 +123,12 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
             check_keys(cfg, config, HydraConfig.get().runtime.choices)
             return task(cfg)
         except (Exception, Interrupted) as error:
-            told, alone = as_told(error), HydraConfig.get().mode != RunMode.MULTIRUN
-            if alone and isinstance(told, BAD_INPUT | Interrupted):
+            told = as_told(error)
+            if isinstance(told, BAD_INPUT | Interrupted):
                 remove_empty(Path(HydraConfig.get().runtime.output_dir))
-            if isinstance(told, NoRoom) or (alone and isinstance(told, BAD_INPUT)):
+            if isinstance(told, BAD_INPUT):
                 give_up(told)  # here, as Hydra would add a line
-            raise  # a sweep decides what becomes of its other jobs
+            raise
 
     threading.excepthook = _untold
     listen()

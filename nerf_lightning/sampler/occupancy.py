@@ -90,6 +90,7 @@ class OccupancySampler(Sampler):
         if not 0 <= alpha_thre < 1:
             raise InputError("sampler.alpha_thre", "", str(alpha_thre), "at least 0, below 1")
         self.stated = samples, resolution
+        self.diagonal = 2 * float(self.bounds.half_size.norm())  # a number: reading it from a device would wait
         self.set_resolution(resolution or RESOLUTION)
         self.threshold = threshold
         self.decay = decay
@@ -137,7 +138,7 @@ class OccupancySampler(Sampler):
 
     def length(self, samples: int) -> float:
         """Of one of so many steps, inside the box, in world units."""
-        return 2 * float(self.bounds.half_size.norm()) / samples
+        return self.diagonal / samples
 
     @torch.no_grad()
     def refine(self, finer: float) -> None:

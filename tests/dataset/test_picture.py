@@ -104,7 +104,7 @@ def test_truncated_jpeg_with_a_whole_thumbnail(red_then_blue: np.ndarray, tmp_pa
     path.write_bytes(data[:2] + thumbnail + data[2:])
     assert load_picture(path).shape == (32, 64, 3)
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(InputError, match="found a truncated image"):
+    with pytest.raises(InputError, match="found an image that was cut short"):
         load_picture(path)
 
 
@@ -113,7 +113,7 @@ DAMAGE = {
     "folder": (lambda path: (path.unlink(), path.mkdir()), "found a folder"),
     "empty": (lambda path: path.write_bytes(b""), "found 0 bytes that are no image"),
     "text": (lambda path: path.write_text("hello"), "found 5 bytes that are no image"),
-    "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-30]), "found a truncated image"),
+    "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-30]), "found an image that was cut short"),
 }
 
 
@@ -157,3 +157,13 @@ def test_real_pictures(real_data: Path):
         "peppers.tiff": (512, 512, 3),
         "kodim23_gray.png": (512, 768, 3),
     }
+
+
+def test_a_png_that_was_changed_on_its_way_is_refused(tmp_path: Path):
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8))
+    whole = path.read_bytes()
+    for at in range(8, len(whole)):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
+        with pytest.raises(InputError, match="cut short or changed"):
+            load_picture(path)

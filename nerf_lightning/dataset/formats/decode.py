@@ -4,6 +4,7 @@ OpenCV rather than Pillow, which cuts 16-bit colour to its high byte and cannot 
 """
 
 import warnings
+import zlib
 from pathlib import Path
 
 import cv2
@@ -46,7 +47,9 @@ def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]
     try:
         data = path.read_bytes()
         if _cut_short(data):
-            raise InputError(path, "", "a truncated image", "a whole PNG, JPEG or TIFF", "copy it again")
+            raise InputError(
+                path, "", "an image that was cut short or changed", "a whole PNG, JPEG or TIFF", "copy it again"
+            )
         # UNCHANGED keeps alpha and 16 bits, and leaves the EXIF rotation alone.
         raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
         if raw is not None and upright and (raw.ndim == 2 or raw.shape[2] < 4):
@@ -113,9 +116,9 @@ def _heic(path: Path, data: bytes) -> UInt8[np.ndarray, "H W C"]:
 
 
 def _cut_short(data: bytes) -> bool:
-    """Whether the end marker is missing: some OpenCV versions fill the rest of a PNG or JPEG with grey and only warn."""
+    """Whether the end is missing, or part of a PNG has changed: some OpenCV versions fill the rest with grey and only warn."""
     if data.startswith(b"\x89PNG"):
-        return b"IEND" not in data
+        return not _whole_png(data)
     if not data.startswith(b"\xff\xd8"):
         return False
     # Skip the segments before the scan: a thumbnail in the EXIF segment has an end marker of its own.
@@ -123,3 +126,15 @@ def _cut_short(data: bytes) -> bool:
     while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return data.find(b"\xff\xd9", at) < 0
+
+
+def _whole_png(data: bytes) -> bool:
+    """Whether all chunks that a picture needs, whose names begin with a capital, have their checksum, up to the last."""
+    at, name = 8, b""
+    while at + 12 <= len(data) and name != b"IEND":
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        name = data[at + 4 : at + 8]
+        if name[:1].isupper() and zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return False
+        at = end + 4
+    return name == b"IEND"
