@@ -26,8 +26,8 @@ VERBS = ("config", "render", "evaluate", "export", "inspect", "chart", "gallery"
 NUMBERED = "{:03d}.png"
 
 TRAIN = (
-    *("budget.steps=1", "kernels=reference", "device=cpu", "callbacks.orbit.frames=0", "callbacks.snapshots.steps=[]"),
-    "callbacks.heldout.views=1",
+    *("budget.steps=1", "budget.default.steps=1", "budget.default.seconds=null", "kernels=reference", "device=cpu"),
+    *("callbacks.orbit.frames=0", "callbacks.snapshots.steps=[]", "callbacks.heldout.views=1"),
 )
 """A training of a step, with the kernels that need no compiling, and nothing drawn."""
 ON_RAYS = (*TRAIN, "dataset=photos", "dataset.rays=16", "dataset.samples=64")
@@ -39,7 +39,8 @@ FIELDS = (
 )
 """Fields of a few numbers, and samplers of a few samples."""
 PICTURE = (
-    *("budget.steps=1", "kernels=reference", "device=cpu", "+experiment=smoke_2d", "callbacks.snapshots.steps=[]"),
+    *("budget.steps=1", "budget.default.steps=1", "budget.default.seconds=null", "kernels=reference", "device=cpu"),
+    *("+experiment=smoke_2d", "callbacks.snapshots.steps=[]"),
     *("callbacks.baselines=null", "callbacks.charts=null", "callbacks.training_gif=null", "callbacks.enlarge=null"),
 )
 """The same of a picture."""

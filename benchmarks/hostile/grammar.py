@@ -99,7 +99,7 @@ def spoilt(good: Command, rng: Random, options: Mapping[str, Mapping[str, str]])
     whole = tuple(
         one.encode("utf-8", "replace").decode().replace("\0", "") for one in arguments
     )  # none can be given more
-    return Command(good.module, whole), "; ".join(one[:60] for one in more)
+    return Command(good.module, whole), "; ".join(one[:60] or "''" for one in more)
 
 
 def document(rng: Random, depth: int = 0) -> Any:

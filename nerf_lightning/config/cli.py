@@ -39,11 +39,17 @@ def by_path(arguments: Sequence[str], folder: Path) -> list[str]:
     Args:
         arguments: of the command line.
         folder: where conf/ is.
+
+    Raises:
+        InputError: where such a file is no YAML, or breaks a limit.
     """
     found = []
     for argument in arguments:
         key, _, value = argument.partition("=")
         if key == "+experiment" and value.endswith(".yaml") and (path := user_path(value)).is_file():
+            from nerf_lightning.utils.untrusted import read_yaml
+
+            read_yaml(path, "an experiment in YAML")  # Hydra reads without limits
             argument = f"{key}={os.path.relpath(path.with_suffix(''), folder / 'experiment')}"
         found.append(argument)
     return found
@@ -75,7 +81,8 @@ def check_flags(arguments: Sequence[str]) -> None:
 
     parser = get_args_parser()
     parser.error = refused  # type: ignore[method-assign]
-    parser.parse_args(arguments)
+    if parser.parse_args(arguments).experimental_rerun:  # it unpickles a file, which may run anything
+        refused("--experimental-rerun")
 
 
 def quoted(arguments: Sequence[str], keys: Sequence[str]) -> list[str]:

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from nerf_lightning.config import cli
+from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import output_path, user_path
 from nerf_lightning.utils.options import check_options
 
@@ -23,12 +24,14 @@ def gallery(runs: str, output: str | None) -> None:
     """Draws the runs below the folder `runs` into the PNG `output`, or gallery.png in that folder.
 
     Raises:
-        InputError: no such folder, or no run in it.
+        InputError: no such folder, no run in it, or another name than a PNG's.
     """
     from nerf_lightning.gallery.figure import write_contact_figure
     from nerf_lightning.runs.index import find_runs
 
     root, file = user_path(runs), None if output is None else output_path(output)
+    if file is not None and file.suffix.lower() != ".png":
+        raise InputError("config", "output", repr(output), "a file that ends in .png")
     print(f"figure: {write_contact_figure(root, find_runs(root), file)}")
 
 

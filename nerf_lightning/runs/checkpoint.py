@@ -1,6 +1,7 @@
 """Checkpoints as they are read back: tensors and plain values, whole to the last bit, and never code."""
 
 import pickle
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -46,7 +47,9 @@ def read_checkpoint(path: Path, needed: Mapping[str, type] = RENDERED) -> dict[s
             changed = packed[0] if packed else archive.testzip()  # what is packed may have any size
         if changed is not None:
             raise InputError(path, changed, "other bytes than were written", EXPECTED, todo)
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of kinds of files that are refused in a line
+            state = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(state, dict):
             raise InputError(path, "", f"a {type(state).__name__}", EXPECTED)
         for key, kind in needed.items():

@@ -62,6 +62,8 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
         (["renderer.background=pink"], ["renderer.background", "'pink'", "black, white"]),
         (["resume=nowhere"], ["nowhere/config.yaml", "nothing there"]),
         (["resume=notes.txt"], ["notes.txt: found a file, expected the folder of a run"]),
+        (["--experimental-rerun=notes.txt"], ["command line: found --experimental-rerun"]),
+        (["+experiment=aliases.yaml"], ["aliases.yaml", "more than"]),
         (["--nope"], ["command line: found unrecognized arguments: --nope"]),
         (["+foo=1"], ["config: foo", "unknown option"]),
         (["+buget.steps=1"], ["config: buget", "did you mean budget?"]),
@@ -88,13 +90,16 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
 def test_bad_input_gets_one_line_and_exit_code_2(arguments: list[str], words: list[str], inside, tmp_path: Path):
     (tmp_path / "notes.txt").write_text("nothing to see")
     (tmp_path / "broken.npz").write_text("not a zip")
+    many = [f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{n}'])}]" for n in range(9)]
+    (tmp_path / "aliases.yaml").write_text("\n".join(["a0: &a0 [1]", *many]))
+    before = {*tmp_path.iterdir()}
     small = [] if any("experiment" in a or a.startswith("dataset=") for a in arguments) else ["dataset.size=16"]
     code, _, err = inside(*small, *arguments)
     assert code == 2, err
     assert err.count("\n") == 1, err
     for word in [*words, "NERF_LIGHTNING_TRACEBACK=1"]:
         assert word in err
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / "broken.npz", tmp_path / "notes.txt"]
+    assert {path for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_photos_without_alpha_refuse_another_background(inside, tmp_path: Path):

@@ -8,6 +8,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from nerf_lightning.drawing.ink import pixels_of
+from nerf_lightning.errors import InputError
+from nerf_lightning.gallery.__main__ import gallery
 from nerf_lightning.gallery.figure import MOST, contact_figure, write_contact_figure
 from nerf_lightning.runs.index import Run, find_runs
 
@@ -89,3 +91,8 @@ def test_the_gallery_draws_what_lies_in_a_folder(tmp_path: Path):
     assert [run.status for run in found] == ["unreadable", "unreadable"]
     assert write_contact_figure(tmp_path / "runs", found) == tmp_path / "runs" / "gallery.png"
     assert imageio.imread(write_contact_figure(tmp_path / "runs", found, tmp_path / "mine.png")).std() > 1
+
+
+def test_the_figure_is_a_png(tmp_path: Path):
+    with pytest.raises(InputError, match=r"output: found .*, expected a file that ends in \.png"):
+        gallery(str(tmp_path), str(tmp_path / "figure.npz"))

@@ -126,6 +126,7 @@ def rigid_poses(where: object, label: str, poses: Shaped[np.ndarray, "V ..."]) -
     return poses
 
 
+@np.errstate(over="ignore")
 def rigid_pose(where: object, key: str, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """One camera-to-world matrix, likewise."""
     expected = "a finite camera-to-world matrix [R t; 0 0 0 1] with R a rotation"

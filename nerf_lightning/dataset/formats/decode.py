@@ -14,12 +14,18 @@ from PIL import Image, UnidentifiedImageError
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.extras import require
+from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.untrusted import existing_file
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 THREADS = 4
 ORIENTATION, QUARTER_TURNS = 0x0112, (5, 6, 7, 8)
 """EXIF's tag for how the camera was held, and its values for photos that lie on their side."""
+PNG = b"\x89PNG"
+PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
+"""Bits a channel that there are, by the kind of colour: grey, RGB, of a palette, grey and alpha, RGBA."""
+PNG_SIDE, MOST_PIXELS = 10**6, 2**30
+"""Most pixels along a side that libpng reads, and in all that OpenCV does, as far as they are not told otherwise."""
 HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 """Brands after `ftyp` in photos of phones (ISO 23008-12); the last two stand for any codec."""
 
@@ -117,7 +123,7 @@ def _heic(path: Path, data: bytes) -> UInt8[np.ndarray, "H W C"]:
 
 def _cut_short(data: bytes) -> bool:
     """Whether the end is missing, or part of a PNG has changed: some OpenCV versions fill the rest with grey and only warn."""
-    if data.startswith(b"\x89PNG"):
+    if data.startswith(PNG):
         return not _whole_png(data)
     if not data.startswith(b"\xff\xd8"):
         return False
@@ -129,12 +135,24 @@ def _cut_short(data: bytes) -> bool:
 
 
 def _whole_png(data: bytes) -> bool:
-    """Whether all chunks that a picture needs, whose names begin with a capital, have their checksum, up to the last."""
+    """Whether all chunks have their checksum, up to the last."""
     at, name = 8, b""
     while at + 12 <= len(data) and name != b"IEND":
         end = at + 8 + int.from_bytes(data[at : at + 4], "big")
         name = data[at + 4 : at + 8]
-        if name[:1].isupper() and zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             return False
         at = end + 4
     return name == b"IEND"
+
+
+def _check_png_header(path: Path, data: bytes) -> None:
+    """Refuses what libpng and OpenCV would, which tell the terminal."""
+    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+    depth, kind = data[24], data[25]
+    if depth not in PNG_DEPTHS.get(kind, ()) or not (0 < width <= PNG_SIDE and 0 < height <= PNG_SIDE):
+        found = f"a header of {width}x{height} pixels, {depth} bits a channel, kind {kind}"
+        raise InputError(path, "", found, "a PNG of a kind and a size that there is", "export it again")
+    if width * height > MOST_PIXELS:
+        raise InputError(path, "", f"{width}x{height} pixels", f"at most {MOST_PIXELS:,}", "take a smaller one")
+    check_memory(path, "", f"{width}x{height} pixels", 3 * width * height)
