@@ -72,6 +72,8 @@ class Budget(L.Callback):
         """Progress is a line over the share spent: (start, progress there, slope)."""
         self._before = 0.0  # spent up to the last pause or restart
         self._since: float | None = None
+        self.began = False
+        """Whether training has begun, or gone on."""
         self._device = CPU
         self._alone = alone
         self._worked = (0.0, 0.0)  # `work_clocks` when the step began
@@ -151,7 +153,7 @@ class Budget(L.Callback):
         return progress if self.limit_seconds is None else agreed(trainer, progress)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        self._device, pl_module.paused = pl_module.device, self.paused
+        self._device, pl_module.paused, self.began = pl_module.device, self.paused, True
         trainer.should_stop = (
             self.shared_progress(trainer) >= 1.0
         )  # a finished run that is resumed has nothing left to do

@@ -19,7 +19,7 @@ def options(
     within_db: Annotated[float, AtLeast(0)],
     seconds: Annotated[float, AtLeast(0)],
     smallest_within_db: Annotated[float, AtLeast(0)],
-    references: dict | None,
+    references: dict | None = None,
 ) -> None:
     """The keys of conf/chart.yaml, for checking."""
 
@@ -34,9 +34,9 @@ def task(cfg: "DictConfig") -> None:
 
     given = {str(key): cfg[key] for key in cfg if not OmegaConf.is_missing(cfg, key)}
     given |= {key: OmegaConf.to_container(value) for key, value in given.items() if OmegaConf.is_config(value)}
-    check_options("", options, given, complete=False)
     if "runs" not in given:
         raise InputError("config", "runs", "nothing", "folders with runs", "give runs=outputs/pareto")
+    check_options("", options, given)
     folders = (
         split_folders(given["runs"]) if isinstance(given["runs"], str) else [user_path(one) for one in given["runs"]]
     )

@@ -44,7 +44,9 @@ def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
     missing = sorted(OmegaConf.missing_keys(node))
     if missing:
         raise InputError("config", missing[0], "nothing", "a value", f"give {missing[0]}=...")
-    late = bool(node.get("_partial_"))
+    late = node.get("_partial_") or False
+    if not isinstance(late, bool):
+        raise InputError("config", f"{path}._partial_", repr(late), "true or false")
     options = {key: value for key, value in resolved(node).items() if key not in ("_target_", "_partial_")}
     check_options(path, target, options, extra, complete=not late)
     # Hydra only binds the options: it would turn dataclasses among `extra` into configs.

@@ -1,5 +1,6 @@
 """Ladders: the sizes a kind of field comes in, smallest first. Configuration, read from YAML."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,9 @@ def read_ladder(name: str, folder: Path) -> Ladder:
     path = user_path(name) if own else folder / f"{name}.yaml"
     plain = read_yaml(path, "a ladder in YAML")
     if not isinstance(plain, dict) or not _options(plain.get("rungs")) or len(plain["rungs"]) < 2:
-        raise InputError(path, "rungs", "something else", "a list of two or more mappings of model options")
+        raise InputError(
+            path, "rungs", "something else", "a list of two or more mappings of model options, each a plain value"
+        )
     samplers = plain.get("samplers", [])
     if not _options(samplers):
         raise InputError(path, "samplers", "something else", "a list of mappings of sampler options")
@@ -46,7 +49,11 @@ def read_ladder(name: str, folder: Path) -> Ladder:
 
 
 def _options(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(one, dict) for one in value)
+    return isinstance(value, list) and all(isinstance(one, dict) and all(map(_plain, one.values())) for one in value)
+
+
+def _plain(value: Any) -> bool:
+    return isinstance(value, int | str | None) or (isinstance(value, float) and math.isfinite(value))
 
 
 def overrides(group: str, options: Options) -> list[str]:

@@ -83,6 +83,7 @@ def _coded(name: str, array: np.ndarray, code: str) -> Arrays:
     return {name: codes, f"{name}:range": np.stack([low, high]).astype(np.float32)}
 
 
+@np.errstate(over="ignore")
 def _decoded(name: str, arrays: Arrays, code: str, shape: list[int]) -> Tensor:
     array = arrays[name]
     if code == "bits":

@@ -13,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from nerf_lightning.callbacks import Checkpoints, Results
+from nerf_lightning.callbacks import Budget, Checkpoints, Results
 from nerf_lightning.callbacks.attached import ChecksData, attached
 from nerf_lightning.callbacks.checkpoints import check_disk
 from nerf_lightning.config.build import (
@@ -80,6 +80,7 @@ def train(
         cfg, checkpoint = resume(cfg, folder)
     device = device_of(cfg)
     quiet()
+    check_options("", labels, {"name": cfg.name, "method": cfg.method, "recipe": cfg.get("recipe")})
     settings = {"seed": cfg.seed, "threads": cfg.threads, "kernels": cfg.kernels, "compile": cfg.compile}
     check_options("", prepare_process, settings)
     prepare_process(**settings)
@@ -119,7 +120,14 @@ def train(
         save_scene(data, folder)
     with trainer.precision_plugin.train_step_context():
         warm_up(system, data, trainer.strategy.root_device)
-    trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
+    try:
+        trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
+    except Exception as error:
+        if checkpoint is None or Budget.of(trainer).began or isinstance(error, InputError):
+            raise
+        # Nothing but the state has been at work yet.
+        found = f"{type(error).__name__}: {error}"
+        raise InputError(checkpoint, "", found, "a state of this run to go on from", "start the run anew") from error
     trainer.test(system, data, verbose=False)
     if trainer.is_global_zero:
         if isinstance(system, NeRF3D) and system.corrections is not None:
@@ -155,6 +163,10 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     if "device" in given:  # the trainer's was resolved when the run began
         OmegaConf.update(saved, "trainer.accelerator", cfg.trainer.accelerator)
     return saved, checkpoint
+
+
+def labels(name: str, method: str, recipe: str | None) -> None:
+    """What a run is called by, for checking."""
 
 
 def prepare_process(seed: Seed, threads: Threads | None, kernels: str, compile: bool = False) -> None:

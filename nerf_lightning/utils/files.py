@@ -26,7 +26,10 @@ def atomic(path: Path) -> Iterator[Path]:
 
     Raises:
         NoRoom: where there is none for the file; what stood at `path` stays.
+        InputError: where a folder stands there.
     """
+    if path.is_dir():
+        raise InputError(path, "", "a folder", "a file to write", "give another name")
     temporary = None
     try:
         with held():

@@ -84,3 +84,10 @@ def test_rungs_are_trained_in_steps_however_long_they_take(given: list[str], ste
     assert (part.budget.steps, part.budget.seconds, part.budget.patience) == (steps, None, None)
     assert set(part.callbacks) == {"guard"} and part.logger is None
     assert cfg == before
+
+
+def test_options_that_are_no_plain_values_are_refused(tmp_path: Path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("rungs: [{width: 8}, {width: 16}]\nsamplers: [{samples: -.inf}]")
+    with pytest.raises(InputError, match="mine.yaml: samplers: found something else"):
+        read_ladder(str(path), SHIPPED)

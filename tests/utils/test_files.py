@@ -110,3 +110,9 @@ def test_empty_folders_are_removed_up_to_the_current_one(tmp_path: Path, monkeyp
     (tmp_path / "a" / "d").touch()
     remove_empty(Path("a/b/c"))
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["d"]
+
+
+def test_a_folder_is_not_replaced_by_a_file(tmp_path: Path):
+    with pytest.raises(InputError, match="found a folder, expected a file to write"), atomic(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []

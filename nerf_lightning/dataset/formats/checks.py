@@ -167,9 +167,11 @@ def told_apart(
     Raises:
         InputError: where single precision could not tell what a pixel shows.
     """
+    if len(c2w) < 3:
+        return c2w
     poses, places = torch.from_numpy(c2w), c2w[:, :3, 3]
-    far = float(np.abs(places).max(initial=0.0))
-    if len(c2w) < 3 or np.ptp(places, axis=0).max() <= ROUNDING * far or not axes_meet(poses):
+    far = float(np.abs(places).max())
+    if np.ptp(places, axis=0).max() <= ROUNDING * far or not axes_meet(poses):
         return c2w  # a fly-through or a panorama: nothing says how far the subject is
     distance = float((poses[:, :3, 3] - focus_point(poses)).abs().amax(1).median())
     if not NEAREST <= distance <= FARTHEST:

@@ -110,6 +110,7 @@ def read_model(folder: Path) -> Model:
     return Model(cameras, images, points[(np.abs(points) <= checks.FARTHEST).all(1)])
 
 
+@np.errstate(over="ignore")
 def _pose(path: Path, name: str, numbers: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
     """World to camera from a quaternion (w, x, y, z) and a translation."""
     q = np.array(numbers[:4])

@@ -56,6 +56,8 @@ def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]
             raise InputError(
                 path, "", "an image that was cut short or changed", "a whole PNG, JPEG or TIFF", "copy it again"
             )
+        if data.startswith(PNG):
+            _check_png_header(path, data)
         # UNCHANGED keeps alpha and 16 bits, and leaves the EXIF rotation alone.
         raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
         if raw is not None and upright and (raw.ndim == 2 or raw.shape[2] < 4):
