@@ -64,6 +64,8 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
         (["resume=notes.txt"], ["notes.txt: found a file, expected the folder of a run"]),
         (["--experimental-rerun=notes.txt"], ["command line: found --experimental-rerun"]),
         (["+experiment=aliases.yaml"], ["aliases.yaml", "more than"]),
+        (["method=1e400"], ["method: found inf", "text"]),
+        (["schedule._partial_=3"], ["schedule._partial_", "true or false"]),
         (["--nope"], ["command line: found unrecognized arguments: --nope"]),
         (["+foo=1"], ["config: foo", "unknown option"]),
         (["+buget.steps=1"], ["config: buget", "did you mean budget?"]),
@@ -173,6 +175,12 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
     code, _, err = inside(f"resume={run}", "sampler.samples=9")
     assert code == 2
     assert "sampler.samples" in err
+    last = run / "checkpoints" / "last.ckpt"
+    state = torch.load(last, weights_only=True)
+    state["loops"]["fit_loop"]["epoch_progress"]["total"] = 1.0
+    torch.save(state, last)
+    code, _, err = inside(f"resume={run}", "budget.steps=12")
+    assert code == 2 and "last.ckpt: found TypeError" in err and err.count("\n") == 1
 
 
 def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path: Path):
