@@ -22,7 +22,7 @@ input was left as it is.
 MEMORY = re.compile(r"MemoryError|[Cc]an(no|')t allocate memory|bad_alloc|not enough memory")
 TIMERS = (signal.SIGALRM, signal.SIGPROF, signal.SIGXCPU)
 KEPT = ("rightsize", "stability")
-"""Verbs that keep what is done where they stop, as sweeps do."""
+"""Verbs that keep what is done where they stop, as sweeps and resumed runs do."""
 LINE = re.compile(r'File "[^"]*?((?:nerf_lightning|benchmarks)/[^"]+)", line (\d+)')
 CLEAN = "nerf_lightning.errors.InputError"
 
@@ -72,8 +72,8 @@ def _outcome(ended: Ended, command: Command, limits: Limits, folder: Path) -> tu
             -2
         ].startswith(CLEAN):
             return "traceback", f"a job of a sweep: {_place(text)}: {_short(text.splitlines()[-1])}"
-    sweep = any(one in ("-m", "--multirun") for one in command.arguments)
-    if left := leftovers(ended, ended.code == 0 or sweep or command.verb in KEPT):
+    own = any(one in ("-m", "--multirun") or one.startswith("resume=") for one in command.arguments)
+    if left := leftovers(ended, ended.code == 0 or own or command.verb in KEPT):
         return "half-written", f"exit {ended.code}, {command.verb}: {left}"
     if answered:
         return "answered", lines[0]

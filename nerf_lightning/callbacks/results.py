@@ -153,7 +153,7 @@ class Results(L.Callback):
             if len(self.views) < data_of(trainer).held_out_views:
                 self.views = []  # the mean of some views is another figure
             self.write(trainer, pl_module, "interrupted", f"at step {trainer.global_step}; resume= goes on")
-        else:
+        elif trainer.ckpt_path is None or Budget.of(trainer).began:  # else there was no state to go on from
             with suppress(NoRoom):  # on a full disk what happened first is to be told
                 self.write(trainer, pl_module, "failed", " ".join(f"{type(exception).__name__}: {exception}".split()))
 

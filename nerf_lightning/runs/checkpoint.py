@@ -56,6 +56,8 @@ def read_checkpoint(path: Path, needed: Mapping[str, type] = RENDERED) -> dict[s
             if not isinstance(state.get(key), kind):
                 raise InputError(path, key, f"a {type(state.get(key)).__name__}", f"a {kind.__name__}", todo)
         _check_weights(path, state["state_dict"])
+        if not _counts(state["loops"] if "loops" in needed else None):
+            raise InputError(path, "loops", "something else", "counts of steps", todo)
     except InputError:
         raise
     except DAMAGED as error:
@@ -68,6 +70,13 @@ def _check_weights(path: Path, weights: Mapping[str, Any]) -> None:
         # A view may show one number any amount of times: it asks for more memory than the file has bytes.
         if not isinstance(tensor, Tensor) or tensor.nbytes > tensor.untyped_storage().nbytes():
             raise InputError(path, f"state_dict.{name}", type(tensor).__name__, "a tensor with a number in each place")
+
+
+def _counts(value: Any) -> bool:
+    """Whether Lightning's progress is made of what it counts."""
+    if isinstance(value, dict | list):
+        return all(map(_counts, value.values() if isinstance(value, dict) else value))
+    return value is None or isinstance(value, str) or (isinstance(value, int) and value >= 0)
 
 
 def check_finite(module: torch.nn.Module, where: object) -> None:

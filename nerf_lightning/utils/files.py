@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.errors import InputError, NoRoom, Unwritable
 from nerf_lightning.utils.ending import held
 
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -27,12 +27,13 @@ def atomic(path: Path) -> Iterator[Path]:
     Raises:
         NoRoom: where there is none for the file; what stood at `path` stays.
         InputError: where a folder stands there.
+        Unwritable: where nothing can be written.
     """
     if path.is_dir():
         raise InputError(path, "", "a folder", "a file to write", "give another name")
     temporary = None
     try:
-        with held():
+        with held(), _writing_into(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
             os.close(handle)
@@ -61,7 +62,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """
     temporary = None
     try:
-        with held():
+        with held(), _writing_into(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
             temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
         yield temporary
@@ -77,6 +78,18 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         with held():
             if temporary is not None:
                 shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def _writing_into(folder: Path) -> Iterator[None]:
+    """Tells of a folder that cannot be made, or not be written."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in FULL:
+            raise
+        found = error.strerror or str(error)
+        raise Unwritable(folder, "", found, "a folder that can be written", "give another one") from error
 
 
 def full_disk(error: BaseException | None) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.errors import InputError, Unwritable
 from nerf_lightning.utils.files import atomic_folder, cache_folder, write_json
 from nerf_lightning.utils.untrusted import read_json
 
@@ -59,15 +59,16 @@ def keep(beside: Path, sources: dict[str, Any], fill: Callable[[Path], None]) ->
     """
     try:
         return _filled(beside, sources, fill)
-    except (OSError, NoRoom) as error:
+    except (OSError, Unwritable) as error:
         cached = _cached(beside)
-        reason = error.strerror if isinstance(error, OSError) else error
+        reason = error.found if isinstance(error, Unwritable) else error.strerror
         log.warning("%s cannot be written (%s): %s is, instead", beside, reason, cached)
     try:
         return _filled(cached, sources, fill)
-    except OSError as error:
+    except (OSError, Unwritable) as error:
+        found = error.found if isinstance(error, Unwritable) else str(error.strerror)
         todo = "set NERF_LIGHTNING_CACHE to one that can"
-        raise InputError(cached, "", str(error.strerror), "a folder that can be written", todo) from error
+        raise InputError(cached, "", found, "a folder that can be written", todo) from error
 
 
 def _filled(folder: Path, sources: dict[str, Any], fill: Callable[[Path], None]) -> Path:
