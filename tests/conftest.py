@@ -28,6 +28,8 @@ torch.set_flush_denormal(True)
 
 ROOT = Path(__file__).resolve().parents[1]
 UNCHECKED = "nerf_lightning.kernels.cpu"
+HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+"""As the process began."""
 
 
 def checked_modules() -> list[str]:
@@ -52,7 +54,6 @@ from torch.nn.functional import normalize
 from benchmarks.synthetic.photos import Flaws, Truth, write_capture
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import use_kernels
-from nerf_lightning.utils.ending import SIGNALS
 
 
 @pytest.fixture(scope="session")
@@ -90,10 +91,11 @@ def same_random_numbers() -> None:
 
 @pytest.fixture(autouse=True)
 def signals_as_they_were() -> Iterator[None]:
-    """Command lines take them for the rest of their process."""
-    handlers = {number: signal.getsignal(number) for number in SIGNALS}
+    """Command lines take them for the rest of their process, also those that fixtures of a whole module run."""
+    for number, handler in HANDLERS.items():
+        signal.signal(number, handler)
     yield
-    for number, handler in handlers.items():
+    for number, handler in HANDLERS.items():
         signal.signal(number, handler)
 
 

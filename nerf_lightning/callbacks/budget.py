@@ -210,8 +210,9 @@ class Budget(L.Callback):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._before = state_dict["seconds"]
-        self._line = tuple(state_dict["line"])
+        self._before = float(state_dict["seconds"])
+        start, reached, slope = map(float, state_dict["line"])
+        self._line = start, reached, slope
         self.stopped = state_dict["stopped"]
         if self.plateau is not None and state_dict["plateau"] is not None:
             self.plateau.load(state_dict["plateau"])
