@@ -19,7 +19,7 @@ class ChecksData(L.Callback):
         Raises:
             InputError: where they do not.
         """
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} must define check(data)")
 
 
 def attached(trainer: L.Trainer, kind: type[Kind]) -> Kind | None:

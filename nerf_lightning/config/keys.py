@@ -68,13 +68,13 @@ def check_keys(cfg: DictConfig, config: str, choices: Mapping[str, str | None]) 
             known = {**_content(file.stem, "experiment", ("hydra", "defaults")), **known}
     packages = {re.split("[/.]", name.rpartition("@")[2])[0] for name in choices}
     groups = dict.fromkeys(packages - {"hydra", "experiment"})
-    _check(OmegaConf.to_container(cfg), {**known, **groups}, "", str(OmegaConf.to_container(cfg)))
+    found = OmegaConf.to_container(cfg)
+    _check(found, {**known, **groups}, "", str(found))
 
 
 def _check(found: Any, known: Mapping[str, Any], where: str, text: str) -> None:
     for key, value in found.items():
-        used = re.search(rf"\$\{{[^}}]*\b{re.escape(str(key))}\b", text)  # by another value
-        if key not in known and not used:
+        if key not in known and not re.search(rf"\$\{{[^}}]*\b{re.escape(str(key))}\b", text):  # by another value
             near = difflib.get_close_matches(str(key), known, 1)
             names = f"one of {', '.join(sorted(known))}"
             raise InputError(

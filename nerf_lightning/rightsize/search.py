@@ -30,7 +30,7 @@ from nerf_lightning.rightsize.ladder import Ladder, Options
 from nerf_lightning.rightsize.start import begin
 from nerf_lightning.runs.folder import load_run, plain_config
 from nerf_lightning.runs.index import read_run
-from nerf_lightning.training.before import left_in
+from nerf_lightning.training.before import left_of
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.quiet import quiet
@@ -141,7 +141,7 @@ def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Any, 
     that was interrupted goes on."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
     whole = set_options(whole, "budget", {"alone": True})
-    done, checkpoint = left_in(folder, whole)
+    done, checkpoint = left_of(read_run(folder), whole)
     if done is None:
         train(whole, checkpoint, folder)
     results = read_run(folder).results

@@ -10,7 +10,7 @@ snapshots/ orbit.gif   pictures
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 import yaml
@@ -27,7 +27,7 @@ from nerf_lightning.runs.trusted import check_config
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.files import atomic
-from nerf_lightning.utils.options import AtLeast, check_options
+from nerf_lightning.utils.options import Seed, check_options
 from nerf_lightning.utils.untrusted import NONSENSE, existing_file, read_yaml
 
 GROUPS = ("dataset", "model", "optimizer", "schedule", "trainer")
@@ -64,7 +64,7 @@ def load_config(folder: Path) -> DictConfig:
     return OmegaConf.create(checked)
 
 
-def _top(seed: Annotated[int, AtLeast(0)], kernels: str) -> None:
+def _top(seed: Seed, kernels: str) -> None:
     """What opening a run needs of the top level of its configuration, for checking."""
 
 

@@ -18,20 +18,10 @@ LOCK = ".lock"
 RUN = ("config.yaml", "results.json", "checkpoints")
 """Any of these says that a folder holds a run."""
 MADE = (
-    *(*RUN, "scene.json", "error.txt", "hparams.yaml", "events.out.tfevents.*", "snapshots", "final.png", "orbit.gif"),
-    *("training.gif", "error.png", "spectrum.png", "curve.png", "baselines.json", "enlarged.*", "enlarged_*"),
-    *(
-        "compact.npz",
-        "field.html",
-        "mesh.ply",
-        "mesh.glb",
-        "points.ply",
-        "voxels.npz",
-        "posed",
-        "render_*",
-        "evaluation",
-    ),
-)
+    *RUN, "scene.json", "error.txt", "hparams.yaml", "events.out.tfevents.*", "snapshots", "final.png", "orbit.gif",
+    "training.gif", "error.png", "spectrum.png", "curve.png", "baselines.json", "enlarged.*", "enlarged_*",
+    "compact.npz", "field.html", "mesh.ply", "mesh.glb", "points.ply", "voxels.npz", "posed", "render_*", "evaluation",
+)  # fmt: skip
 """What runs leave, and what the verbs make from them, where no other names are given."""
 
 

@@ -67,14 +67,14 @@ def trained(cfg: "DictConfig", folder: Path) -> float | None:
     """The held-out PSNR of a job in a folder that this process owns, from now, from before, or from its last checkpoint on."""
     from nerf_lightning.runs.folder import plain_config
     from nerf_lightning.runs.owner import already, holds_run, leads, may_overwrite, remove
-    from nerf_lightning.training.before import left_in
+    from nerf_lightning.training.before import left_of
     from nerf_lightning.training.train import train
 
     before = read_run(folder)
     other = holds_run(folder) and before.config != plain_config(cfg)
     if other and before.status != "failed" and not may_overwrite(cfg):
         raise already(folder)
-    done, checkpoint = left_in(folder, cfg)
+    done, checkpoint = left_of(before, cfg)
     if leads():
         for name in (ERROR,) if done is not None else (ERROR, "results.json"):
             remove(folder / name)

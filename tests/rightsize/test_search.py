@@ -17,8 +17,9 @@ from nerf_lightning.rightsize.ladder import Ladder
 from nerf_lightning.rightsize.start import begin
 from nerf_lightning.runs.compact import load_compact
 from nerf_lightning.runs.folder import load_config
+from nerf_lightning.runs.index import read_run
 from nerf_lightning.stability.toys import PILE, toy
-from nerf_lightning.training.before import left_in
+from nerf_lightning.training.before import left_of
 
 RUNGS = [
     {"density_components": 3, "colour_components": 3, "coarsest": 4, "finest": 4, "width": 8, "stages": 1},
@@ -115,12 +116,12 @@ def test_a_search_goes_on_where_the_same_one_was_interrupted(given: list[str], t
 def test_what_was_trained_in_full_is_not_trained_again(small_run: Path, tmp_path: Path):
     folder = shutil.copytree(small_run, tmp_path / "run")
     cfg = load_config(folder)
-    done, checkpoint = left_in(folder, cfg)
+    done, checkpoint = left_of(read_run(folder), cfg)
     assert done is not None and checkpoint is None
     (folder / "results.json").write_text(json.dumps({**done.results, "status": "interrupted"}))
-    assert left_in(folder, cfg) == (None, folder / "checkpoints" / "last.ckpt")
+    assert left_of(read_run(folder), cfg) == (None, folder / "checkpoints" / "last.ckpt")
     cfg.seed += 1
-    assert left_in(folder, cfg) == (None, None), "another run"
+    assert left_of(read_run(folder), cfg) == (None, None), "another run"
 
 
 def test_a_picture_has_a_ladder_too(tmp_path: Path):

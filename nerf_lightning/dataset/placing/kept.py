@@ -61,14 +61,16 @@ def keep(beside: Path, sources: dict[str, Any], fill: Callable[[Path], None]) ->
         return _filled(beside, sources, fill)
     except (OSError, Unwritable) as error:
         cached = _cached(beside)
-        reason = error.found if isinstance(error, Unwritable) else error.strerror
-        log.warning("%s cannot be written (%s): %s is, instead", beside, reason, cached)
+        log.warning("%s cannot be written (%s): %s is, instead", beside, _reason(error), cached)
     try:
         return _filled(cached, sources, fill)
     except (OSError, Unwritable) as error:
-        found = error.found if isinstance(error, Unwritable) else str(error.strerror)
         todo = "set NERF_LIGHTNING_CACHE to one that can"
-        raise InputError(cached, "", found, "a folder that can be written", todo) from error
+        raise InputError(cached, "", _reason(error), "a folder that can be written", todo) from error
+
+
+def _reason(error: OSError | Unwritable) -> str:
+    return error.found if isinstance(error, Unwritable) else str(error.strerror)
 
 
 def _filled(folder: Path, sources: dict[str, Any], fill: Callable[[Path], None]) -> Path:
