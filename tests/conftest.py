@@ -54,6 +54,7 @@ from torch.nn.functional import normalize
 from benchmarks.synthetic.photos import Flaws, Truth, write_capture
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import use_kernels
+from nerf_lightning.utils.ending import listen
 
 
 @pytest.fixture(scope="session")
@@ -91,10 +92,12 @@ def same_random_numbers() -> None:
 
 @pytest.fixture(autouse=True)
 def signals_as_they_were() -> Iterator[None]:
-    """Command lines take them for the rest of their process, also those that fixtures of a whole module run."""
+    """Command lines take them for the rest of their process, also those that fixtures of a whole module run; one that came is
+    forgotten, as it would end the next training."""
     for number, handler in HANDLERS.items():
         signal.signal(number, handler)
     yield
+    listen()
     for number, handler in HANDLERS.items():
         signal.signal(number, handler)
 
