@@ -12,6 +12,9 @@ from nerf_lightning.system import System, ViewResult
 from nerf_lightning.utils.ending import leave_if_asked
 from nerf_lightning.utils.evenly import evenly
 
+LARGE = 1 << 21
+"""Pixels of a view beyond which SSIM, which takes some ten times as long as rendering, is left to the test."""
+
 
 class HeldOut(L.Callback):
     """Measures held-out PSNR and SSIM at fractions of the budget, with the training clock stopped.
@@ -61,9 +64,11 @@ class HeldOut(L.Callback):
         quality = fmean(result.psnr for result in results)
         self.view_seconds = fmean(result.seconds for result in results)
         self.curve.append([round(Budget.of(trainer).seconds, 3), trainer.global_step, round(quality, 4)])
-        structure = fmean(result.ssim for result in results)
         if trainer.logger is not None:
-            trainer.logger.log_metrics({"heldout/psnr": quality, "heldout/ssim": structure}, trainer.global_step)
+            figures = {"heldout/psnr": quality}
+            if all(result.truth[..., 0].numel() <= LARGE for result in results):
+                figures["heldout/ssim"] = fmean(result.ssim for result in results)
+            trainer.logger.log_metrics(figures, trainer.global_step)
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int

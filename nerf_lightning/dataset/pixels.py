@@ -89,7 +89,8 @@ def centres(height: int, width: int, index: Int[Tensor, "N"]) -> Float[Tensor, "
 
 def pixel_grid(height: int, width: int) -> Float[Tensor, "N 2"]:
     """The centres of all pixels, row by row."""
-    return centres(height, width, torch.arange(height * width))
+    x, y = ((torch.arange(side) + 0.5) / side for side in (width, height))
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).view(-1, 2)
 
 
 def pixels_at(image: UInt8[Tensor, "H W 3"], index: Int[Tensor, "N"]) -> PixelBatch:
@@ -141,5 +142,5 @@ class PixelDataModule(StepDataModule[Tensor]):
     def held_out(self, view: int) -> PictureBatch:
         """The whole picture."""
         height, width, _ = self.scene.image.shape
-        everything = pixels_at(self.scene.image, torch.arange(height * width))
-        return PictureBatch(everything.uv, everything.rgb, height, width)
+        rgb = self.scene.image.view(-1, 3).float().div_(255)  # in place: large pictures
+        return PictureBatch(pixel_grid(height, width), rgb, height, width)

@@ -18,10 +18,13 @@ from nerf_lightning.utils.files import atomic
 SMALLEST_SIDE = 160
 """Panels below this height are magnified (whole multiples, hard edges), so that the caption stays readable."""
 
+WIDEST = 2048
+"""Pixels across of a picture that stands beside others."""
+
 
 def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[ndarray, "*shape"]:
     """[0, 1] -> bytes, rounded, on the CPU."""
-    return (image.clamp(0, 1) * 255).round().byte().cpu().numpy()
+    return image.clamp(0, 1).mul_(255).round_().byte().cpu().numpy()
 
 
 def near_bright(depth: Float[ndarray, "H W"], low: float, high: float) -> UInt8[ndarray, "H W 3"]:
@@ -60,14 +63,15 @@ def stacked(panels: list[UInt8[ndarray, "H W 3"]]) -> UInt8[ndarray, "H2 W2 3"]:
 
 
 def result_panel(result: ViewResult, caption: str) -> UInt8[ndarray, "H2 W2 3"]:
-    """Truth, render, and depth (3D) or error times four (2D)."""
+    """Truth, render, and depth (3D) or error times four (2D), each at most `WIDEST` pixels across."""
     if result.depth is not None and result.opacity is not None:
         third = depth_colours(result.depth, result.opacity)
         names = "truth | render | depth"
     else:
         third = to_bytes(result.errors * 4)
         names = "truth | render | 4 x error"
-    return panel([to_bytes(result.truth), to_bytes(result.rgb), third], f"{names}    {caption}")
+    shown = [narrowed(one, WIDEST) for one in (to_bytes(result.truth), to_bytes(result.rgb), third)]
+    return panel(shown, f"{names}    {caption}")
 
 
 def narrowed(image: UInt8[ndarray, "H W 3"], width: int) -> UInt8[ndarray, "h w 3"]:

@@ -7,6 +7,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+AT_ONCE = 1 << 18
+"""Pixels compared at once: in doubles, a large picture would take gigabytes."""
+
 
 def mse_to_psnr(mse: float) -> float:
     """10 log10(1 / MSE), at most 120 dB."""
@@ -18,10 +21,13 @@ def psnr(
 ) -> float:
     """Peak signal-to-noise ratio in dB, 10 log10(1 / MSE), of pictures in [0, 1], over all pixels or the known ones; nan where
     none is known."""
-    first, second = (x.cpu().double() for x in (image, truth))  # not every device has doubles
-    squares = (first - second) ** 2
-    mse = float(torch.mean(squares if known is None else squares[known.cpu()]))
-    return mse if math.isnan(mse) else mse_to_psnr(mse)
+    first, second = (x.reshape(-1, x.shape[-1]).cpu().split(AT_ONCE) for x in (image, truth))
+    masks = [...] * len(first) if known is None else known.reshape(-1).cpu().split(AT_ONCE)
+    squares = count = 0.0
+    for a, b, mask in zip(first, second, masks, strict=True):
+        errors = (a[mask].double() - b[mask].double()) ** 2
+        squares, count = squares + float(errors.sum()), count + errors.numel()
+    return mse_to_psnr(squares / count) if count and not math.isnan(squares) else math.nan
 
 
 SSIM_WINDOW = 11

@@ -14,6 +14,8 @@ PIXELS = 2
 """Pixels rendered at once for each sample of `chunk`."""
 LOOKED = 1 << 16
 """About how many pixels ReLUs are tested at."""
+CORNERS = 1 << 20
+"""About how many corners between pixels are looked at."""
 SATURATED = 1 / 255
 """A sigmoid this close to 0 or 1 has less than a fiftieth of its largest slope."""
 
@@ -58,18 +60,24 @@ class NeRF2D(System):
     @torch.no_grad()
     def colours(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         """The field's colours at any places, a chunk at a time, clamped to [0, 1]."""
-        return torch.cat([self.field(part).clamp(0, 1) for part in uv.split(PIXELS * self.chunk)])
+        colours = uv.new_empty(len(uv), 3)
+        for some, places in zip(colours.split(PIXELS * self.chunk), uv.split(PIXELS * self.chunk), strict=True):
+            some.copy_(self.field(places).clamp(0, 1))
+        return colours
 
     def between(self, view: PictureBatch) -> float | None:
-        """PSNR at the corners where four pixels meet, against their mean: if far below that of the pixels, the field overfits.
+        """PSNR at corners where four pixels meet, against their mean: if far below that of the pixels, the field overfits.
 
         None for a picture of one row or one column.
         """
-        if min(view.height, view.width) < 2:
+        across, corners = view.width - 1, (view.width - 1) * (view.height - 1)
+        if not corners:
             return None
-        grid = torch.cat([view.uv, view.rgb], dim=1).view(view.height, view.width, 5)
-        met = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]).view(-1, 5) / 4
-        return psnr(self.colours(met[:, :2]), met[:, 2:])
+        corner = torch.arange(0, corners, 1 + corners // CORNERS, device=view.uv.device)
+        first = corner // across * view.width + corner % across
+        around = (0, 1, view.width, view.width + 1)
+        uv, rgb = (torch.stack([x[first + next] for next in around]).mean(0) for x in (view.uv, view.rgb))
+        return psnr(self.colours(uv), rgb)
 
     @torch.no_grad()
     def diagnose(self, view: PictureBatch) -> str:

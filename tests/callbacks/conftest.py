@@ -60,7 +60,7 @@ class Scripted(NeRF2D):
         self.asked.append(view)
         time.perf_counter.wait(50)  # slow, which must not count
         picture = torch.rand(12, 16, 3)
-        return ViewResult(picture, picture, float(next(self.psnrs)), 0.5, 50.0)
+        return ViewResult(picture, picture, float(next(self.psnrs)), 50.0)
 
 
 @pytest.fixture

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import pytest
 
 from nerf_lightning.callbacks import Budget, HeldOut
@@ -87,3 +89,14 @@ def test_the_end_is_left_to_the_test(clock, system, trainer_with):
 def test_what_cannot_be_measured_is_refused(at, views, key):
     with pytest.raises(InputError, match=f"callbacks.heldout.{key}"):
         HeldOut(at, views)
+
+
+def test_ssim_of_large_pictures_is_left_to_the_end(clock, system, trainer_with, monkeypatch):
+    logged = []
+    trainer = trainer_with(Budget(steps=10), HeldOut([0.2, 0.5]))
+    trainer.logger = SimpleNamespace(log_metrics=lambda figures, step: logged.append(sorted(figures)))
+    held_out = HeldOut([0.2, 0.5], views=1)
+    for system.progress, largest in ((0.3, 12 * 16), (0.6, 12 * 16 - 1)):
+        monkeypatch.setattr("nerf_lightning.callbacks.heldout.LARGE", largest)
+        held_out.on_train_batch_end(trainer, system, None, None, 0)
+    assert logged == [["heldout/psnr", "heldout/ssim"], ["heldout/psnr"]]

@@ -75,10 +75,18 @@ def test_depth_of_nothing_or_of_one_distance(opacity):
 def test_a_result_shows_truth_render_and_depth_or_error(with_depth):
     rgb, truth = torch.full((200, 100, 3), 0.5), torch.full((200, 100, 3), 0.4)
     maps = (torch.ones(200, 100), torch.ones(200, 100)) if with_depth else (None, None)
-    made = result_panel(ViewResult(rgb, truth, 20.0, 0.9, 1.0, *maps), "caption")
+    made = result_panel(ViewResult(rgb, truth, 20.0, 1.0, *maps), "caption")
     assert (made[100, 50] == 102).all() and (made[100, 150] == 128).all()
     third = depth_colours(*maps)[0, 0] if with_depth else 102  # four times 0.1
     assert (made[100, 250] == third).all()
+
+
+def test_large_pictures_are_shrunk_to_stand_beside_others(monkeypatch):
+    monkeypatch.setattr("nerf_lightning.drawing.panels.WIDEST", 50)
+    rgb = torch.zeros(400, 100, 3)
+    rgb[::2] = 1.0
+    made = result_panel(ViewResult(rgb, rgb, 20.0, 1.0), "caption")
+    assert made.shape[1] == 150 and (made[:200, :100] == 128).all()
 
 
 def test_a_picture_is_written_whole(tmp_path):

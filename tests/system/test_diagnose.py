@@ -129,6 +129,13 @@ def test_between_pixels_a_field_is_held_against_the_mean_of_the_four_around():
     assert system.between(view) == pytest.approx(expected, abs=0.3)
 
 
+def test_between_the_pixels_of_large_pictures_some_corners_stand_for_all(view, monkeypatch):
+    system = NeRF2D(Waves(1), ADAM, constant)
+    all_corners = system.between(view)
+    monkeypatch.setattr("nerf_lightning.system.nerf2d.CORNERS", 90)
+    assert system.between(view) == pytest.approx(all_corners, abs=1.0)
+
+
 def test_frequencies_that_pixels_do_not_show_run_wild_between_them():
     slow, view = waves_seen(1)
     fast, _ = waves_seen(21)  # at the pixels' middles the same, but for the sign

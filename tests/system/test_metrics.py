@@ -17,6 +17,17 @@ def test_psnr_averages_squares_before_the_logarithm():
     assert psnr(torch.tensor([0.1, 0.3]), torch.zeros(2)) == pytest.approx(-10 * math.log10(0.05), abs=1e-5)
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_psnr_of_a_large_picture_is_computed_in_parts(masked, monkeypatch):
+    image, truth = torch.rand(2, 9, 5, 3)
+    known = torch.rand(9, 5) > 0.4 if masked else None
+    squares = (image.double() - truth.double()) ** 2
+    expected = -10 * math.log10(float((squares if known is None else squares[known]).mean()))
+    monkeypatch.setattr("nerf_lightning.system.metrics.AT_ONCE", 7)
+    assert psnr(image, truth, known) == pytest.approx(expected, abs=1e-9)
+    assert math.isnan(psnr(image, truth, torch.zeros(9, 5, dtype=torch.bool)))
+
+
 def test_psnr_of_the_same_picture_is_finite():
     assert psnr(torch.rand(4, 3), torch.rand(4, 3)) < 30
     assert psnr(torch.ones(4, 3), torch.ones(4, 3)) == pytest.approx(120)

@@ -6,12 +6,11 @@ from typing import Any
 import cv2
 import lightning as L
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
 from nerf_lightning.callbacks.attached import attached, picture_of
 from nerf_lightning.callbacks.results import Results
-from nerf_lightning.system import System, psnr
+from nerf_lightning.system import System
 from nerf_lightning.utils.files import write_json
 
 Image = UInt8[np.ndarray, "H W 3"]
@@ -21,8 +20,7 @@ def quality_of(image: Image, truth: Image) -> float | None:
     """PSNR in dB; None if the two are equal, since JSON has no infinity."""
     if np.array_equal(image, truth):
         return None
-    first, second = (torch.from_numpy(np.ascontiguousarray(x)).double() / 255 for x in (image, truth))
-    return round(psnr(first, second), 4)
+    return round(cv2.PSNR(image, truth), 4)
 
 
 def jpeg(image: Image, quality: int, sampling: int) -> tuple[int, Image]:
@@ -55,12 +53,17 @@ def jpeg_as_good(image: Image, wanted: float) -> dict[str, Any] | None:
     """The smallest JPEG of at least `wanted` dB; None if even the best is worse."""
     found: list[dict[str, Any]] = []
     for sampling in SAMPLINGS:
-        for quality in range(1, 101):
-            size, decoded = jpeg(image, quality, sampling)
+        enough: dict[str, Any] | None = None
+        low, high = 1, 101  # the least quality that is good enough is in between; 101 stands for none
+        while low < high:
+            middle = (low + high) // 2
+            size, decoded = jpeg(image, middle, sampling)
             reached = quality_of(decoded, image)
             if reached is None or reached >= wanted:
-                found.append({"quality": quality, "bytes": size, "psnr": reached})
-                break
+                high, enough = middle, {"quality": middle, "bytes": size, "psnr": reached}
+            else:
+                low = middle + 1
+        found += [enough] if enough is not None else []
     return min(found, key=lambda one: one["bytes"], default=None)
 
 
