@@ -10,11 +10,12 @@ from typing import Any
 import hydra
 import lightning as L
 import torch
-from lightning.pytorch.loggers import Logger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
+from torch.utils.tensorboard import SummaryWriter
 
 from nerf_lightning.callbacks import Budget, Results
 from nerf_lightning.cameras import Bounds, Cameras
@@ -208,9 +209,18 @@ def build_budget(cfg: DictConfig) -> Budget:
     return Budget(**limits)
 
 
+def build_logger(cfg: DictConfig, folder: Path) -> Logger:
+    """Where curves go. TensorBoard's gives options that it does not know to its writer, which is made later."""
+    logger = make(cfg, "logger", save_dir=folder)
+    if isinstance(logger, TensorBoardLogger):
+        own = {"_target_", *inspect.signature(TensorBoardLogger).parameters}
+        check_options("logger", SummaryWriter, {k: v for k, v in resolved(cfg.logger).items() if k not in own})
+    return logger
+
+
 def build_trainer(cfg: DictConfig, folder: Path, device: torch.device, results: Results | None = None) -> L.Trainer:
     """The Trainer with its callbacks, on a device, writing into `folder`; with `results`, a results.json too."""
-    logger: Logger | bool = make(cfg, "logger", save_dir=folder) if cfg.get("logger") is not None else False
+    logger = build_logger(cfg, folder) if cfg.get("logger") is not None else False
     chosen = [name for name, node in (cfg.get("callbacks") or {}).items() if node is not None]
     callbacks = [make(cfg, f"callbacks.{name}") for name in chosen]
     # The budget comes first, as the others read its clock; results before the orbit, as figures should not wait for a GIF.
