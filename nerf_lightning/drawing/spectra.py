@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from scipy.fft import fft2
 
 from nerf_lightning.drawing.ink import BLUE, DPI, ORANGE, VERMILLION
 
@@ -12,14 +13,17 @@ BANDS = 64
 
 def brightness(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
     """Luma of sRGB (ITU-R BT.601), its mean taken away."""
-    grey = image @ np.array([0.299, 0.587, 0.114])
+    grey = image @ np.array([0.299, 0.587, 0.114], image.dtype)
     return grey - grey.mean()
 
 
 def amplitudes(grey: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     """Size of every frequency, zero in the middle. A Hann window keeps the picture's borders from looking like edges."""
-    window = np.hanning(grey.shape[0] + 2)[1:-1, None] * np.hanning(grey.shape[1] + 2)[1:-1]
-    return np.abs(np.fft.fftshift(np.fft.fft2(grey * window))) / np.sqrt((window**2).sum() * grey.size)
+    down, across = (np.hanning(side + 2)[1:-1].astype(grey.dtype) for side in grey.shape)
+    sizes = np.abs(
+        fft2(grey * down[:, None] * across)
+    )  # in the picture's precision: large ones take gigabytes in doubles
+    return np.fft.fftshift(sizes) / np.sqrt((down**2).sum() * (across**2).sum() * grey.size, dtype=grey.dtype)
 
 
 def by_frequency(
