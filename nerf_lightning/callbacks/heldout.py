@@ -17,7 +17,7 @@ LARGE = 1 << 21
 
 
 class HeldOut(L.Callback):
-    """Measures held-out PSNR and SSIM at fractions of the budget, with the training clock stopped.
+    """Measures held-out PSNR, and SSIM up to `LARGE` pixels, at fractions of the budget, with the training clock stopped.
 
     The last point of the curve, at the end of the budget, comes from the test over all views.
 
@@ -66,7 +66,7 @@ class HeldOut(L.Callback):
         self.curve.append([round(Budget.of(trainer).seconds, 3), trainer.global_step, round(quality, 4)])
         if trainer.logger is not None:
             figures = {"heldout/psnr": quality}
-            if all(result.truth[..., 0].numel() <= LARGE for result in results):
+            if all(result.truth.shape[:2].numel() <= LARGE for result in results):
                 figures["heldout/ssim"] = fmean(result.ssim for result in results)
             trainer.logger.log_metrics(figures, trainer.global_step)
 

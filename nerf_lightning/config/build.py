@@ -15,7 +15,6 @@ from lightning.pytorch.strategies import SingleDeviceStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
-from torch.utils.tensorboard import SummaryWriter
 
 from nerf_lightning.callbacks import Budget, Results
 from nerf_lightning.cameras import Bounds, Cameras
@@ -213,6 +212,8 @@ def build_logger(cfg: DictConfig, folder: Path) -> Logger:
     """Where curves go. TensorBoard's gives options that it does not know to its writer, which is made later."""
     logger = make(cfg, "logger", save_dir=folder)
     if isinstance(logger, TensorBoardLogger):
+        from torch.utils.tensorboard import SummaryWriter
+
         own = {"_target_", *inspect.signature(TensorBoardLogger).parameters}
         check_options("logger", SummaryWriter, {k: v for k, v in resolved(cfg.logger).items() if k not in own})
     return logger

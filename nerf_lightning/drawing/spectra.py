@@ -20,9 +20,8 @@ def brightness(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
 def amplitudes(grey: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     """Size of every frequency, zero in the middle. A Hann window keeps the picture's borders from looking like edges."""
     down, across = (np.hanning(side + 2)[1:-1].astype(grey.dtype) for side in grey.shape)
-    sizes = np.abs(
-        fft2(grey * down[:, None] * across)
-    )  # in the picture's precision: large ones take gigabytes in doubles
+    # In the picture's precision: in doubles, large ones take gigabytes.
+    sizes = np.abs(fft2(grey * down[:, None] * across))
     return np.fft.fftshift(sizes) / np.sqrt((down**2).sum() * (across**2).sum() * grey.size, dtype=grey.dtype)
 
 

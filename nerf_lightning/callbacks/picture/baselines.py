@@ -1,5 +1,7 @@
 """Baselines: what a JPEG or a smaller picture of the same bytes looks like, to judge a 2D field by."""
 
+import math
+from bisect import bisect_left, bisect_right
 from pathlib import Path
 from typing import Any
 
@@ -33,38 +35,39 @@ def jpeg(image: Image, quality: int, sampling: int) -> tuple[int, Image]:
 
 
 SAMPLINGS = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+QUALITIES = range(1, 101)
+"""A file grows with it, and so does what is kept: the one that is looked for is found by halving."""
+
+
+def described(image: Image, quality: int, sampling: int) -> dict[str, Any]:
+    """A JPEG's quality, size in bytes, and PSNR."""
+    size, decoded = jpeg(image, quality, sampling)
+    return {"quality": quality, "bytes": size, "psnr": quality_of(decoded, image)}
 
 
 def best_jpeg(image: Image, limit: int) -> dict[str, Any] | None:
     """The best JPEG of at most `limit` bytes, with or without colours at half resolution; None if none is that small."""
     found: list[dict[str, Any]] = []
     for sampling in SAMPLINGS:
-        low, high = 0, 100  # the largest quality that fits is in between; 0 stands for none
-        while low < high:
-            middle = (low + high + 1) // 2
-            low, high = (middle, high) if jpeg(image, middle, sampling)[0] <= limit else (low, middle - 1)
-        if low:
-            size, decoded = jpeg(image, low, sampling)
-            found.append({"quality": low, "bytes": size, "psnr": quality_of(decoded, image)})
-    return max(found, key=lambda one: float("inf") if one["psnr"] is None else one["psnr"], default=None)
+        fitting = bisect_right(QUALITIES, limit, key=lambda quality: jpeg(image, quality, sampling)[0])
+        if fitting:
+            found.append(described(image, QUALITIES[fitting - 1], sampling))
+    return max(found, key=decibels, default=None)
 
 
 def jpeg_as_good(image: Image, wanted: float) -> dict[str, Any] | None:
     """The smallest JPEG of at least `wanted` dB; None if even the best is worse."""
     found: list[dict[str, Any]] = []
     for sampling in SAMPLINGS:
-        enough: dict[str, Any] | None = None
-        low, high = 1, 101  # the least quality that is good enough is in between; 101 stands for none
-        while low < high:
-            middle = (low + high) // 2
-            size, decoded = jpeg(image, middle, sampling)
-            reached = quality_of(decoded, image)
-            if reached is None or reached >= wanted:
-                high, enough = middle, {"quality": middle, "bytes": size, "psnr": reached}
-            else:
-                low = middle + 1
-        found += [enough] if enough is not None else []
+        worse = bisect_left(QUALITIES, wanted, key=lambda quality: decibels(described(image, quality, sampling)))
+        if worse < len(QUALITIES):
+            found.append(described(image, QUALITIES[worse], sampling))
     return min(found, key=lambda one: one["bytes"], default=None)
+
+
+def decibels(one: dict[str, Any]) -> float:
+    """PSNR of a JPEG, infinite where nothing is lost."""
+    return math.inf if one["psnr"] is None else one["psnr"]
 
 
 def shrunk(image: Image, limit: int) -> dict[str, Any]:
