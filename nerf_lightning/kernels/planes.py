@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import fast
@@ -47,6 +48,26 @@ def footprint(unit: Float[Tensor, "N 3"], side: int) -> Footprint:
     )
 
 
+@constant
+def _crossed(device: torch.device) -> Int[Tensor, "3 2"]:
+    """`PLANE_AXES` as `grid_sample` wants them, the last one first."""
+    return torch.tensor(PLANE_AXES, device=device).flip(1)
+
+
+def sampled_products(
+    planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3 C"]:
+    """`plane_line_products`, mode by mode, by PyTorch's own sampling of pictures: a fifth of the time of gathers on an NVIDIA
+    H200, where a gather gives each row of channels a block of threads. Apple's devices do not have its gradient."""
+    places = unit.clamp(0, 1).mul(2).sub(1).T
+    across = places[_crossed(unit.device)].mT[:, None]
+    along = torch.stack([torch.zeros_like(places), places], dim=-1)[:, None]
+    corners = grid_sample(planes.permute(0, 3, 1, 2), across, padding_mode="border", align_corners=True)
+    ends = grid_sample(lines.mT[..., None], along, padding_mode="border", align_corners=True)
+    unknown = 0 * places.sum(0)  # it clamps what is not a number, which is to show
+    return (corners * ends + unknown)[:, :, 0].permute(2, 0, 1)
+
+
 def _products(planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], at: Footprint) -> Float[Tensor, "N 3 C"]:
     """One gather for all planes and one for all lines: on a GPU the number of operations counts."""
     channels = lines.shape[2]
@@ -59,7 +80,15 @@ def plane_line_products_reference(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N threeC"]:
     """`plane_line_products` in plain PyTorch, for every device and differentiable in the positions too."""
-    return _products(planes, lines, footprint(unit, lines.shape[1])).flatten(1)
+    return _each((planes, lines), unit=unit)[0].flatten(1)
+
+
+def _each(*volumes: tuple[Tensor, Tensor], unit: Float[Tensor, "N 3"]) -> list[Tensor]:
+    """Products of each of some planes and lines of one size, mode by mode, N 3 C."""
+    if unit.device.type == "cuda":
+        return [sampled_products(*volume, unit) for volume in volumes]
+    at = footprint(unit, volumes[0][1].shape[1])
+    return [_products(*volume, at) for volume in volumes]
 
 
 def _block(channels: int) -> int:
@@ -120,7 +149,7 @@ def plane_line_sum(
     """The sum of what `plane_line_products` gives at each position."""
     if fast(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, True)[:, 0]
-    return _products(planes, lines, footprint(unit, lines.shape[1])).sum((1, 2))
+    return _each((planes, lines), unit=unit)[0].sum((1, 2))
 
 
 def plane_line_sum_and_products(
@@ -131,5 +160,5 @@ def plane_line_sum_and_products(
     """`plane_line_sum` of some planes and lines, and `plane_line_products` of others of the same size."""
     if fast(*summed, unit) and fast(*apart, unit):
         return plane_line_sum(*summed, unit), plane_line_products(*apart, unit)
-    at = footprint(unit, summed[1].shape[1])
-    return _products(*summed, at).sum((1, 2)), _products(*apart, at).flatten(1)
+    total, products = _each(summed, apart, unit=unit)
+    return total.sum((1, 2)), products.flatten(1)

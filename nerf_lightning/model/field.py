@@ -79,6 +79,8 @@ class Field(InBounds, AnyField):
     """Adam's learning rate above which training diverges, as the stability suite measured it; infinite if unknown."""
     growing_steps: int = 0
     """Steps before which it does not have its last size, whatever the budget: the smaller ones need them."""
+    growing_steps_most: float = math.inf
+    """Steps after which it has its last size, whatever the budget: the smaller ones have learned what they can by then."""
 
     @property
     def finer(self) -> float:

@@ -21,8 +21,8 @@ from nerf_lightning.utils.options import Count, Layers, Side
 
 FINEST = 160
 """Cells along a side at the end, where photos are of usual size."""
-SETTLED = 80
-"""Steps that a size needs before the next is worth its time."""
+SETTLED, LEARNED = 80, 1000
+"""Steps that a size needs before the next is worth its time, and after which it has learned what it can."""
 
 
 class VectorMatrix(torch.nn.Module):
@@ -106,8 +106,8 @@ class TensoRFField(Field):
         coarsest, finest: cells along a side at the start and at the end. Without a finest: 160, and more for larger photos, see
             `Bounds.fineness`.
         stages: number of sizes, growing geometrically.
-        grown: fraction of the budget after which the planes have their finest size; the stages before are equally long, and of
-            at least `SETTLED` steps.
+        grown: fraction of the budget after which the planes have their finest size; the stages before are equally long, of at
+            least `SETTLED` and at most `LEARNED` steps.
         width: neurons of the hidden layer.
         degree: of the spherical harmonics of the direction that the network sees, 0 to 3; with 0, colours are the same from
             everywhere. With few photos, less than 3 may be better.
@@ -147,7 +147,8 @@ class TensoRFField(Field):
         self.resolutions = level_resolutions(stages, coarsest, finest)
         self.grown = grown
         if coarsest < finest:
-            self.grown_after, self.growing_steps = grown, SETTLED * (stages - 1)
+            self.grown_after = grown
+            self.growing_steps, self.growing_steps_most = SETTLED * (stages - 1), LEARNED * (stages - 1)
         self.density_volume = VectorMatrix(coarsest, density_components)
         self.colour_volume = VectorMatrix(coarsest, colour_components)
         self.activation = density_activation(density)

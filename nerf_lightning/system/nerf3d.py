@@ -114,12 +114,14 @@ class NeRF3D(System):
 
     def ripeness(self, step: int) -> float:
         """The share of the budget by which the field is to grow: behind `progress` where it has not taken the steps that its
-        sizes need, or where corrections are still coming."""
-        ripe = self.progress
+        sizes need, or where corrections are still coming; ahead of it where its sizes have had all the steps that help them."""
+        field, ripe = self.field, self.progress
         if self.corrections is not None:
-            ripe = self.corrections.ripeness(ripe, self.field.grown_after)
-        if step < self.field.growing_steps:
-            ripe = min(ripe, self.field.grown_after * step / self.field.growing_steps)
+            ripe = self.corrections.ripeness(ripe, field.grown_after)
+        else:
+            ripe = max(ripe, field.grown_after * min(1.0, step / field.growing_steps_most))
+        if step < field.growing_steps:
+            ripe = min(ripe, field.grown_after * step / field.growing_steps)
         return ripe
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

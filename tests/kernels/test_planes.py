@@ -4,6 +4,7 @@ from agreement import agree
 from torch import Tensor
 
 from nerf_lightning.kernels import plane_line_products, plane_line_sum, use_kernels
+from nerf_lightning.kernels.planes import sampled_products
 
 NAN = float("nan")
 READS = pytest.mark.parametrize("read", [plane_line_products, plane_line_sum])
@@ -75,6 +76,19 @@ def test_positions_have_gradients_where_they_need_them(read, kernels: str):
     products = plane_line_products(planes.double(), lines.double(), double)
     (wanted,) = torch.autograd.grad(products.sum(), double)
     torch.testing.assert_close(got.double(), wanted, rtol=1e-4, atol=1e-4)
+
+
+@SIZES
+def test_products_sampled_as_pictures_are_the_same(side: int, channels: int):
+    planes, lines = (x.requires_grad_() for x in factors(side, channels, torch.float64))
+    unit = (1.4 * torch.rand(50, 3, dtype=torch.float64) - 0.2).requires_grad_()
+    got, expected = sampled_products(planes, lines, unit).flatten(1), plane_line_products(planes, lines, unit)
+    torch.testing.assert_close(got, expected)
+    above = torch.randn_like(expected)
+    gradients = (torch.autograd.grad(out, (planes, lines, unit), above) for out in (got, expected))
+    torch.testing.assert_close(*gradients)
+    bad = torch.tensor([[0.5, NAN, 0.5], [0.5, 0.5, 0.5]], dtype=torch.float64)
+    assert sampled_products(planes, lines, bad).isnan().flatten(1).all(1).tolist() == [True, False]
 
 
 @READS
