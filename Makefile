@@ -13,7 +13,8 @@ $(VENV)/.run: $(BIN)/python pyproject.toml
 	touch $@
 
 $(VENV)/.test: $(BIN)/python pyproject.toml
-	$(BIN)/python -m pip install -q -e '.[test]'
+	$(BIN)/python -m pip install -q --no-compile -e '.[test]'
+	-$(BIN)/python -m compileall -qq -j 0 $(VENV)  # on all cores, where pip compiles on one
 	touch $@
 
 run: $(VENV)/.run           ## install, then train on the Lego scene (or the built-in bricks)

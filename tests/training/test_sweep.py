@@ -191,7 +191,7 @@ SHARED = {
 }
 
 
-@pytest.mark.parametrize("what", SHARED)
+@pytest.mark.parametrize("what", ["planes that grow", pytest.param("a picture", marks=pytest.mark.long)])
 def test_two_processes_share_a_run_and_leave_one_folder(what: str, inside, tmp_path: Path):
     options = [*SHARED[what], "budget.steps=100", "trainer.accelerator=cpu", "threads=1"]
     code, out, err = inside(*options, "name=one")
