@@ -18,7 +18,7 @@ def bare_step(
     start = time.perf_counter()
     system.progress = progress
     for group in optimizer.param_groups:
-        group["lr"] = group["initial_lr"] * system.schedule(progress)
+        group["lr"] = group["initial_lr"] * system.schedule(progress, step)
     for parameter in system.field.grow(system.ripeness(step)):
         optimizer.state.pop(parameter, None)
     system.follow_field(data)

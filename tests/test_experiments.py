@@ -57,7 +57,7 @@ def take_a_step(cfg: DictConfig) -> System:
         loss = system.loss(batch)
     loss.backward()
     optimizer.step()
-    assert loss.isfinite() and 0 < system.schedule(0.5) <= 1
+    assert loss.isfinite() and 0 < system.schedule(0.5, 100) <= 1
     return system
 
 

@@ -20,7 +20,7 @@ from nerf_lightning.utils.allocator import give_back_freed_memory
 from nerf_lightning.utils.device import synchronize
 
 MakeOptimizer = Callable[[list[dict[str, Any]]], torch.optim.Optimizer]
-Schedule = Callable[[float], float]
+Schedule = Callable[[float, int], float]
 """Progress in [0, 1] -> factor on the learning rate."""
 CHUNK = 1 << 15
 """Default of `System`'s chunk."""
@@ -83,7 +83,7 @@ class System(L.LightningModule):
 
     Args:
         optimizer: makes the optimiser from the parameters.
-        schedule: factor on its learning rate by progress.
+        schedule: factor on its learning rate by progress and step.
         seed: of all randomness in training steps.
         chunk: samples rendered at once without gradient: bounds the memory that a view of any size takes.
     """
@@ -128,7 +128,7 @@ class System(L.LightningModule):
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         if self.paused is None and self.trainer.max_steps > 0:
             self.progress = self.global_step / self.trainer.max_steps
-        factor = self.schedule(self.progress) * self.rate
+        factor = self.schedule(self.progress, self.global_step) * self.rate
         for group in self.parameter_groups:
             group["lr"] = group["initial_lr"] * factor * group.get("final", 1.0) ** self.progress
 
