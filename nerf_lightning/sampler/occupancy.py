@@ -24,7 +24,8 @@ ASKED, LOOKED_AT = 4, 32
 MOST_CAMERAS = 128
 """Most cameras, evenly chosen, that decide which cells are in view."""
 UNSEEN = 0.5 / 255
-"""Optical thickness that rays of a picture may lose to steps that hold less: half of what 8 bits tell."""
+"""Optical thickness that rays of a picture may lose to steps that hold less, and transmittance at which they end: half of what 8
+bits tell."""
 ROOM = 1.25
 """Room for steps that are not counted, as a multiple of the last count."""
 
@@ -60,7 +61,7 @@ class OccupancySampler(Sampler):
         memory: updates after which a cell that light no longer reaches is skipped.
         seen_by: cells seen by fewer training cameras stay empty: what only one camera sees can be anything, such as fog in
             front of its lens.
-        early_stop_eps: early-stop transmittance, above 0: below it a ray has ended.
+        early_stop_eps: early-stop transmittance, above 0: below it a ray has ended; in pictures at 1/510 at the latest.
         alpha_thre: alpha threshold: training drops steps of lower opacity; at most half the mean, so that fog trains too.
     """
 
@@ -161,14 +162,14 @@ class OccupancySampler(Sampler):
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
         if generator is None:
-            steps = self.picture_samples
-            found, packed = self._look(rays, density, near, far, torch.zeros_like(near), self.occupied, steps)
+            steps, stop = self.picture_samples, max(self.early_stop_eps, UNSEEN)
+            found, packed = self._look(rays, density, near, far, torch.zeros_like(near), self.occupied, steps, stop)
             # A picture must not depend on how its rays are split into calls: only training uses the mean to drop steps.
-            return Samples(*keep_visible(found, packed, self.early_stop_eps, UNSEEN, dropped=UNSEEN))
+            return Samples(*keep_visible(found, packed, stop, UNSEEN, dropped=UNSEEN))
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.occupied if self.look_everywhere else self.lit
         rooms = [None, None] if self.per_ray is None else [math.ceil(ROOM * many * len(rays)) for many in self.per_ray]
-        found, packed = self._look(rays, density, near, far, shift, cells, self.samples, rooms[0])
+        found, packed = self._look(rays, density, near, far, shift, cells, self.samples, self.early_stop_eps, rooms[0])
         if self.thin is None:
             mean = (self.thickness * self.lit).sum() / self.lit.sum()
             self.thin = mean.mul(0.5).clamp_max(-math.log1p(-self.alpha_thre))
@@ -192,9 +193,10 @@ class OccupancySampler(Sampler):
         shift: Float[Tensor, "R"],
         cells: Bool[Tensor, "cells"],
         samples: int,
+        stop: float,
         room: int | None = None,
     ) -> tuple[Float[Tensor, "N"], Packed]:
-        """Steps in some cells and the optical thickness of each."""
+        """Steps in some cells and the optical thickness of each, as far as light reaches."""
 
         def thickness(packed: Packed) -> Float[Tensor, "N"]:
             """From the density at the steps' middle, which mixed precision gives in half precision."""
@@ -202,7 +204,7 @@ class OccupancySampler(Sampler):
             return (found[0].detach() if len(found) == 1 else torch.cat(found)) * packed[1]
 
         given = rays, self.bounds, near, far, shift, cells, samples, self.length(samples)
-        return front_first(*given, thickness, self.early_stop_eps, room, LOOKED_AT * self.chunk)
+        return front_first(*given, thickness, stop, room, LOOKED_AT * self.chunk)
 
     @torch.no_grad()
     def look_through(self, cameras: Cameras) -> None:

@@ -8,7 +8,7 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import march
-from nerf_lightning.sampler import OccupancySampler, Samples
+from nerf_lightning.sampler import OccupancySampler, Samples, occupancy
 from nerf_lightning.sampler.occupancy import ASKED, UNSEEN
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
@@ -44,7 +44,10 @@ def bare(sampler: OccupancySampler, rays: Rays, cells: Tensor, generator: Genera
 
 @pytest.mark.parametrize("unbounded", [False, True])
 @pytest.mark.parametrize("training", [False, True])
-def test_steps_are_taken_in_occupied_cells(training: bool, unbounded: bool, box: Bounds, rays: Rays, kernels: str):
+def test_steps_are_taken_in_occupied_cells(
+    training: bool, unbounded: bool, box: Bounds, rays: Rays, kernels: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(occupancy, "UNSEEN", 0.0)  # else a picture's rays end in fog
     sampler = OccupancySampler(replace(box, unbounded=unbounded), samples=40, resolution=6, **OPEN)
     sampler.occupied = torch.rand(6**3) < 0.4
     actual = sampler(rays, fog, seeded() if training else None)
@@ -107,6 +110,14 @@ def test_a_picture_does_not_depend_on_how_its_rays_are_cut(box: Bounds, rays: Ra
     sampler = OccupancySampler(box, samples=40, resolution=6)
     whole, parts = sampler(rays, waves), [sampler(rays[i : i + 7], waves) for i in range(0, len(rays), 7)]
     assert torch.equal(whole.t, torch.cat([part.t for part in parts]))
+
+
+def test_rays_of_pictures_end_where_the_rest_is_less_than_anyone_sees(box: Bounds, rays: Rays, kernels: str):
+    samples = OccupancySampler(box, samples=40, resolution=6)(rays, lambda x: torch.full((len(x),), 20.0))
+    passed = torch.zeros(len(rays)).index_add(0, samples.ray, 20.0 * samples.dt)
+    deep = passed > 1.1 * -math.log(UNSEEN)
+    last = samples.dt[samples.offsets[1:].sub(1).clamp_min(0)]
+    assert deep.any() and (passed - 20.0 * last <= -math.log(UNSEEN) + 1e-4).all()
 
 
 @pytest.mark.parametrize("density", [0.0, 1e-6, 1e-3])
