@@ -24,8 +24,8 @@ ASKED, LOOKED_AT = 4, 32
 MOST_CAMERAS = 128
 """Most cameras, evenly chosen, that decide which cells are in view."""
 UNSEEN = 0.5 / 255
-"""Optical thickness that rays of a picture may lose to steps that hold less, and transmittance at which they end: half of what 8
-bits tell."""
+"""Optical thickness that rays of a picture may lose to steps that hold less, and transmittance at which they end: half of
+what 8 bits tell."""
 ROOM = 1.25
 """Room for steps that are not counted, as a multiple of the last count."""
 

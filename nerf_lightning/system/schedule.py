@@ -1,4 +1,4 @@
-"""Learning-rate factors as functions of progress, the fraction of the budget done, so that they fit any budget; and of the step."""
+"""Learning-rate factors as functions of progress, the part of the budget done, so that they fit any budget, and of the step."""
 
 import math
 
