@@ -175,7 +175,7 @@ def test_the_trainer_and_the_verbs_agree(tmp_path: Path, plain_torch: None):
 
 @pytest.mark.parametrize(
     ("device", "batch", "chunk"),
-    [("cpu", 1, 32768), ("cuda", 8, 524288), ("mps", 4, 131072), ("xpu", 1, 32768)],
+    [("cpu", 1, 32768), ("cuda", 4, 524288), ("mps", 4, 131072), ("xpu", 1, 32768)],
 )
 def test_each_device_has_limits_of_its_own_that_a_run_overrides(device: str, batch: int, chunk: int):
     where = torch.device(device)
