@@ -30,7 +30,7 @@ from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.options import Seed, check_options
 from nerf_lightning.utils.untrusted import NONSENSE, existing_file, read_yaml
 
-GROUPS = ("dataset", "model", "optimizer", "schedule", "trainer")
+GROUPS = ("dataset", "optimizer", "schedule", "model", "trainer")
 """Groups of a configuration, in the order written: if a file was cut short, at least the last is missing."""
 
 

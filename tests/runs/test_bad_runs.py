@@ -51,7 +51,7 @@ def half_a_configuration(run: Path) -> None:
 
 def a_configuration_cut_between_groups(run: Path) -> None:
     whole = (run / "config.yaml").read_text()
-    (run / "config.yaml").write_text(whole[: whole.index("sampler:")])
+    (run / "config.yaml").write_text(whole[: whole.index("schedule:")])
 
 
 def no_scene(run: Path) -> None:
@@ -110,7 +110,7 @@ DAMAGES: dict[Callable[[Path], None], str] = {
     nothing: "config.yaml: found nothing there, expected the folder of a run",
     no_configuration: "config.yaml: found nothing there",
     half_a_configuration: "expected a run's configuration in YAML",
-    a_configuration_cut_between_groups: "config.yaml: sampler: found nothing, expected a run's whole configuration",
+    a_configuration_cut_between_groups: "config.yaml: schedule: found nothing, expected a run's whole configuration",
     no_scene: "scene.json: found nothing there, expected the scene of a run",
     half_a_scene: "expected the scene of a run, whole",
     a_list_for_a_scene: "expected the scene of a run, whole",
