@@ -3,7 +3,7 @@ VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 
-.PHONY: run test long quick lint format clean
+.PHONY: run test suite long quick lint format clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -25,7 +25,10 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint                  ## install, check style and types, run the tests
+test: $(VENV)/.test         ## install, check style and types, and run the tests meanwhile
+	$(MAKE) -j2 lint suite
+
+suite: $(VENV)/.test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
 
 long: $(VENV)/.test         ## what a test run leaves out: launchers of sweeps, kernels of a compiler, whole runs on a pretended device
