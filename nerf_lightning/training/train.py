@@ -60,6 +60,17 @@ LATER = {"device": "auto", "compile": False, "limits": {"batch": None, "chunk": 
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
+class Described(L.Callback):
+    """Writes what opens a run again once its training begins: a resumed run whose options do not fit stays as it was."""
+
+    def __init__(self, cfg: DictConfig, data: RayDataModule | PixelDataModule, folder: Path):
+        self.cfg, self.data, self.folder = cfg, data, folder
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        save_config(self.cfg, self.folder)
+        save_scene(self.data, self.folder)
+
+
 def train(
     cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None = None, scene: Scene | None = None
 ) -> float:
@@ -116,8 +127,7 @@ def train(
             check_disk(folder / checkpoints.folder, system)
         if checkpoint is None:
             clear(folder)
-        save_config(cfg, folder)
-        save_scene(data, folder)
+        trainer.callbacks.append(Described(cfg, data, folder))  # type: ignore[attr-defined]
     with trainer.precision_plugin.train_step_context():
         warm_up(system, data, trainer.strategy.root_device)
     try:

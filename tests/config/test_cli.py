@@ -178,13 +178,16 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
     assert "sampler.samples" in err
     last = run / "checkpoints" / "last.ckpt"
     state = torch.load(last, weights_only=True)
-    before = (run / "results.json").read_bytes()
+    before = {name: (run / name).read_bytes() for name in ("config.yaml", "scene.json", "results.json")}
+    code, _, err = inside(f"resume={run}", "model.width=24")
+    assert code == 2 and "last.ckpt: found " in err and err.count("\n") == 1
+    assert {name: (run / name).read_bytes() for name in before} == before, "what goes on from this state stays"
     for wrong, words in ((1.0, "last.ckpt: loops: found something else"), (1, "last.ckpt: found TypeError")):
         state["loops"]["fit_loop"]["epoch_progress"]["total"] = wrong
         torch.save(state, last)
         code, _, err = inside(f"resume={run}", "budget.steps=12")
         assert code == 2 and words in err and err.count("\n") == 1
-        assert (run / "results.json").read_bytes() == before
+        assert {name: (run / name).read_bytes() for name in before} == before
 
 
 def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path: Path):
