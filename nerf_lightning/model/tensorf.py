@@ -21,6 +21,8 @@ from nerf_lightning.utils.options import Count, Layers, Side
 
 FINEST = 160
 """Cells along a side at the end, where photos are of usual size."""
+WIDTH = 32
+"""Neurons of the hidden layer there."""
 SETTLED, LEARNED = 80, 1000
 """Steps that a size needs before the next is worth its time, and after which it has learned what it can."""
 
@@ -108,7 +110,8 @@ class TensoRFField(Field):
         stages: number of sizes, growing geometrically.
         grown: fraction of the budget after which the planes have their finest size; the stages before are equally long, of at
             least `SETTLED` and at most `LEARNED` steps.
-        width: neurons of the hidden layer.
+        width: neurons of the hidden layer. Without a width: 32, and up to 64 where planes are finer for larger photos, which
+            show more of how surfaces shine.
         degree: of the spherical harmonics of the direction that the network sees, 0 to 3; with 0, colours are the same from
             everywhere. With few photos, less than 3 may be better.
         density: "relu", "softplus" or "exp".
@@ -130,15 +133,18 @@ class TensoRFField(Field):
         finest: Side | None = None,
         stages: Layers = 4,
         grown: float = 0.3,
-        width: Count = 32,
+        width: Count | None = None,
         degree: int = 3,
         density: str = "exp",
         size: str = "auto",
     ):
         super().__init__(bounds)
         self.follows_photos = finest is None
+        finer = bounds.fineness if finest is None else 1.0
         if finest is None:
-            finest = max(coarsest, round(FINEST * bounds.fineness))
+            finest = max(coarsest, round(FINEST * finer))
+        if width is None:
+            width = 8 * round(WIDTH * finer / 8)
         coarsest, finest = self.grid_sizes(coarsest, finest, size)
         if stages == 1 and coarsest < finest:
             raise InputError("model.stages", "", f"1 with sizes {coarsest} and {finest}", "at least 2, or one size")

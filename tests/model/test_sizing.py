@@ -66,12 +66,16 @@ def test_grids_are_no_finer_than_two_cells_a_pixel(resolutions: Resolutions):
 
 
 @pytest.mark.parametrize(
-    ("unbounded", "width", "finest"),
-    [(False, 150, 160), (False, 800, 320), (False, 9000, 320), (True, 800, 160)],
+    ("unbounded", "across", "finest", "width"),
+    [(False, 150, 160, 32), (False, 450, 240, 48), (False, 800, 320, 64), (False, 9000, 320, 64), (True, 800, 160, 32)],
 )
-def test_planes_have_numbers_in_proportion_to_the_width_of_large_photos(unbounded: bool, width: int, finest: int):
-    assert TensoRFField(Bounds(BOX, unbounded, pixel=2 / width), 2, 2).resolutions[-1] == finest
-    assert TensoRFField(Bounds(BOX, unbounded, pixel=2 / width), 2, 2, finest=100).resolutions[-1] == 100
+def test_planes_and_their_network_are_larger_for_large_photos(unbounded: bool, across: int, finest: int, width: int):
+    """Planes have numbers in proportion to the width of the photos, the network neurons in proportion to the planes' side."""
+    bounds = Bounds(BOX, unbounded, pixel=2 / across)
+    field, given = TensoRFField(bounds, 2, 2), TensoRFField(bounds, 2, 2, finest=100, width=24)
+    assert field.resolutions[-1] == finest and field.colour_net[0].out_features == width
+    assert given.resolutions[-1] == 100 and given.colour_net[0].out_features == 24
+    assert TensoRFField(bounds, 2, 2, finest=100).colour_net[0].out_features == 32
     assert TensoRFField(Bounds(BOX, unbounded), 2, 2, coarsest=200).resolutions[-1] == 200
 
 
