@@ -231,7 +231,7 @@ def build_trainer(cfg: DictConfig, folder: Path, device: torch.device, results: 
         raise InputError(
             "config", "trainer.devices", devices[:60], f"at most {MOST_DEVICES}, the processes of one machine"
         )
-    where: dict[str, Any] = {"accelerator": device.type}
+    where: dict[str, Any] = {"accelerator": device.type, "enable_checkpointing": False}  # callbacks/checkpoints does it
     if device.type not in KNOWN:
         where["strategy"] = SingleDeviceStrategy(device)
     return make(cfg, "trainer", callbacks=callbacks, logger=logger, default_root_dir=folder, **where)

@@ -1,5 +1,6 @@
 """Checkpoints as they are read back: tensors and plain values, whole to the last bit, and never code."""
 
+import math
 import pickle
 import warnings
 import zipfile
@@ -77,6 +78,35 @@ def _counts(value: Any) -> bool:
     if isinstance(value, dict | list):
         return all(map(_counts, value.values() if isinstance(value, dict) else value))
     return value is None or isinstance(value, str) or (isinstance(value, int) and value >= 0)
+
+
+def check_optimizer(path: Path, optimizer: torch.optim.Optimizer) -> None:
+    """Refuses a state that an optimizer has taken from a file, and could not make a step with.
+
+    Raises:
+        InputError: where an option is of another kind than that which it was built with, or not finite; or where what it keeps
+            of a parameter is of another shape.
+    """
+    todo = "start the run anew"
+    for group in optimizer.param_groups:
+        for key, value in group.items():
+            if key != "params" and not _alike(value, optimizer.defaults.get(key, 0.0)):
+                raise InputError(path, f"optimizer_states.{key}", repr(value)[:60], "what it was saved with", todo)
+        for parameter in group["params"]:
+            for key, value in optimizer.state[parameter].items():
+                if not isinstance(value, Tensor) or (value.shape != parameter.shape and value.numel() != 1):
+                    found = f"{tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)[:60]
+                    expected = f"a tensor of shape {tuple(parameter.shape)}"
+                    raise InputError(path, f"optimizer_states.{key}", found, expected, todo)
+
+
+def _alike(value: Any, built: Any) -> bool:
+    """Whether an option of an optimizer can stand where another one did."""
+    if isinstance(built, tuple | list):
+        return isinstance(value, tuple | list) and len(value) == len(built) and all(map(_alike, value, built))
+    if built is None or isinstance(built, bool):
+        return value is None or isinstance(value, bool)
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def check_finite(module: torch.nn.Module, where: object) -> None:

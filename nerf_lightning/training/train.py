@@ -32,7 +32,7 @@ from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.refine import summary, told
-from nerf_lightning.runs.checkpoint import RESUMED, read_checkpoint
+from nerf_lightning.runs.checkpoint import RESUMED, check_optimizer, read_checkpoint
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.owner import clear
@@ -43,6 +43,7 @@ from nerf_lightning.training.room import check_room
 from nerf_lightning.utils.allocator import keep_freed_memory
 from nerf_lightning.utils.listing import first_few
 from nerf_lightning.utils.machine import CROWDED, crowding
+from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.options import AtMost, Count, Seed, check_options
 from nerf_lightning.utils.progress import animates
 from nerf_lightning.utils.quiet import quiet
@@ -55,18 +56,23 @@ NAMED = 10
 log = logging.getLogger(__name__)
 Threads = Annotated[Count, AtMost(1024)]
 """Threads of one process; beyond, starting them fails on common systems, and ends the process."""
+STACK = 8 * 2**20
+"""Bytes that are set aside for each."""
 LATER = {"device": "auto", "compile": False, "limits": {"batch": None, "chunk": None}}
 """Options that runs of earlier versions lack, and that may be given when they are resumed."""
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
 class Described(L.Callback):
-    """Writes what opens a run again once its training begins: a resumed run whose options do not fit stays as it was."""
+    """Writes what opens a run again once its training begins: a resumed run stays as it was where its state does not fit."""
 
-    def __init__(self, cfg: DictConfig, data: RayDataModule | PixelDataModule, folder: Path):
-        self.cfg, self.data, self.folder = cfg, data, folder
+    def __init__(self, cfg: DictConfig, data: RayDataModule | PixelDataModule, folder: Path, checkpoint: Path | None):
+        self.cfg, self.data, self.folder, self.checkpoint = cfg, data, folder, checkpoint
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        if self.checkpoint is not None:
+            for optimizer in trainer.optimizers:
+                check_optimizer(self.checkpoint, optimizer)
         save_config(self.cfg, self.folder)
         save_scene(self.data, self.folder)
 
@@ -127,7 +133,7 @@ def train(
             check_disk(folder / checkpoints.folder, system)
         if checkpoint is None:
             clear(folder)
-        trainer.callbacks.append(Described(cfg, data, folder))  # type: ignore[attr-defined]
+        trainer.callbacks.insert(0, Described(cfg, data, folder, checkpoint))  # type: ignore[attr-defined]
     with trainer.precision_plugin.train_step_context():
         warm_up(system, data, trainer.strategy.root_device)
     try:
@@ -182,6 +188,7 @@ def labels(name: str, method: str, recipe: str | None) -> None:
 def prepare_process(seed: Seed, threads: Threads | None, kernels: str, compile: bool = False) -> None:
     """Sets what applies to the whole process."""
     if threads is not None:
+        check_memory("config", "threads", f"stacks of {threads} threads", threads * STACK)
         torch.set_num_threads(threads)
     use_kernels("reference" if compile else kernels)
     keep_freed_memory()

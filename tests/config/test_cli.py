@@ -182,9 +182,18 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
     code, _, err = inside(f"resume={run}", "model.width=24")
     assert code == 2 and "last.ckpt: found " in err and err.count("\n") == 1
     assert {name: (run / name).read_bytes() for name in before} == before, "what goes on from this state stays"
-    for wrong, words in ((1.0, "last.ckpt: loops: found something else"), (1, "last.ckpt: found TypeError")):
-        state["loops"]["fit_loop"]["epoch_progress"]["total"] = wrong
+    total, groups = state["loops"]["fit_loop"]["epoch_progress"], state["optimizer_states"][0]["param_groups"]
+    moments = state["optimizer_states"][0]["state"][0]
+    for where, key, wrong, words in (
+        (total, "total", 1.0, "last.ckpt: loops: found something else"),
+        (total, "total", 1, "last.ckpt: found TypeError"),
+        (groups[0], "betas", True, "last.ckpt: optimizer_states.betas: found True"),
+        (groups[0], "lr", float("nan"), "last.ckpt: optimizer_states.lr: found nan"),
+        (moments, "exp_avg", torch.zeros(3), "last.ckpt: optimizer_states.exp_avg: found (3,)"),
+    ):
+        right, where[key] = where[key], wrong
         torch.save(state, last)
+        where[key] = right
         code, _, err = inside(f"resume={run}", "budget.steps=12")
         assert code == 2 and words in err and err.count("\n") == 1
         assert {name: (run / name).read_bytes() for name in before} == before

@@ -15,6 +15,7 @@ from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import ImportanceSampler, OccupancySampler, ProposalSampler, Sampler, UniformSampler
 from nerf_lightning.system import NeRF2D, NeRF3D
 from nerf_lightning.training.room import check_room
+from nerf_lightning.training.train import prepare_process
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.memory import Frugal, free_memory
 
@@ -42,6 +43,13 @@ def test_what_fits_is_made_as_ever(kind: type):
     with Frugal("config", "model"):
         made = kind(BOX).state_dict()
     assert all(torch.equal(plain[name], made[name]) for name in plain)
+
+
+def test_threads_need_room_for_their_stacks():
+    before = torch.get_num_threads()
+    with pytest.raises(InputError, match="config: threads: found stacks of 1000 threads"):
+        prepare_process(0, 1000, "auto")
+    assert torch.get_num_threads() == before
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from PIL import Image, UnidentifiedImageError
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.quiet import native_errors_hidden
 from nerf_lightning.utils.untrusted import existing_file
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -59,9 +60,10 @@ def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]
         if data.startswith(PNG):
             _check_png_header(path, data)
         # UNCHANGED keeps alpha and 16 bits, and leaves the EXIF rotation alone.
-        raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-        if raw is not None and upright and (raw.ndim == 2 or raw.shape[2] < 4):
-            raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+        with native_errors_hidden():  # what follows says it in a line
+            raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+            if raw is not None and upright and (raw.ndim == 2 or raw.shape[2] < 4):
+                raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     except (cv2.error, OSError) as error:
         raise InputError(path, "", f"an unreadable image ({error})", "a PNG, JPEG or TIFF") from error
     if raw is None and data[8:12] in HEIC:
