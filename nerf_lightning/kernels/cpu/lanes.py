@@ -66,6 +66,20 @@ def zeros(typing, lanes):
 
 
 @intrinsic
+def spread(typing, a, lanes):
+    """One number, once for each entry of the tuple `lanes`."""
+    width = len(lanes)
+    return Lanes(width)(types.float32, lanes), lambda context, builder, signature, values: _spread(builder, values[0], width)
+
+
+def _spread(builder, number, width):
+    index = ir.IntType(32)
+    empty = ir.Constant(ir.VectorType(ir.FloatType(), width), ir.Undefined)
+    first = builder.insert_element(empty, number, index(0))
+    return builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(index, width), [0] * width))
+
+
+@intrinsic
 def total(typing, a):
     """The sum of all lanes: that of the first half plus that of the second, and so on in each."""
 
@@ -121,11 +135,7 @@ def _multiplied(typing, a, b):
 @intrinsic
 def _scaled(typing, factor, a):
     def code(context, builder, signature, values):
-        vector, index = values[1].type, ir.IntType(32)
-        empty = ir.Constant(vector, ir.Undefined)
-        first = builder.insert_element(empty, values[0], index(0))
-        everywhere = builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(index, a.width), [0] * a.width))
-        return builder.fmul(everywhere, values[1])
+        return builder.fmul(_spread(builder, values[0], a.width), values[1])
 
     return a(types.float32, a), code
 

@@ -1,105 +1,89 @@
 """A whole small network on one tile of samples at a time, so that its activations never leave the core's cache.
 
 Weights come as one flat array, layer after layer [O, I] then bias [O], every width padded with zeros to a multiple of four:
-the loops handle four rows by four columns at once, in registers.
+the loops handle blocks of rows and samples at once, whose sums stay in registers.
 """
 
 import numpy as np
 from numba import float32, prange
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
-from nerf_lightning.kernels.cpu.lanes import fused, load, total, zeros
+from nerf_lightning.kernels.cpu.lanes import fused, load, spread, store, total, zeros
 
 TILE = 128
 """Samples worked on together; a constant, so that the inner loops need no remainder."""
 RUN = (0,) * 8
-"""Samples of a tile that are summed side by side."""
+"""Samples of a tile in one register."""
 
 
-@inner(inline="always")
-def sum4(w, a0, a1, a2, a3, start):
-    """start + w0 a0 + w1 a1 + w2 a2 + w3 a3, from the last to the first."""
-    return fused(w[0], a0, fused(w[1], a1, fused(w[2], a2, fused(w[3], a3, start))))
-
-
-@inner(inline="always")
-def add_product(w0, w1, w2, w3, x, i, y, o):
-    """Adds to four rows of y, from o on, what four rows of weights make of the rows of x from i on."""
-    for n in range(TILE):
-        x0, x1, x2, x3 = x[i, n], x[i + 1, n], x[i + 2, n], x[i + 3, n]
-        y[o, n] = sum4(w0, x0, x1, x2, x3, y[o, n])
-        y[o + 1, n] = sum4(w1, x0, x1, x2, x3, y[o + 1, n])
-        y[o + 2, n] = sum4(w2, x0, x1, x2, x3, y[o + 2, n])
-        y[o + 3, n] = sum4(w3, x0, x1, x2, x3, y[o + 3, n])
-
-
-@inner(inline="always")
-def row4(W, o, i):
-    return W[o, i], W[o, i + 1], W[o, i + 2], W[o, i + 3]
-
-
-@inner(inline="always")
-def column4(W, o, i):
-    return W[o, i], W[o + 1, i], W[o + 2, i], W[o + 3, i]
+@inner
+def add_product(W, x, y):
+    """y += W x, four rows by two registers of samples at a time: eight sums, as many as a processor adds to at once."""
+    outputs, inputs = W.shape
+    half = len(RUN)
+    for o in range(0, outputs, 4):
+        for n in range(0, TILE, 2 * half):
+            a0, a1 = load(y, o, n, RUN), load(y, o, n + half, RUN)
+            b0, b1 = load(y, o + 1, n, RUN), load(y, o + 1, n + half, RUN)
+            c0, c1 = load(y, o + 2, n, RUN), load(y, o + 2, n + half, RUN)
+            d0, d1 = load(y, o + 3, n, RUN), load(y, o + 3, n + half, RUN)
+            for i in range(inputs):
+                x0, x1 = load(x, i, n, RUN), load(x, i, n + half, RUN)
+                w = spread(W[o, i], RUN)
+                a0, a1 = fused(w, x0, a0), fused(w, x1, a1)
+                w = spread(W[o + 1, i], RUN)
+                b0, b1 = fused(w, x0, b0), fused(w, x1, b1)
+                w = spread(W[o + 2, i], RUN)
+                c0, c1 = fused(w, x0, c0), fused(w, x1, c1)
+                w = spread(W[o + 3, i], RUN)
+                d0, d1 = fused(w, x0, d0), fused(w, x1, d1)
+            for k, sums in enumerate(((a0, a1), (b0, b1), (c0, c1), (d0, d1))):
+                store(y, o + k, n, sums[0])
+                store(y, o + k, n + half, sums[1])
 
 
 @inner
 def affine(W, b, x, y, relu):
     """y = W x + b, or its ReLU."""
-    outputs, inputs = W.shape
-    for o in range(0, outputs, 4):
-        for k in range(o, o + 4):
+    for o in range(len(W)):
+        for n in range(TILE):
+            y[o, n] = b[o]
+    add_product(W, x, y)
+    if relu:
+        for o in range(len(W)):
             for n in range(TILE):
-                y[k, n] = b[k]
-        for i in range(0, inputs, 4):
-            add_product(row4(W, o, i), row4(W, o + 1, i), row4(W, o + 2, i), row4(W, o + 3, i), x, i, y, o)
-        if relu:
-            for k in range(o, o + 4):
-                for n in range(TILE):
-                    y[k, n] = float32(0) if y[k, n] < float32(0) else y[k, n]  # keeps NaN
+                y[o, n] = float32(0) if y[o, n] < float32(0) else y[o, n]  # keeps NaN
 
 
 @inner
 def back_input(W, dy, dx):
     """dx = W^T dy."""
-    outputs, inputs = W.shape
-    for i in range(0, inputs, 4):
-        dx[i : i + 4] = float32(0)
-        for o in range(0, outputs, 4):
-            w0, w1, w2, w3 = column4(W, o, i), column4(W, o, i + 1), column4(W, o, i + 2), column4(W, o, i + 3)
-            add_product(w0, w1, w2, w3, dy, o, dx, i)
+    dx[:] = float32(0)
+    add_product(W.T, dy, dx)
 
 
 @inner
 def back_weight(dW, db, dy, x):
-    """dW += dy x^T, db += the sum of dy."""
+    """dW += dy x^T, db += the sum of dy: two rows by four columns at a time, each summed in the lanes of a register."""
     outputs, inputs = dW.shape
     zero = zeros(RUN)
-    for o in range(0, outputs, 4):
-        for k in range(o, o + 4):
+    for o in range(0, outputs, 2):
+        for k in range(o, o + 2):
             s = zero
             for n in range(0, TILE, len(RUN)):
                 s = s + load(dy, k, n, RUN)
             db[k] += total(s)
         for i in range(0, inputs, 4):
-            s00, s01, s02, s03 = zero, zero, zero, zero
-            s10, s11, s12, s13 = zero, zero, zero, zero
-            s20, s21, s22, s23 = zero, zero, zero, zero
-            s30, s31, s32, s33 = zero, zero, zero, zero
+            a0, a1, a2, a3 = zero, zero, zero, zero
+            b0, b1, b2, b3 = zero, zero, zero, zero
             for n in range(0, TILE, len(RUN)):
                 x0, x1 = load(x, i, n, RUN), load(x, i + 1, n, RUN)
                 x2, x3 = load(x, i + 2, n, RUN), load(x, i + 3, n, RUN)
                 y = load(dy, o, n, RUN)
-                s00, s01, s02, s03 = fused(y, x0, s00), fused(y, x1, s01), fused(y, x2, s02), fused(y, x3, s03)
+                a0, a1, a2, a3 = fused(y, x0, a0), fused(y, x1, a1), fused(y, x2, a2), fused(y, x3, a3)
                 y = load(dy, o + 1, n, RUN)
-                s10, s11, s12, s13 = fused(y, x0, s10), fused(y, x1, s11), fused(y, x2, s12), fused(y, x3, s13)
-                y = load(dy, o + 2, n, RUN)
-                s20, s21, s22, s23 = fused(y, x0, s20), fused(y, x1, s21), fused(y, x2, s22), fused(y, x3, s23)
-                y = load(dy, o + 3, n, RUN)
-                s30, s31, s32, s33 = fused(y, x0, s30), fused(y, x1, s31), fused(y, x2, s32), fused(y, x3, s33)
-            for k, sums in enumerate(
-                ((s00, s01, s02, s03), (s10, s11, s12, s13), (s20, s21, s22, s23), (s30, s31, s32, s33))
-            ):
+                b0, b1, b2, b3 = fused(y, x0, b0), fused(y, x1, b1), fused(y, x2, b2), fused(y, x3, b3)
+            for k, sums in enumerate(((a0, a1, a2, a3), (b0, b1, b2, b3))):
                 for m in range(4):
                     dW[o + k, i + m] += total(sums[m])
 
