@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -222,7 +223,10 @@ def build_logger(cfg: DictConfig, folder: Path) -> Logger:
 def build_trainer(cfg: DictConfig, folder: Path, device: torch.device, results: Results | None = None) -> L.Trainer:
     """The Trainer with its callbacks, on a device, writing into `folder`; with `results`, a results.json too."""
     logger = build_logger(cfg, folder) if cfg.get("logger") is not None else False
-    chosen = [name for name, node in (cfg.get("callbacks") or {}).items() if node is not None]
+    asked = cfg.get("callbacks") or {}
+    if not isinstance(asked, Mapping):
+        raise InputError("config", "callbacks", repr(asked)[:60], "callbacks by name")
+    chosen = [name for name, node in asked.items() if node is not None]
     callbacks = [make(cfg, f"callbacks.{name}") for name in chosen]
     # The budget comes first, as the others read its clock; results before the orbit, as figures should not wait for a GIF.
     callbacks = [build_budget(cfg), *([results] if results else []), *callbacks]

@@ -63,7 +63,7 @@ def scene_of(
     checks.split_size(source, "train split", len(train))
     checks.split_size(source, "val split", len(val))
     poses = np.stack([shot.c2w for shot in shots])
-    checks.told_apart(source, poses[train])
+    checks.told_apart(source, poses[train.numpy()])  # a tensor of one number would be one photo, not a list of it
     c2w, to_source = framed(torch.from_numpy(poses), train)
     moved = [replace(shot, c2w=pose) for shot, pose in zip(shots, c2w.numpy(), strict=True)]
     views = read_shots(source, moved, reading)

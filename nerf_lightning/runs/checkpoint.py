@@ -57,7 +57,7 @@ def read_checkpoint(path: Path, needed: Mapping[str, type] = RENDERED) -> dict[s
             if not isinstance(state.get(key), kind):
                 raise InputError(path, key, f"a {type(state.get(key)).__name__}", f"a {kind.__name__}", todo)
         _check_weights(path, state["state_dict"])
-        if not _counts(state["loops"] if "loops" in needed else None):
+        if "loops" in needed and not _counts(state["loops"]):
             raise InputError(path, "loops", "something else", "counts of steps", todo)
     except InputError:
         raise
@@ -77,7 +77,7 @@ def _counts(value: Any) -> bool:
     """Whether Lightning's progress is made of what it counts."""
     if isinstance(value, dict | list):
         return all(map(_counts, value.values() if isinstance(value, dict) else value))
-    return value is None or isinstance(value, str) or (isinstance(value, int) and value >= 0)
+    return isinstance(value, int) and value >= 0
 
 
 def check_optimizer(path: Path, optimizer: torch.optim.Optimizer) -> None:

@@ -33,6 +33,8 @@ TARGETS = {
     "torch.optim": ("Adam", "AdamW"),
 }
 """What a run folder may name, by module. Anything else could be called with a stranger's arguments."""
+MOST_VALUES = 4096
+"""In a configuration: those of runs have some 150, and OmegaConf takes a tenth of a millisecond for each, several times."""
 
 
 def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
@@ -50,8 +52,15 @@ def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
     """
     if not isinstance(plain, dict):
         raise InputError(path, "", type(plain).__name__, "a mapping")
+    if (values := _values(plain)) > MOST_VALUES:
+        raise InputError(path, "", f"{values:,} values", f"a configuration of at most {MOST_VALUES:,}")
     _check(path, "", plain)
     return with_new_names(plain)
+
+
+def _values(node: Any) -> int:
+    parts = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    return 1 + sum(map(_values, parts))
 
 
 def _check(path: Path | str, key: str, node: Any) -> None:

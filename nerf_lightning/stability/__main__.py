@@ -46,8 +46,9 @@ def stability(
     if suite not in ("quick", "full"):
         raise InputError("config", "suite", repr(suite), "quick or full")
     unknown = [method for method in methods or [] if method not in METHODS]
-    if unknown:
-        raise InputError("config", "methods", unknown[0], f"some of {', '.join(METHODS)}")
+    if unknown or methods == []:
+        found = unknown[0] if unknown else "none"
+        raise InputError("config", "methods", found, f"some of {', '.join(METHODS)}")
     cells = cells_of(QUICK if suite == "quick" else every, methods or list(METHODS), seeds, steps)
     root = output_path(output)
     with owned(root):

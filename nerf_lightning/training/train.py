@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import math
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Annotated
@@ -160,7 +161,8 @@ def train(
         if trainer.logger is not None:
             log_hyperparameters(trainer.logger, cfg, results.summary)
         report(results.summary, folder)
-    return results.summary["psnr"]
+    quality: float | None = results.summary["psnr"]
+    return math.nan if quality is None else quality  # views of a field that has broken down may have none
 
 
 def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
@@ -254,7 +256,8 @@ def report(results: dict, folder: Path) -> None:
     for one in results["recoveries"]:
         print(f"guard: at step {one['step']}: {one['cause']}; {one['action']}")
     scene, seconds = results["scene"]["name"], results["train_seconds"]
-    print(f"{scene}: {results['psnr']:.2f} dB held out after {seconds:.0f} s of training ({results['status']})")
+    quality = "no PSNR" if results["psnr"] is None else f"{results['psnr']:.2f} dB"
+    print(f"{scene}: {quality} held out after {seconds:.0f} s of training ({results['status']})")
     if results["diagnosis"]:
         print(results["diagnosis"])
     crowded = crowding(results)

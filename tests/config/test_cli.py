@@ -179,6 +179,11 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
     last = run / "checkpoints" / "last.ckpt"
     state = torch.load(last, weights_only=True)
     before = {name: (run / name).read_bytes() for name in ("config.yaml", "scene.json", "results.json")}
+    described = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(yaml.safe_dump({**yaml.safe_load(described), "callbacks": 3}))
+    code, _, err = inside(f"resume={run}")
+    assert code == 2 and "config: callbacks: found 3, expected callbacks by name" in err and err.count("\n") == 1
+    (run / "config.yaml").write_text(described)
     code, _, err = inside(f"resume={run}", "model.width=24")
     assert code == 2 and "last.ckpt: found " in err and err.count("\n") == 1
     assert {name: (run / name).read_bytes() for name in before} == before, "what goes on from this state stays"

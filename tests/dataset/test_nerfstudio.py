@@ -221,6 +221,9 @@ def test_holdout_counts(capture: Path):
     assert len(load_nerfstudio(capture, reading=Reading(holdout=100)).val) == 1
     with pytest.raises(InputError, match="holdout: found 1"):
         Reading(holdout=1)
+    change(capture, lambda c: c.update(frames=c["frames"][:2]))
+    scene = load_nerfstudio(capture)
+    assert (len(scene.train), len(scene.val)) == (1, 1), "two photos: one to learn from"
 
 
 def test_missing_extensions_are_found(capture: Path):

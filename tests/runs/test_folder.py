@@ -162,6 +162,7 @@ DAMAGES: list[tuple[str, Callable[[Path], object], str]] = [
     ("config.yaml", changed(seed=None), "config.yaml: seed: found nothing"),
     ("config.yaml", changed(seed=-1), "config.yaml: seed: found -1"),
     ("config.yaml", changed(kernels=None), "config.yaml: kernels: found nothing"),
+    ("config.yaml", changed(name=[0] * 9000), "config.yaml: found 9,1"),
     ("config.yaml", changed(model=3), "config.yaml: model: found"),
     ("config.yaml", changed(model__width="???"), "config.yaml: model.width: found '???'"),
     ("config.yaml", changed(model__width=10**9), "config.yaml: model: found numbers, with the copy"),
@@ -232,6 +233,11 @@ def test_a_checkpoint_to_go_on_from_holds_more_than_weights(small_run: Path, tmp
     torch.save({"state_dict": {}, "loops": {}, "callbacks": []}, tmp_path / "a.ckpt")
     with pytest.raises(InputError, match=r"a\.ckpt: callbacks: found a list, expected a dict"):
         read_checkpoint(tmp_path / "a.ckpt", RESUMED)
+    state = torch.load(small_run / "checkpoints" / "last.ckpt", weights_only=True)
+    state["loops"]["fit_loop"]["epoch_progress"]["total"]["ready"] = None
+    torch.save(state, tmp_path / "b.ckpt")
+    with pytest.raises(InputError, match=r"b\.ckpt: loops: found something else, expected counts of steps"):
+        read_checkpoint(tmp_path / "b.ckpt", RESUMED)
 
 
 def test_damaged_run_folders_are_told(small_run: Path, tmp_path: Path):

@@ -181,7 +181,9 @@ def test_controls_and_what_the_guard_makes_of_them():
     assert "proves nothing" in summary(squares(outcomes[:1]), [])[0]
 
 
-@pytest.mark.parametrize(("suite", "methods", "words"), [("all", None, "suite"), ("quick", ["nerf"], "methods")])
+@pytest.mark.parametrize(
+    ("suite", "methods", "words"), [("all", None, "suite"), ("quick", ["nerf"], "methods"), ("quick", [], "found none")]
+)
 def test_unknown_names_are_told(suite: str, methods: list[str] | None, words: str, tmp_path: Path):
     with pytest.raises(InputError, match=words):
         stability(suite, methods, 1, 10, 1, str(tmp_path))

@@ -69,7 +69,9 @@ def zeros(typing, lanes):
 def spread(typing, a, lanes):
     """One number, once for each entry of the tuple `lanes`."""
     width = len(lanes)
-    return Lanes(width)(types.float32, lanes), lambda context, builder, signature, values: _spread(builder, values[0], width)
+    return Lanes(width)(types.float32, lanes), lambda context, builder, signature, values: _spread(
+        builder, values[0], width
+    )
 
 
 def _spread(builder, number, width):
