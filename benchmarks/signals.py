@@ -29,7 +29,13 @@ HOW = ("told", "killed", "ended before", "other")
 """A signal that a command answers, SIGKILL, too late for either, and what should not happen."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 BRICKS = ("dataset=bricks", "dataset.size=48", "dataset.train_views=16", "dataset.val_views=2", "threads=1")
-TRAINING = (*BRICKS, "device=cpu", "recipe=tensorf_small", "callbacks.checkpoints.every_seconds=1")
+TRAINING = (
+    *BRICKS,
+    "device=cpu",
+    "recipe=tensorf_small",
+    "callbacks.checkpoints.every_seconds=0.5",
+    "callbacks.orbit.frames=4",
+)
 TIMES = re.compile("^run$|second|time|speed|date|load|machine|energy|memory|started|ended|path|folder|per_s")
 """What keys say that hold times, or what is different from process to process."""
 
@@ -80,13 +86,13 @@ def jobs(run: Path) -> dict[str, Job]:
         run: a trained run, to be rendered.
     """
     return {
-        "train": Job(lambda out: ("nerf_lightning", *TRAINING, "budget.steps=400", f"hydra.run.dir={out}"), (weights,)),
+        "train": Job(lambda out: ("nerf_lightning", *TRAINING, "budget.steps=200", f"hydra.run.dir={out}"), (weights,)),
         "sweep": Job(
-            lambda out: ("nerf_lightning", "-m", *TRAINING, "seed=0,1", "budget.steps=150", f"hydra.sweep.dir={out}"),
+            lambda out: ("nerf_lightning", "-m", *TRAINING, "seed=0,1", "budget.steps=100", f"hydra.sweep.dir={out}"),
             (weights,),
         ),
         "rightsize": Job(
-            lambda out: ("nerf_lightning.rightsize", *TRAINING, "budget.steps=150", "target.psnr=21", f"output={out}"),
+            lambda out: ("nerf_lightning.rightsize", *TRAINING, "budget.steps=100", "target.psnr=21", f"output={out}"),
             (weights, figures),
         ),
         "stability": Job(
@@ -97,7 +103,7 @@ def jobs(run: Path) -> dict[str, Job]:
             lambda out: (
                 "nerf_lightning.render",
                 f"run={run}",
-                "frames=60",
+                "frames=30",
                 "scale=4",
                 "device=cpu",
                 f"output={out}/film.webp",

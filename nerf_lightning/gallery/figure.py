@@ -31,7 +31,8 @@ CELL = 2.3
 
 def write_contact_figure(root: Path, runs: Sequence[Run], output: Path | None = None) -> Path:
     """Draws the runs found below a folder into a PNG, gallery.png in that folder by default; returns its path."""
-    scenes = sorted({str((run.results.get("scene") or {}).get("name", "")) for run in runs} - {""})
+    names = {str((run.results.get("scene") or {}).get("name", "")) for run in runs} - {""}
+    scenes = [shortened(name, 60) for name in sorted(names)]
     path = root / "gallery.png" if output is None else output
     title = ": ".join(["/".join(root.resolve().parts[-2:]), *filter(None, [", ".join(scenes)])])
     write_png(path, pixels_of(contact_figure(runs, title)))

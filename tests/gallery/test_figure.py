@@ -84,11 +84,12 @@ def test_names_that_are_no_mathematics_are_drawn_as_they_are(tmp_path: Path):
 
 
 def test_the_gallery_draws_what_lies_in_a_folder(tmp_path: Path):
-    for name, text in {"a": "{}", "b": '{"status": "finished", "psnr": 3'}.items():
+    endless = f'{{"scene": {{"name": "{"a" * 10**5}"}}}}'
+    for name, text in {"a": "{}", "b": '{"status": "finished", "psnr": 3', "c": endless}.items():
         (tmp_path / "runs" / name).mkdir(parents=True)
         (tmp_path / "runs" / name / "results.json").write_text(text)
     found = find_runs(tmp_path / "runs")
-    assert [run.status for run in found] == ["unreadable", "unreadable"]
+    assert [run.status for run in found] == 3 * ["unreadable"]
     assert write_contact_figure(tmp_path / "runs", found) == tmp_path / "runs" / "gallery.png"
     assert imageio.imread(write_contact_figure(tmp_path / "runs", found, tmp_path / "mine.png")).std() > 1
 

@@ -185,6 +185,11 @@ DAMAGES: list[tuple[str, Callable[[Path], object], str]] = [
     ("scene.json", changed(unbounded=1), "scene.json: unbounded: found 1"),
     ("scene.json", changed(background=[1, 1]), "scene.json: background: found shape (2,)"),
     ("scene.json", changed(to_source=[[0] * 4] * 4), "scene.json: to_source: found a scale"),
+    (
+        "scene.json",
+        changed(to_source=[[1, 1.7e308, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+        "scene.json: to_source: found",
+    ),
     ("scene.json", changed(name=3), "scene.json: name: found 3"),
     ("checkpoints/last.ckpt", lambda p: p.write_text("text"), "last.ckpt: found File is not a zip file"),
     ("checkpoints/last.ckpt", lambda p: torch.save([1], p), "last.ckpt: found a list"),

@@ -190,12 +190,12 @@ def similarity(where: object, key: str, matrix: Shaped[np.ndarray, "..."]) -> Fl
     """[s R t; 0 1] with R a rotation and s a positive scale."""
     matrix = numeric(where, key, matrix, "4 4")
     expected = "a similarity [s R t; 0 0 0 1]: a rotation times a scale, and a shift"
-    columns = np.linalg.norm(np.clip(matrix[:3, :3], -2 * FARTHEST, 2 * FARTHEST), axis=0)
-    scale = float(columns.mean())
+    turn = np.clip(matrix[:3, :3], -2 * FARTHEST, 2 * FARTHEST)
+    scale = float(np.linalg.norm(turn, axis=0).mean())
     if not NEAREST <= scale <= FARTHEST or np.abs(matrix[:3, 3]).max() > FARTHEST:
         found, expected = "a scale or a shift that no file's unit has", f"{expected} of at most {FARTHEST:g}"
-    elif np.linalg.det(matrix[:3, :3] / scale) <= 0 or off_rotation(matrix[:3, :3] / scale) > RIGID_TOLERANCE:
-        found = str(matrix[:3, :3].round(3).tolist())
+    elif np.linalg.det(turn / scale) <= 0 or off_rotation(turn / scale) > RIGID_TOLERANCE:
+        found = str(turn.round(3).tolist())
     elif not np.allclose(matrix[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE):
         found = f"bottom row {matrix[3].round(4).tolist()}"
     else:
