@@ -164,8 +164,8 @@ class Guard(L.Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.watch.load(state_dict)
         self.recoveries = [Recovery(**one) for one in state_dict["recoveries"]]
-        for key in ("rate", "began_at", "softened"):
-            setattr(self, key, state_dict[key])
+        self.rate, self.began_at = float(state_dict["rate"]), float(state_dict["began_at"])
+        self.softened = state_dict["softened"]
         self._given_up = state_dict["given_up"]
         self._finite = state_dict.get("finite", True)  # older checkpoints lack it
 

@@ -107,5 +107,6 @@ class HeldOut(L.Callback):
         return {"curve": self.curve, "view_seconds": self.view_seconds}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.curve = state_dict["curve"]
-        self.view_seconds = state_dict["view_seconds"]
+        self.curve = [[float(spent), int(step), float(quality)] for spent, step, quality in state_dict["curve"]]
+        seconds = state_dict["view_seconds"]
+        self.view_seconds = None if seconds is None else float(seconds)

@@ -58,4 +58,4 @@ class Throughput(L.Callback):
         return {"rays": self.rays}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        self.rays = state_dict["rays"]
+        self.rays = int(state_dict["rays"])

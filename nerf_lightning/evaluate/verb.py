@@ -88,8 +88,9 @@ def table(metrics: list[ViewMetrics]) -> Table:
 
 
 def _row(name: str, figures: dict[str, float | None], mark: str = "") -> tuple[str, ...]:
-    ssim, lpips = ("-" if _finite(figures[key]) is None else f"{figures[key]:.4f}" for key in ("ssim", "lpips"))
-    return name, f"{figures['psnr']:.2f}", ssim, lpips, f"{figures['seconds']:.3f}{mark}"
+    digits = {"psnr": 2, "ssim": 4, "lpips": 4, "seconds": 3}
+    *cells, seconds = ("-" if _finite(figures[key]) is None else f"{figures[key]:.{n}f}" for key, n in digits.items())
+    return name, *cells, seconds + mark
 
 
 def averages(metrics: list[ViewMetrics]) -> dict[str, float | None]:

@@ -75,9 +75,9 @@ def _check_weights(path: Path, weights: Mapping[str, Any]) -> None:
 
 def _counts(value: Any) -> bool:
     """Whether Lightning's progress is made of what it counts."""
-    if isinstance(value, dict | list):
-        return all(map(_counts, value.values() if isinstance(value, dict) else value))
-    return isinstance(value, int) and value >= 0
+    if isinstance(value, list):  # the states of data loaders
+        return bool(value) and all(isinstance(one, dict) and _counts(one) for one in value)
+    return all(map(_counts, value.values())) if isinstance(value, dict) else isinstance(value, int) and value >= 0
 
 
 def check_optimizer(path: Path, optimizer: torch.optim.Optimizer) -> None:

@@ -189,7 +189,11 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
     assert {name: (run / name).read_bytes() for name in before} == before, "what goes on from this state stays"
     total, groups = state["loops"]["fit_loop"]["epoch_progress"], state["optimizer_states"][0]["param_groups"]
     moments = state["optimizer_states"][0]["state"][0]
+    callbacks = state["callbacks"]
     for where, key, wrong, words in (
+        (callbacks["Throughput"], "rays", [], "last.ckpt: found Type"),
+        (callbacks["HeldOut"], "curve", [1], "last.ckpt: found TypeError"),
+        (callbacks["Guard"], "rate", "fast", "last.ckpt: found ValueError"),
         (total, "total", 1.0, "last.ckpt: loops: found something else"),
         (total, "total", 1, "last.ckpt: found TypeError"),
         (groups[0], "betas", True, "last.ckpt: optimizer_states.betas: found True"),
@@ -200,7 +204,7 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
         torch.save(state, last)
         where[key] = right
         code, _, err = inside(f"resume={run}", "budget.steps=12")
-        assert code == 2 and words in err and err.count("\n") == 1
+        assert code == 2 and words in err and err.count("\n") == 1, err
         assert {name: (run / name).read_bytes() for name in before} == before
 
 

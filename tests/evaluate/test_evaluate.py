@@ -15,7 +15,7 @@ from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.evaluate import perceptual
 from nerf_lightning.evaluate.__main__ import task
 from nerf_lightning.evaluate.perceptual import perceptual_distance
-from nerf_lightning.evaluate.verb import ViewMetrics, averages
+from nerf_lightning.evaluate.verb import ViewMetrics, averages, table
 from nerf_lightning.training.train import train
 
 
@@ -63,6 +63,8 @@ def test_pictures_too(tmp_path: Path):
 def test_means_are_of_what_could_be_told():
     metrics = [ViewMetrics(0, 20.0, math.nan, None, 1.0), ViewMetrics(1, 30.0, 0.5, None, 3.0)]
     assert averages(metrics) == {"psnr": 25.0, "ssim": None, "lpips": None, "seconds": 2.0}
+    broken = table([ViewMetrics(0, math.nan, math.nan, None, 1.0)])
+    assert [list(column.cells)[0] for column in broken.columns] == ["0", "-", "-", "-", "1.000"]
 
 
 def test_lpips_is_told_where_its_weights_are_and_nothing_is_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
