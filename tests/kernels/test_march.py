@@ -228,6 +228,26 @@ def test_the_very_samples_are_kept_whatever_the_unit_of_length(factor, unbounded
         assert torch.equal(actual.t, expected.t) and torch.equal(actual.offsets, expected.offsets)
 
 
+@pytest.mark.parametrize("away", [2.0, 300.0])
+def test_rays_along_the_walls_of_blocks_keep_the_very_samples(away: float):
+    """Where rounding decides on which side of a wall a step lies, a leap must not decide otherwise."""
+    grid = torch.zeros(16, 16, 16, dtype=torch.bool)
+    grid[:, 8:, :] = True  # from the wall of a block on
+    total = 0
+    for lean in (0.0, 1e-7, 1e-6, 1e-5, 1e-3, 0.3):
+        generator = torch.Generator().manual_seed(1)
+        sideways = lean * (2 * torch.rand(500, generator=generator) - 1)
+        direction = normalize(torch.stack([torch.ones(500), sideways, 0.1 * torch.rand(500, generator=generator)], 1), dim=1)
+        at = torch.stack([torch.zeros(500), 1e-6 * torch.randn(500, generator=generator), torch.zeros(500)], 1)
+        rays, found = Rays(at - away * direction, direction), []
+        for version in ("reference", "auto"):
+            use_kernels(version)
+            found.append(marched(rays, CUBE, grid.flatten(), 4000))
+        assert torch.equal(found[0].t, found[1].t) and torch.equal(found[0].offsets, found[1].offsets)
+        total += len(found[0])
+    assert total > 1e5
+
+
 @pytest.mark.parametrize("unbounded", [False, True])
 def test_rays_that_go_some_steps_at_a_time_take_the_same_steps(unbounded: bool, box: Bounds):
     bounds = replace(box, unbounded=unbounded)

@@ -9,6 +9,8 @@ from nerf_lightning.kernels.cpu.compile import inner, kernel
 
 FAR = 8
 """Most blocks that a leap looks ahead."""
+ROUNDED = float32(1e-6)
+"""Share by which places and distances may differ from the reference's: some roundings to single precision."""
 
 
 @inner
@@ -88,18 +90,20 @@ def flat_cell(u, v, w, resolution):
 
 @inner(inline="always")
 def crossing(origin, direction, middle, half, cells):
-    """Of a ray along one axis: where it starts, in cells of a grid over the box, and how far it goes for one of them."""
+    """Of a ray along one axis: where it starts, in cells of a grid over the box, how far it goes for one of them, and how far
+    while rounding may leave open which one it is in."""
     scale = float32(cells) / (float32(2) * half)
     speed = direction * scale
-    return (origin - (middle - half)) * scale, (float32(1) / speed if speed != float32(0) else float32(1e30))
+    start, a_cell = (origin - (middle - half)) * scale, (float32(1) / speed if speed != float32(0) else float32(1e30))
+    return start, a_cell, ROUNDED * (abs(start) + float32(cells)) * abs(a_cell)
 
 
 @inner(inline="always")
 def when_at_wall(u, cells, clear, axis):
-    """Distance at which a ray leaves the cells nearer than the `clear`-th from that at u, along one axis; see `crossing`."""
-    start, a_cell = axis
+    """Distance up to which a ray is surely in cells nearer than the `clear`-th from that at u, along one axis; see `crossing`."""
+    start, a_cell, unsure = axis
     wall = cell(u, cells) + (clear if a_cell > float32(0) else 1 - clear)
-    return (float32(wall) - start) * a_cell
+    return (float32(wall) - start) * a_cell - unsure
 
 
 @kernel
@@ -121,6 +125,7 @@ def walk(which, origins, directions, near, far, inside, shift, occupied, resolut
             across = crossing(origins[ray, 0], directions[ray, 0], centre[0], half[0], cells)
             down = crossing(origins[ray, 1], directions[ray, 1], centre[1], half[1], cells)
             deep = crossing(origins[ray, 2], directions[ray, 2], centre[2], half[2], cells)
+            unsure = float32(0.01) + ROUNDED * span[1] / step  # steps by which a distance may be wrong
             start = edge(k, shift[ray], span, step, samples, unbounded)
             while k <= samples and kept < most:
                 end = edge(k + 1, shift[ray], span, step, samples, unbounded)
@@ -137,7 +142,7 @@ def walk(which, origins, directions, near, far, inside, shift, occupied, resolut
                     if not unbounded:
                         first = min(when_at_wall(u, cells, clear, across), when_at_wall(v, cells, clear, down))
                         first = min(first, when_at_wall(w, cells, clear, deep))
-                        leap = max(int((first - t) / step) - 1, 0)  # one less, as it is rounded
+                        leap = int((first - t) / step - unsure)
                         if leap > 0:
                             k += leap
                             end = edge(k + 1, shift[ray], span, step, samples, unbounded)
