@@ -100,7 +100,7 @@ def crossing(origin, direction, middle, half, cells):
 
 @inner(inline="always")
 def when_at_wall(u, cells, clear, axis):
-    """Distance up to which a ray is surely in cells nearer than the `clear`-th from that at u, along one axis; see `crossing`."""
+    """Distance up to which a ray is surely in cells nearer than the `clear`-th from that at u along an axis; see `crossing`."""
     start, a_cell, unsure = axis
     wall = cell(u, cells) + (clear if a_cell > float32(0) else 1 - clear)
     return (float32(wall) - start) * a_cell - unsure
