@@ -67,6 +67,11 @@ def behave(how: str) -> None:
             (work / "error.txt").write_text(
                 "Traceback (most recent call last):\n  ...\nValueError: nobody caught this\n"
             )
+        case "jobs refuse":
+            print("size=a: failed: config: no\nsize=b: failed: config: no", file=sys.stderr)
+            sys.exit("nerf_lightning: 2 of 2 jobs failed: size=a, size=b")
+        case "a job fails and is not named":
+            sys.exit("nerf_lightning: 1 of 2 jobs failed: size=a")
         case "a job refuses":
             (work / "error.txt").write_text("Traceback ...\nnerf_lightning.errors.InputError: no\n")
         case "works":

@@ -40,7 +40,9 @@ OUTCOMES = {
     "refuses in two lines": "said otherwise",
     "refuses without a word": "said otherwise",
     "fails with another code": "said otherwise",
+    "a job fails and is not named": "said otherwise",
     "refuses": "answered",
+    "jobs refuse": "answered",
     "warns": "warned",
     "trains": "accepted",
     "a job refuses": "accepted",
@@ -64,7 +66,7 @@ def process(*arguments: str, cwd: Path) -> str:
 def test_what_a_command_does_is_what_the_table_says(tmp_path: Path):
     """By behaviour: what the judge says of it where the input was damaged, and where it was not."""
     judged = json.loads(process("misbehaving", *OUTCOMES, cwd=tmp_path))
-    assert judged == {how: [found, "good refused" if how == "refuses" else found] for how, found in OUTCOMES.items()}
+    assert judged == {how: [found, "good refused" if found == "answered" else found] for how, found in OUTCOMES.items()}
 
 
 @pytest.mark.parametrize("cases", CASES)

@@ -54,7 +54,7 @@ def judge(ended: Ended, command: Command, limits: Limits, folder: Path, harmed: 
 
 def _outcome(ended: Ended, command: Command, limits: Limits, folder: Path) -> tuple[str, str]:
     lines = [line for line in ended.err.splitlines() if line.strip()]
-    answered = ended.code == 2 and len(lines) == 1
+    answered = (ended.code == 2 and len(lines) == 1) or (ended.code == 1 and _jobs_failed(lines))
     if ended.marked:
         return "code run", _place(ended.err) or "a file was made"
     if -ended.code in TIMERS:
@@ -76,7 +76,7 @@ def _outcome(ended: Ended, command: Command, limits: Limits, folder: Path) -> tu
     if left := leftovers(ended, ended.code == 0 or own or command.verb in KEPT):
         return "half-written", f"exit {ended.code}, {command.verb}: {left}"
     if answered:
-        return "answered", lines[0]
+        return "answered", lines[-1]
     if ended.code == 0:
         warned = "warning" in (ended.out + ended.err).lower() or "guard:" in ended.out
         if not warned and (empty := _nothing_came(ended, folder)):
@@ -85,6 +85,13 @@ def _outcome(ended: Ended, command: Command, limits: Limits, folder: Path) -> tu
     strange = [line for line in lines if not line.startswith("nerf_lightning: ")] or lines or ["nothing"]
     said = re.sub(r"^\S*/(?=nerf_lightning/|site-packages/)", "", strange[0]).split(": ")[0]
     return "said otherwise", f"exit {ended.code} and {'more than ' * (len(lines) > 1)}a line: {_short(said)}"
+
+
+def _jobs_failed(lines: list[str]) -> bool:
+    """Whether a sweep told each job that failed in a line, and then how many these were."""
+    *jobs, last = lines or [""]
+    found = re.match(r"nerf_lightning: (\d+) of \d+ jobs failed: ", last)
+    return found is not None and len(jobs) == int(found[1]) and all(": failed: " in job for job in jobs)
 
 
 def leftovers(ended: Ended, finished: bool) -> str:
