@@ -237,7 +237,9 @@ def test_rays_along_the_walls_of_blocks_keep_the_very_samples(away: float):
     for lean in (0.0, 1e-7, 1e-6, 1e-5, 1e-3, 0.3):
         generator = torch.Generator().manual_seed(1)
         sideways = lean * (2 * torch.rand(500, generator=generator) - 1)
-        direction = normalize(torch.stack([torch.ones(500), sideways, 0.1 * torch.rand(500, generator=generator)], 1), dim=1)
+        direction = normalize(
+            torch.stack([torch.ones(500), sideways, 0.1 * torch.rand(500, generator=generator)], 1), dim=1
+        )
         at = torch.stack([torch.zeros(500), 1e-6 * torch.randn(500, generator=generator), torch.zeros(500)], 1)
         rays, found = Rays(at - away * direction, direction), []
         for version in ("reference", "auto"):
