@@ -1,6 +1,7 @@
 """What a configuration from outside may name: a stranger's run folder or compact file must not execute code."""
 
 import importlib
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,8 @@ def _check(path: Path | str, key: str, node: Any) -> None:
             _check(path, f"{key}[{index}]", value)
     elif isinstance(node, str) and ("${" in node or node == "???"):
         raise InputError(path, key, repr(node), "a resolved value")
+    elif isinstance(node, float) and not math.isfinite(node):
+        raise InputError(path, key, str(node), "a finite number")
     elif not isinstance(node, str | int | float | None):
         raise InputError(path, key, f"a {type(node).__name__}", "plain values")
 

@@ -92,6 +92,12 @@ def an_option_of_another_version(run: Path) -> None:
     (run / "config.yaml").write_text(yaml.safe_dump(config))
 
 
+def an_option_that_is_no_number(run: Path) -> None:
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["logger"] = [0, float("nan")]
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+
+
 def a_strangers_target(run: Path) -> None:
     config = yaml.safe_load((run / "config.yaml").read_text())
     config["model"] = {"_target_": "pathlib.Path.touch", "_args_": [str(run.parent / "executed")]}
@@ -119,6 +125,7 @@ DAMAGES: dict[Callable[[Path], None], str] = {
     a_later_format: "found format 99, expected format 1, which this version reads",
     another_model: "expected the weights of this run's model",
     an_option_of_another_version: "model.hue: found an unknown option",
+    an_option_that_is_no_number: "config.yaml: logger[1]: found nan, expected a finite number",
     a_strangers_target: "model._target_: found 'pathlib.Path.touch', expected a class of this package",
     a_strangers_yaml: "expected a run's configuration in YAML",
     a_strangers_checkpoint: "expected a whole checkpoint of tensors and plain values",
