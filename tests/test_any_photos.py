@@ -1,7 +1,9 @@
 """Photos of several sizes through a fisheye, some masked: trained on, judged, filmed, exported and looked at."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
@@ -12,10 +14,13 @@ import nerf_lightning as nl
 from nerf_lightning.cameras import Cameras, Distortion, Lenses
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Views
+from nerf_lightning.dataset.views import Runs
 from nerf_lightning.evaluate.__main__ import task as evaluate
 from nerf_lightning.export.__main__ import task as export
 from nerf_lightning.render.__main__ import task as render
+from nerf_lightning.renderer import Rendered
 from nerf_lightning.stability.toys import PILE, around, photograph
+from nerf_lightning.system import NeRF3D
 from nerf_lightning.view.drawing import frusta
 from tests.dataset.colmap_files import cameras_of, photos, write_colmap
 
@@ -76,3 +81,36 @@ def test_a_run_on_any_photos(folder: Path, tmp_path: Path, capsys: pytest.Captur
     export(composed([f"run={tmp_path / 'run'}", "loss=20", "device=cpu"], tmp_path, "export"))
     assert (tmp_path / "run/compact.npz").exists()
     assert len(list(frusta(scene.train, "train", 16))) == len(scene.train)
+
+
+QUICK = [
+    "callbacks.snapshots=null",
+    "callbacks.orbit=null",
+    "callbacks.heldout.at=[0.5]",
+    "~logger",
+    "sampler.samples=32",
+]
+
+
+def test_a_held_out_photo_of_which_nothing_is_known_does_not_count(folder: Path, tmp_path: Path):
+    scene = nl.load_scene(folder)
+    mask = scene.val.mask.clone()
+    mask[: 24 * 24] = False
+    scene = replace(scene, val=replace(scene.val, known=Runs.of(mask)))
+    run = nl.train(scene, steps=4, seed=1, device="cpu", folder=tmp_path / "run", options=QUICK)
+    assert np.isfinite(run.psnr) and run.results["psnr_worst_view"] == run.results["psnr"]
+    assert len(run.results["curve"]) == 2
+
+
+def test_pictures_that_are_no_numbers_are_told(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As where weights are finite and what they add up to is not."""
+    render_well = NeRF3D.render
+
+    def render_badly(self: NeRF3D, *given: Any) -> Rendered:
+        rendered = render_well(self, *given)
+        return replace(rendered, rgb=rendered.rgb * torch.nan)
+
+    monkeypatch.setattr(NeRF3D, "render", render_badly)
+    run = nl.train(nl.load_scene(folder), steps=4, seed=1, device="cpu", folder=tmp_path / "run", options=QUICK)
+    assert run.results["status"] == "collapsed" and "not finite" in run.results["diagnosis"]
+    assert run.results["psnr"] is None and run.results["curve"] == []

@@ -1,5 +1,6 @@
 """HeldOut: the quality curve, on views that are never trained on."""
 
+import math
 from statistics import fmean
 from typing import Any
 
@@ -38,7 +39,7 @@ class HeldOut(L.Callback):
         self.at = list(at)
         self.views = views
         self.curve: list[list[float]] = []
-        """[training seconds, step, PSNR], a row for each measurement."""
+        """[training seconds, step, PSNR], a row for each measurement; nan where there was no figure."""
         self.view_seconds: float | None = None
         """Rendering time of a view at the last measurement."""
 
@@ -60,8 +61,9 @@ class HeldOut(L.Callback):
         return max(1, int(allowed / self.view_seconds))
 
     def record(self, trainer: L.Trainer, results: list[ViewResult]) -> None:
-        """Adds a point to the curve and to the log."""
-        quality = fmean(result.psnr for result in results)
+        """Adds a point to the curve and to the log; views of which no pixel is known do not count."""
+        counted = [result.psnr for result in results if math.isfinite(result.psnr)]
+        quality = fmean(counted) if counted else math.nan
         self.view_seconds = fmean(result.seconds for result in results)
         self.curve.append([round(Budget.of(trainer).seconds, 3), trainer.global_step, round(quality, 4)])
         if trainer.logger is not None:

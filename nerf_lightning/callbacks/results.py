@@ -122,8 +122,10 @@ class Results(L.Callback):
         self.views.append(outputs)
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        quality = fmean(view["psnr"] for view in self.views)
-        plain = fmean(view["plain_psnr"] for view in self.views)
+        counted = [view for view in self.views if math.isfinite(view["psnr"])]
+        quality, plain = (
+            fmean(view[key] for view in counted) if counted else math.nan for key in ("psnr", "plain_psnr")
+        )
         scene = data_of(trainer).scene
         if isinstance(pl_module, NeRF3D) and isinstance(scene, Scene):
             if pl_module.corrections is not None and pl_module.corrections.since:
@@ -137,6 +139,9 @@ class Results(L.Callback):
         broken = [name for name, value in pl_module.named_parameters() if not value.isfinite().all()]
         if broken:
             self.write(trainer, pl_module, "collapsed", f"{broken[0]} is no longer finite")
+        elif not counted:
+            diagnosis = "held-out views have no figure: what is rendered is not finite, or no pixel of theirs is known"
+            self.write(trainer, pl_module, "collapsed", diagnosis)
         elif quality < nothing:
             found = pl_module.diagnose(data_of(trainer).held_out(0).to(pl_module.device))
             diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
@@ -162,7 +167,7 @@ class Results(L.Callback):
         scene, budget = data_of(trainer).scene, Budget.of(trainer)
         throughput, held_out = attached(trainer, Throughput), attached(trainer, HeldOut)
         guard = attached(trainer, Guard)
-        curve = held_out.curve if held_out is not None else []
+        curve = [] if held_out is None else [point for point in held_out.curve if math.isfinite(point[2])]
 
         def over_views(statistic: Any, key: str) -> float | None:
             values = [view[key] for view in self.views if math.isfinite(view[key])]
