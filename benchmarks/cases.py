@@ -16,7 +16,7 @@ from nerf_lightning.model import HashGrid, HashGrid2DField, VectorMatrix, VoxelF
 SAMPLES, RAYS = 1 << 15, 1 << 12
 STEPS, CELLS = 192, 64
 """Steps along a ray at most, and cells along a side of the occupancy grid."""
-TRANSPARENT, THIN = 1e-4, 5e-3
+TRANSPARENT, THIN, FAINT = 1e-4, 5e-3, 1e-2
 KINK = 1e-5
 """Distance from zero that counts as near for a rectifier."""
 GONE = 1 / 3
@@ -71,7 +71,12 @@ def march(unbounded: bool, room: int | None, *tensors: Tensor) -> Outputs:
 
 def keep_visible(room: int | None, thickness: Tensor, *packed: Tensor) -> Outputs:
     t, dt, ray, offsets = packed
-    return kernels.keep_visible(thickness, (t, dt, ray, offsets), TRANSPARENT, THIN, room)
+    return kernels.keep_visible(thickness, (t, dt, ray, offsets), TRANSPARENT, THIN, room)[1]
+
+
+def merge_faint(thickness: Tensor, *packed: Tensor) -> Outputs:
+    t, dt, ray, offsets = packed
+    return kernels.merge_faint(thickness, (t, dt, ray, offsets), FAINT)[1]
 
 
 def mark_cells(marks: Tensor, aabb: Tensor, positions: Tensor) -> Tensor:
@@ -172,6 +177,7 @@ def _cases() -> dict[str, Case]:
         "keep_visible, into room": Case(
             partial(keep_visible, room), (density[torch.arange(room) % len(t)] * roomy[1], *roomy), kind="packed"
         ),
+        "merge_faint": Case(merge_faint, (density * packed[1], *packed), kind="packed"),
         "mark_cells": Case(mark_cells, (marks, aabb, kernels.points(origins, directions, ray, t))),
         "hash_interpolate": Case(partial(hash_interpolate, grid.cells, grid.sizes), (grid.tables, unit), learns=1),
         "hash_interpolate_2d": Case(

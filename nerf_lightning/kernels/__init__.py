@@ -18,6 +18,7 @@ from nerf_lightning.kernels.march import (
     pack_intervals,
     points,
 )
+from nerf_lightning.kernels.merge import merge_faint
 from nerf_lightning.kernels.mlp import mlp, mlp_heads
 from nerf_lightning.kernels.planes import (
     plane_line_products,
@@ -49,6 +50,7 @@ __all__ = [
     "march",
     "mark_cells",
     "mark_rows",
+    "merge_faint",
     "mlp",
     "mlp_heads",
     "pack_intervals",

@@ -13,8 +13,10 @@ from nerf_lightning.kernels.switch import fast
 
 Pixels = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
 """Colour, opacity and depth summed along each ray, each sample by its weight."""
-Kept = tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
-"""As `Packed`, for the K of N samples that are kept."""
+Kept = tuple[
+    Float[Tensor, "K"], tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
+]
+"""Optical thickness of the K of N samples that are kept, and what `Packed` says of them."""
 
 
 def volume_weights(
@@ -113,10 +115,12 @@ def keep_visible_reference(
     counts = counted(keep)
     if room is None:
         index, kept = keep.nonzero()[:, 0], counts.index_select(0, offsets)
-        return t.index_select(0, index), dt.index_select(0, index), ray.index_select(0, index), kept
+        found, t, dt, ray = (x.index_select(0, index) for x in (thickness, t, dt, ray))
+        return found, (t, dt, ray, kept)
     index, there = within(room, counts)
     kept = counts.index_select(0, offsets.clamp_max(len(keep)))  # a ray may end beyond the room of the earlier call
-    return t.index_select(0, index), dt.index_select(0, index) * there, ray.index_select(0, index), kept
+    found, t, dt, ray = (x.index_select(0, index) for x in (thickness, t, dt, ray))
+    return found * there, (t, dt * there, ray, kept)
 
 
 def keep_visible(
@@ -143,19 +147,10 @@ def keep_visible(
     from nerf_lightning.kernels.cpu import composite, workers
 
     threads, keep, counts = workers(), np.empty(len(t), np.bool_), np.empty(len(offsets) - 1, np.int64)
-    composite.visible(
-        thickness.detach().contiguous().numpy(),
-        offsets.numpy(),
-        early_stop_eps,
-        float(min_thickness),
-        dropped,
-        keep,
-        counts,
-        threads,
-    )
+    given, ends = [x.detach().contiguous().numpy() for x in (thickness, t, dt)], offsets.numpy()
+    composite.visible(given[0], ends, early_stop_eps, float(min_thickness), dropped, keep, counts, threads)
     kept = torch.zeros_like(offsets)
     np.cumsum(counts, out=kept.numpy()[1:])
-    total = int(kept[-1])
-    out = torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
-    composite.gather(keep, offsets.numpy(), kept.numpy(), t.numpy(), dt.numpy(), *(x.numpy() for x in out), threads)
-    return *out, kept
+    out = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
+    composite.gather(keep, ends, kept.numpy(), *given, *(x.numpy() for x in out), threads)
+    return out[0][0], (out[0][1], out[0][2], out[1], kept)

@@ -152,6 +152,8 @@ class VolumeRenderer(torch.nn.Module):
         if backgrounds is None:
             backgrounds = self.backgrounds(len(rays))
         density, rgb, *view_part = field(samples.positions(rays), samples.directions(rays))
+        if samples.thickness is not None and not density.requires_grad:
+            density = samples.thickness / samples.dt
         summed, opacity, distance = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
         if self.unbounded and not density.requires_grad:
             # The mean says little: a hundredth of the weight, left over for the far end, would move it behind the wall.

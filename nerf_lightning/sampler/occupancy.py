@@ -165,7 +165,8 @@ class OccupancySampler(Sampler):
             steps, stop = self.picture_samples, max(self.early_stop_eps, UNSEEN)
             found, packed = self._look(rays, density, near, far, torch.zeros_like(near), self.occupied, steps, stop)
             # A picture must not depend on how its rays are split into calls: only training uses the mean to drop steps.
-            return Samples(*keep_visible(found, packed, stop, UNSEEN, dropped=UNSEEN))
+            found, packed = keep_visible(found, packed, stop, UNSEEN, dropped=UNSEEN)
+            return Samples(*packed, thickness=found)
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.occupied if self.look_everywhere else self.lit
         rooms = [None, None] if self.per_ray is None else [math.ceil(ROOM * many * len(rays)) for many in self.per_ray]
@@ -173,7 +174,7 @@ class OccupancySampler(Sampler):
         if self.thin is None:
             mean = (self.thickness * self.lit).sum() / self.lit.sum()
             self.thin = mean.mul(0.5).clamp_max(-math.log1p(-self.alpha_thre))
-        kept = keep_visible(found, packed, self.early_stop_eps, self.thin, rooms[1])
+        _, kept = keep_visible(found, packed, self.early_stop_eps, self.thin, rooms[1])
         places = Samples(*kept).positions(rays)
         mark_cells(self.reached, self.updates, self.bounds, places)
         if rooms[0] is not None:

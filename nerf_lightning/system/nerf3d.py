@@ -259,7 +259,7 @@ class NeRF3D(System):
             found = self.sampler(chunk, self.field.density)
             if near > 0 or far < math.inf:
                 found = found.between(near, far)
-            for run, samples in split(found, self.chunk):
+            for run, samples in split(found.merged(), self.chunk):
                 part_rays = chunk[run]
                 parts.append(self.renderer(part_rays, samples, self.field, behind.expand(len(part_rays), 3)))
         return Rendered(

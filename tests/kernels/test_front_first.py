@@ -46,9 +46,9 @@ def test_all_that_light_reaches_is_found_and_little_else(share: float):
     use_kernels("auto")
     found, packed, asked = looked(rays, occupied)
     for min_thickness in (0.0, 0.05):
-        kept = keep_visible(found, packed, EPS, min_thickness)
-        wanted = keep_visible(expected, every, EPS, min_thickness)
-        assert all(torch.equal(a, b) for a, b in zip(kept, wanted, strict=True))
+        kept, which = keep_visible(found, packed, EPS, min_thickness)
+        wanted, those = keep_visible(expected, every, EPS, min_thickness)
+        assert all(torch.equal(a, b) for a, b in zip((kept, *which), (wanted, *those), strict=True))
     assert asked == len(found) and (len(found) < 0.7 * most or share < 1)
     again = with_threads(lambda: looked(rays, occupied), 2 if torch.get_num_threads() == 1 else 1)
     assert torch.equal(found, again[0]) and torch.equal(packed[0], again[1][0])

@@ -27,6 +27,7 @@ CALLS: dict[str, Callable[[], object]] = {
     "colours of two channels": lambda: k.composite(ONE, torch.zeros(3, 2), ONE, ONE, RAY, OFFSETS),
     "too few colours": lambda: k.composite(ONE, torch.zeros(2, 3), ONE, ONE, RAY, OFFSETS),
     "too little thickness": lambda: k.keep_visible(ONE[1:], (ONE, ONE, RAY, OFFSETS), 1e-4, 0.0),
+    "too little thickness to merge": lambda: k.merge_faint(ONE[1:], (ONE, ONE, RAY, OFFSETS), 0.1),
     "directions of two coordinates": lambda: k.spherical_harmonics(torch.zeros(5, 2)),
     "places in a row": lambda: k.hash_interpolate(torch.zeros(27, 2), torch.rand(4), [(2, 2, 2)], [27]),
     "too few near ends": lambda: k.march(RAYS, BOX, ONE[1:], ONE, ONE, CELLS, 8, 0.1),

@@ -50,6 +50,7 @@ CASES: dict[str, tuple[Callable[[Tensor, Tensor], object], str, bool]] = {
     "visible lengths": (
         lambda x, c: k.keep_visible(c[:, 0], (c[:, 1], x[:, 2], RAY, OFFSETS), 1e-4, 0.0), "composite.visible", False,
     ),
+    "merged thickness": (lambda x, c: k.merge_faint(x[:, 0], (c[:, 1], c[:, 2], RAY, OFFSETS), 0.1), "merge.pair", False),
     "march": (march, "march.walk", False),
     "mark_cells": (mark_cells, "march.mark", True),
     "points of rays": (lambda x, c: k.points(x, c, RAY, c[:, 0]), "march.points", True),

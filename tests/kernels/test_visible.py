@@ -13,6 +13,11 @@ def packed(samples: Samples):
     return samples.t, samples.dt, samples.ray, samples.offsets
 
 
+def flat(kept):
+    thickness, packed = kept
+    return thickness, *packed
+
+
 @pytest.mark.parametrize("counts", COUNTS)
 @pytest.mark.parametrize("early_stop_eps", [1e-4, 0.5])
 @pytest.mark.parametrize(("min_thickness", "dropped"), [(0.0, math.inf), (1e-3, math.inf), (0.2, math.inf), (0.2, 0.3)])
@@ -33,7 +38,8 @@ def test_what_is_seen_agrees_with_a_loop(
             i += 1
         ends.append(len(kept))
     given = density * samples.dt, packed(samples), early_stop_eps, min_thickness
-    t, dt, ray, offsets = keep_visible(*given, dropped=dropped)
+    thickness, (t, dt, ray, offsets) = keep_visible(*given, dropped=dropped)
+    assert torch.equal(thickness, given[0][kept])
     assert torch.equal(t, samples.t[kept]) and torch.equal(dt, samples.dt[kept])
     assert torch.equal(ray, samples.ray[kept]) and offsets.tolist() == ends
 
@@ -46,18 +52,20 @@ def test_what_is_seen_agrees_with_the_reference(counts: list[int], min_thickness
     results = {}
     for choice in ("auto", "reference"):
         use_kernels(choice)
-        results[choice] = keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness, dropped=dropped)
+        results[choice] = flat(
+            keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness, dropped=dropped)
+        )
     assert all(torch.equal(a, b) for a, b in zip(*results.values(), strict=True))
     use_kernels("auto")
     one = with_threads(
         lambda: keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness, dropped=dropped), 1
     )
-    assert all(torch.equal(a, b) for a, b in zip(one, results["auto"], strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(flat(one), results["auto"], strict=True))
 
 
 def test_nothing_is_dropped_when_all_may_stay(kernels: str):
     samples = ragged(MANY)
-    kept = keep_visible(torch.full((len(samples),), 1e-3), packed(samples), 1e-4, 0.1, dropped=1e-4)
+    _, kept = keep_visible(torch.full((len(samples),), 1e-3), packed(samples), 1e-4, 0.1, dropped=1e-4)
     assert all(torch.equal(a, b) for a, b in zip(kept, packed(samples), strict=True))
 
 
@@ -65,7 +73,7 @@ def test_dropping_what_is_not_seen_changes_pixels_by_no_more_than_it_may():
     samples = ragged(MANY)
     density, rgb = 20 * torch.rand(len(samples)) ** 4, torch.rand(len(samples), 3)
     whole = composite(density, rgb, *packed(samples))
-    t, dt, ray, offsets = keep_visible(density * samples.dt, packed(samples), 1e-3, 0.0)
+    _, (t, dt, ray, offsets) = keep_visible(density * samples.dt, packed(samples), 1e-3, 0.0)
     assert 0 < len(t) < len(samples)
     place = {key: i for i, key in enumerate(zip(samples.ray.tolist(), samples.t.tolist(), strict=True))}
     index = torch.tensor([place[key] for key in zip(ray.tolist(), t.tolist(), strict=True)])
@@ -77,5 +85,5 @@ def test_a_density_that_is_not_a_number_stays(kernels: str):
     samples = ragged([3, 5, 2])
     density = torch.zeros(10)
     density[5] = float("nan")
-    t, _, ray, _ = keep_visible(density * samples.dt, packed(samples), 1e-4, 0.01)
+    _, (t, _, ray, _) = keep_visible(density * samples.dt, packed(samples), 1e-4, 0.01)
     assert float(samples.t[5]) in t.tolist() and (ray == 1).any()

@@ -85,15 +85,15 @@ def visible(thickness, offsets, early_stop_eps, min_thickness, dropped, keep, co
 
 
 @kernel
-def gather(keep, offsets, kept_offsets, t, dt, out_t, out_dt, out_ray, workers):
-    """Packs the kept samples."""
+def gather(keep, offsets, kept_offsets, thickness, t, dt, out, out_ray, workers):
+    """Packs the kept samples: their thickness, t and dt into out [3, K]."""
     rays = len(offsets) - 1
     for worker in prange(workers):
         for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
             to = kept_offsets[ray]
             for n in range(offsets[ray], offsets[ray + 1]):
                 if keep[n]:
-                    out_t[to], out_dt[to], out_ray[to] = t[n], dt[n], ray
+                    out[0, to], out[1, to], out[2, to], out_ray[to] = thickness[n], t[n], dt[n], ray
                     to += 1
 
 

@@ -1,0 +1,64 @@
+"""Fewer samples along rays: one that hardly counts and the one beside it become one."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.kernels.composite import Kept, volume_weights
+from nerf_lightning.kernels.march import Packed, counted
+from nerf_lightning.kernels.switch import fast
+
+APART = 0.625
+"""Distance between the midpoints of neighbours, as a share of their lengths together: 0.5 if they touch, and 0.75 at least with
+one of equal length between them."""
+
+
+def merge_faint_reference(thickness: Tensor, packed: Packed, faint: float) -> Kept:
+    """`merge_faint` in plain PyTorch, for every device."""
+    t, dt, ray, offsets = packed
+    weights = volume_weights(thickness, torch.ones_like(thickness), ray, offsets)
+    one, two = weights[:-1], weights[1:]
+    near = (ray[1:] == ray[:-1]) & (t[1:] - t[:-1] < APART * (dt[1:] + dt[:-1]))
+    could = torch.zeros_like(ray, dtype=torch.bool)
+    could[1:] = near & (torch.minimum(one, two) < faint) & (one + two < 2)
+    # Of several in a row that could, every second one does.
+    place = torch.arange(len(ray), device=ray.device)
+    chain = torch.where(could, 0, place).cummax(0).values if len(ray) else place
+    joins = could & ((place - chain) % 2 == 1)
+    index, kept = (~joins).nonzero()[:, 0], counted(~joins).index_select(0, offsets)
+
+    def kept_of(own: Tensor, added: Tensor) -> Tensor:
+        """Of those that remain, with what the next one adds where that joins."""
+        more = torch.where(joins, added, 0.0).roll(-1)  # the first never joins
+        return (own + more).index_select(0, index)
+
+    share = weights / (weights + weights.roll(1)).clamp_min(1e-30)
+    found = (kept_of(thickness, thickness), kept_of(t, share * (t - t.roll(1))), kept_of(dt, dt))
+    return found[0], (*found[1:], ray.index_select(0, index), kept)
+
+
+def merge_faint(thickness: Float[Tensor, "N"], packed: Packed, faint: float) -> Kept:
+    """Merges samples with the neighbour before them where the weight of either is below `faint`, at most two into one.
+
+    The merged interval has the length and the thickness of both, so that opacity stays as it was, and its t is the mean by
+    weights, so that depth does. Only the colour is asked at one place instead of two.
+
+    Args:
+        thickness: optical thickness of each sample, density times length.
+        packed: midpoints, lengths, rays and offsets of N samples. Only those that touch are merged.
+        faint: weight, see `volume_weights`.
+    """
+    t, dt, _, offsets = packed
+    if not fast(thickness, t, dt) or any(x.requires_grad for x in (thickness, t, dt)):
+        return merge_faint_reference(thickness, packed, faint)
+    from nerf_lightning.kernels.cpu import merge, workers
+
+    given, ends, threads = [x.contiguous().numpy() for x in (thickness, t, dt)], offsets.numpy(), workers()
+    share, counts = np.empty(len(t), np.float32), np.empty(len(offsets) - 1, np.int64)
+    merge.pair(*given, ends, faint, APART, share, counts, threads)
+    kept = torch.zeros_like(offsets)
+    np.cumsum(counts, out=kept.numpy()[1:])
+    out = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
+    merge.join(share, ends, kept.numpy(), *given, *(x.numpy() for x in out), threads)
+    return out[0][0], (out[0][1], out[0][2], out[1], kept)

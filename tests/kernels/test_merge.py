@@ -1,0 +1,98 @@
+import math
+
+import pytest
+import torch
+from agreement import with_threads
+from ragged import COUNTS, MANY, ragged
+
+from nerf_lightning.kernels import composite, merge_faint, use_kernels
+from nerf_lightning.kernels.composite import Kept
+from nerf_lightning.sampler import Samples
+
+FAINT = 0.1
+
+
+def packed(samples: Samples):
+    return samples.t, samples.dt, samples.ray, samples.offsets
+
+
+def foggy(counts: list[int]) -> tuple[torch.Tensor, Samples]:
+    """Thickness and samples, of which some stand alone."""
+    samples = ragged(counts)
+    keep = torch.rand(len(samples)) < 0.8
+    ends = torch.cat([torch.zeros(1, dtype=torch.int64), keep.cumsum(0)])[samples.offsets]
+    some = Samples(samples.t[keep], samples.dt[keep], samples.ray[keep], ends)
+    return 2 * torch.rand(len(some)) ** 3, some
+
+
+def by_hand(thickness: torch.Tensor, samples: Samples, faint: float) -> list[tuple[float, ...]]:
+    """Thickness, t, dt and ray of what remains."""
+    found: list[tuple[float, ...]] = []
+    for ray in range(len(samples.offsets) - 1):
+        passed, last, weight_before = 0.0, None, 0.0
+        for n in range(int(samples.offsets[ray]), int(samples.offsets[ray + 1])):
+            own, t, dt = (float(x[n]) for x in (thickness, samples.t, samples.dt))
+            weight = math.exp(-passed) * (1 - math.exp(-own))
+            passed += own
+            touches = last is not None and (t - dt / 2) - (last[1] + last[2] / 2) < 0.02
+            if touches and min(weight, weight_before) < faint:
+                both = weight + weight_before
+                found[-1] = (own + last[0], (weight * t + weight_before * last[1]) / both, dt + last[2], ray)
+                last = None  # at most two
+            else:
+                found.append((own, t, dt, ray))
+                last = own, t, dt
+            weight_before = weight
+    return found
+
+
+@pytest.mark.parametrize("counts", [*COUNTS, MANY])
+@pytest.mark.parametrize("faint", [0.0, FAINT, 1.1])
+def test_neighbours_that_hardly_count_are_merged(counts: list[int], faint: float, kernels: str):
+    thickness, samples = foggy(counts)
+    merged, (t, dt, ray, offsets) = merge_faint(thickness, packed(samples), faint)
+    wanted = by_hand(thickness, samples, faint)
+    torch.testing.assert_close(torch.stack([merged, t, dt, ray.float()], dim=1), torch.tensor(wanted).view(-1, 4))
+    assert torch.equal(offsets.diff(), torch.bincount(ray, minlength=len(counts)))
+    assert len(t) < len(samples) or faint == 0 or len(samples) < 20
+
+
+@pytest.mark.parametrize("counts", [[], [0, 0], MANY])
+def test_merging_agrees_with_the_reference(counts: list[int]):
+    thickness, samples = foggy(counts)
+
+    def merged() -> Kept:
+        return merge_faint(thickness, packed(samples), FAINT)
+
+    found = {}
+    for choice in ("reference", "auto"):
+        use_kernels(choice)
+        found[choice] = merged()
+    (wanted, those), (actual, these) = found.values()
+    for a, b in zip((actual, *these), (wanted, *those), strict=True):
+        torch.testing.assert_close(a, b)
+    one, which = with_threads(merged, 1)
+    assert torch.equal(one, actual) and all(torch.equal(a, b) for a, b in zip(which, these, strict=True))
+
+
+def test_opacity_and_depth_stay_and_colours_hardly_change(kernels: str):
+    thickness, samples = foggy(MANY)
+    merged, (t, dt, ray, offsets) = merge_faint(thickness, packed(samples), 0.01)
+
+    def seen(thickness, t, dt, ray, offsets):
+        rgb = torch.stack([t, t.square(), torch.sin(t)], dim=1) / 25  # within [0, 1]
+        return composite(thickness / dt, rgb, t, dt, ray, offsets)
+
+    whole, part = seen(thickness, *packed(samples)), seen(merged, t, dt, ray, offsets)
+    assert len(t) < 0.9 * len(samples)
+    torch.testing.assert_close(whole[1:], part[1:], rtol=1e-5, atol=1e-5)
+    assert 0 < (whole[0] - part[0]).abs().max() < 0.01
+
+
+def test_a_thickness_that_is_not_a_number_stays_alone(kernels: str):
+    samples = ragged([3, 5, 2])
+    thickness = torch.full((10,), 1e-3)
+    thickness[5] = math.nan
+    merged, (t, _, _, offsets) = merge_faint(thickness, packed(samples), FAINT)
+    assert merged.isnan().sum() == 1 and float(samples.t[5]) in t.tolist() and t.isfinite().all()
+    assert offsets[:3].tolist() == [0, 2, 6]
