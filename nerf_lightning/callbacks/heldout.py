@@ -9,7 +9,7 @@ import lightning as L
 from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.errors import InputError
-from nerf_lightning.system import System, ViewResult
+from nerf_lightning.system import System
 from nerf_lightning.utils.ending import leave_if_asked
 from nerf_lightning.utils.evenly import evenly
 
@@ -60,16 +60,16 @@ class HeldOut(L.Callback):
         allowed = Budget.of(trainer).drawing_seconds(trainer.global_step) / len(self.at)
         return max(1, int(allowed / self.view_seconds))
 
-    def record(self, trainer: L.Trainer, results: list[ViewResult]) -> None:
+    def record(self, trainer: L.Trainer, views: list[dict[str, float]]) -> None:
         """Adds a point to the curve and to the log; views of which no pixel is known do not count."""
-        counted = [result.psnr for result in results if math.isfinite(result.psnr)]
+        counted = [view["psnr"] for view in views if math.isfinite(view["psnr"])]
         quality = fmean(counted) if counted else math.nan
-        self.view_seconds = fmean(result.seconds for result in results)
+        self.view_seconds = fmean(view["seconds"] for view in views)
         self.curve.append([round(Budget.of(trainer).seconds, 3), trainer.global_step, round(quality, 4)])
         if trainer.logger is not None:
             figures = {"heldout/psnr": quality}
-            if all(result.truth.shape[:2].numel() <= LARGE for result in results):
-                figures["heldout/ssim"] = fmean(result.ssim for result in results)
+            if all("ssim" in view for view in views):
+                figures["heldout/ssim"] = fmean(view["ssim"] for view in views)
             trainer.logger.log_metrics(figures, trainer.global_step)
 
     def on_train_batch_end(
@@ -97,13 +97,15 @@ class HeldOut(L.Callback):
                     f"{len(chosen)} of {data.held_out_views} held-out views are measured while training, as one takes "
                     f"{self.view_seconds:.1f} s; callbacks.heldout.views={data.held_out_views} takes all"
                 )
-            results: list[ViewResult] = []
+            views: list[dict[str, float]] = []  # not their pictures, which would be held together
             for result in pl_module.evaluate_held_out(data, chosen):
-                results.append(result)
+                views.append({"psnr": result.psnr, "seconds": result.seconds})
+                if trainer.logger is not None and result.truth.shape[:2].numel() <= LARGE:
+                    views[-1]["ssim"] = result.ssim
                 if trainer.world_size == 1:  # several processes leave together, at the end of a step
                     leave_if_asked()
             while len(self.curve) < due:  # one step may pass several marks: one measurement counts for all
-                self.record(trainer, results)
+                self.record(trainer, views)
 
     def state_dict(self) -> dict[str, Any]:
         return {"curve": self.curve, "view_seconds": self.view_seconds}

@@ -159,7 +159,6 @@ class System(L.LightningModule):
     @torch.no_grad()
     def evaluate(self, view: Any) -> ViewResult:
         """Renders a whole view and measures it."""
-        give_back_freed_memory()
         view = view.to(self.device)
         synchronize(self.device)
         start = time.perf_counter()
@@ -172,13 +171,19 @@ class System(L.LightningModule):
 
         rgb, truth = image(rgb.clamp_(0, 1)), image(self.truth(view))
         depth, opacity, known = (None if x is None else image(x) for x in (depth, opacity, view.known))
-        figure = psnr(rgb, truth, known)
-        give_back_freed_memory()
-        return ViewResult(rgb, truth, figure, seconds, depth, opacity, known)
+        return ViewResult(rgb, truth, psnr(rgb, truth, known), seconds, depth, opacity, known)
 
     def evaluate_held_out(self, data: StepDataModule, views: Iterable[int]) -> Iterator[ViewResult]:
-        """Evaluates some of the held-out views, one after the other."""
-        return (self.evaluate(data.held_out(view)) for view in views)
+        """Evaluates some of the held-out views, one after the other, in memory that training has given back."""
+        give_back_freed_memory()
+        try:
+            for view in views:
+                yield self.evaluate(data.held_out(view))
+        finally:
+            give_back_freed_memory()
+
+    def on_test_start(self) -> None:
+        give_back_freed_memory()
 
     def test_step(self, batch: Any, batch_idx: int) -> dict[str, float]:
         result = self.evaluate(batch)

@@ -1,3 +1,4 @@
+import weakref
 from types import SimpleNamespace
 
 import pytest
@@ -47,6 +48,23 @@ def test_measurements_come_at_their_fractions_with_the_clock_stopped(clock, syst
     assert system.asked == [2, 7] * 3
     assert held_out.latest == 14.5 and held_out.view_seconds == 50 and held_out.planned(trainer) == 0
     assert budget.seconds == 10
+
+
+def test_pictures_of_several_views_are_not_held_together(clock, system, trainer_with, monkeypatch):
+    held_out, held, alive = HeldOut([0.2], views=8), [], []
+    evaluate = system.evaluate
+
+    def watched(view):
+        alive.append(sum(one() is not None for one in held))
+        result = evaluate(view)
+        held.append(weakref.ref(result))
+        return result
+
+    monkeypatch.setattr(system, "evaluate", watched)
+    trainer = trainer_with(Budget(steps=10), held_out)
+    system.progress = 0.3
+    held_out.on_train_batch_end(trainer, system, None, None, 0)
+    assert len(held) == 8 and max(alive) <= 1
 
 
 def test_a_step_that_passes_several_marks_measures_once(clock, system, trainer_with):
