@@ -84,7 +84,7 @@ class Samples:
 
     def merged(self) -> "Samples":
         """For pictures: fewer samples, as one that is `FAINT` needs no colour of its own; the same where thickness is not
-        known."""
+        known. The t of two that became one is where their weight is."""
         if self.thickness is None:
             return self
         thickness, packed = merge_faint(self.thickness, (self.t, self.dt, self.ray, self.offsets), FAINT)
