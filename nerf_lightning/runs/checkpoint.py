@@ -24,6 +24,8 @@ RESUMED: dict[str, type] = {
     **dict.fromkeys(("epoch", "global_step"), int),
 }
 """What training needs to go on, as Lightning writes it."""
+COUNTED = ("ready", "started", "processed", "completed")
+"""What Lightning counts of batches, steps and epochs."""
 DAMAGED = (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, OSError, *NONSENSE)
 """What zipfile and PyTorch raise for a damaged file."""
 
@@ -73,11 +75,13 @@ def _check_weights(path: Path, weights: Mapping[str, Any]) -> None:
             raise InputError(path, f"state_dict.{name}", type(tensor).__name__, "a tensor with a number in each place")
 
 
-def _counts(value: Any) -> bool:
+def _counts(value: Any, name: str = "") -> bool:
     """Whether Lightning's progress is made of what it counts."""
     if isinstance(value, list):  # the states of data loaders
         return bool(value) and all(isinstance(one, dict) and _counts(one) for one in value)
-    return all(map(_counts, value.values())) if isinstance(value, dict) else isinstance(value, int) and value >= 0
+    if isinstance(value, dict):
+        return name not in COUNTED and all(_counts(one, str(key)) for key, one in value.items())
+    return isinstance(value, int) and value >= 0
 
 
 def check_optimizer(path: Path, optimizer: torch.optim.Optimizer) -> None:

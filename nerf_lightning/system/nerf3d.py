@@ -25,6 +25,8 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 
 MIGHT, DRAWS = 0.5, 4
 """Share of what corrections have to explain from which on this many draws of pixels decide, by their mean."""
+FOUND = 16
+"""Samples that are found together without gradient before they are rendered, as multiples of `chunk`."""
 
 
 class NeRF3D(System):
@@ -253,10 +255,13 @@ class NeRF3D(System):
             background: colour in [0, 1]; None takes the renderer's own.
         """
         behind = self.renderer.colour if background is None else torch.tensor(background, device=self.device)
-        parts = []
-        for start in range(0, len(rays), self.chunk_rays):
-            chunk = rays[start : start + self.chunk_rays]
+        parts, start, many = [], 0, self.chunk_rays
+        while start < len(rays):
+            chunk = rays[start : start + many]
             found = self.sampler(chunk, self.field.density)
+            # Fog, which an early field is full of, leaves many times more along a ray than a surface does.
+            many = max(1, min(self.chunk_rays, FOUND * self.chunk * len(chunk) // max(1, len(found.t))))
+            start += len(chunk)
             if near > 0 or far < math.inf:
                 found = found.between(near, far)
             for run, samples in split(found.merged(), self.chunk):

@@ -239,7 +239,7 @@ def test_a_checkpoint_to_go_on_from_holds_more_than_weights(small_run: Path, tmp
     with pytest.raises(InputError, match=r"a\.ckpt: callbacks: found a list, expected a dict"):
         read_checkpoint(tmp_path / "a.ckpt", RESUMED)
     state = torch.load(small_run / "checkpoints" / "last.ckpt", weights_only=True)
-    for nothing in (None, [], "1", -1):
+    for nothing in (None, [], "1", -1, {"a": 1}):
         state["loops"]["fit_loop"]["epoch_progress"]["total"]["ready"] = nothing
         torch.save(state, tmp_path / "b.ckpt")
         with pytest.raises(InputError, match=r"b\.ckpt: loops: found something else, expected counts of steps"):

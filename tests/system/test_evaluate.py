@@ -9,8 +9,10 @@ from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.dataset import Picture, PictureBatch, PixelDataModule, ViewBatch
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.renderer import VolumeRenderer
-from nerf_lightning.sampler import UniformSampler
+from nerf_lightning.sampler import Samples, UniformSampler
+from nerf_lightning.sampler.samples import RAY_SAMPLES
 from nerf_lightning.system import NeRF2D, NeRF3D, constant
+from nerf_lightning.system.nerf3d import FOUND
 
 ADAM = functools.partial(torch.optim.Adam, lr=0.01)
 
@@ -87,6 +89,23 @@ def test_a_view_is_rendered_in_parts_of_any_size(chunk, slab: NeRF3D):
     assert (result.opacity[:, 8:] > 0.999).all() and (result.opacity[:, :8] == 0).all()
     z = slab_view(0).rays.directions[:, 2].view(12, 16)[:, 8:]
     torch.testing.assert_close(result.depth[:, 8:] * z, torch.full_like(z, 3.5), atol=0.02, rtol=0)
+
+
+def test_where_rays_hold_many_samples_fewer_rays_are_rendered_together(slab: NeRF3D, monkeypatch):
+    slab.chunk = slab.sampler.chunk = 80 * RAY_SAMPLES
+    found, ask = [], slab.sampler.forward
+
+    def asked(rays: Rays, *given) -> Samples:
+        found.append(ask(rays, *given))
+        return found[-1]
+
+    monkeypatch.setattr(slab.sampler, "forward", asked)
+    rays = slab_view(0).rays
+    seen = slab.render(rays)
+    assert len(seen.rgb) == len(rays)
+    first, *others = (len(one.t) for one in found)
+    most = FOUND * slab.chunk
+    assert first > most >= max(others) > most - 200, "200 a ray: known from the second part on"
 
 
 def test_a_wrong_half_costs_what_it_should(slab: NeRF3D):
