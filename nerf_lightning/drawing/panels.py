@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.dataset.resize import area_resize
+from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.system import ViewResult
 from nerf_lightning.utils.files import atomic
 
@@ -79,6 +79,13 @@ def narrowed(image: UInt8[ndarray, "H W 3"], width: int) -> UInt8[ndarray, "h w 
     if image.shape[1] <= width:
         return image
     return area_resize(image, width, max(1, round(image.shape[0] * width / image.shape[1])))
+
+
+def averaged(values: Float[ndarray, "H W"]) -> Float[ndarray, "h w"]:
+    """Averaged down to at most `WIDEST` along either side, of which a chart shows no more."""
+    height, width = values.shape
+    size = fit_size(width, height, WIDEST)
+    return values if size == (width, height) else cv2.resize(values, size, interpolation=cv2.INTER_AREA)
 
 
 def write_png(path: Path, image: UInt8[ndarray, "H W 3"]) -> None:

@@ -1,14 +1,20 @@
 """Frequencies of a picture: how much of each is there, and how much of it a field has learned."""
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.fft import fft2
 
 from nerf_lightning.drawing.ink import BLUE, DPI, ORANGE, VERMILLION
+from nerf_lightning.drawing.panels import averaged
 
 BANDS = 64
 """Rings into which the frequencies up to one cycle in two pixels are gathered."""
+TOGETHER = 1 << 20
+"""Frequencies that are gathered at a time."""
 
 
 def brightness(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
@@ -30,33 +36,41 @@ def by_frequency(
 ) -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B"]]:
     """Root mean square over rings of equal frequency: their middles in cycles a pixel, and the sizes (nan for empty rings)."""
     down, across = (np.fft.fftshift(np.fft.fftfreq(n)) for n in spectrum.shape)
-    radius = np.hypot(down[:, None], across)
-    # The last ring ends with 0.5 itself; the corners beyond go into one of their own.
-    ring = np.where(radius <= 0.5, np.minimum((radius / 0.5 * bands).astype(int), bands - 1), bands)
-    count = np.bincount(ring.ravel(), minlength=bands + 1)[:bands]
-    power = np.bincount(ring.ravel(), (spectrum**2).ravel(), minlength=bands + 1)[:bands]
+    count, power = np.zeros(bands + 1), np.zeros(bands + 1)
+    rows = max(1, TOGETHER // len(across))
+    for start in range(0, len(down), rows):
+        part = slice(start, start + rows)
+        radius = np.hypot(down[part, None], across)
+        # The last ring ends with 0.5 itself; the corners beyond go into one of their own.
+        ring = np.where(radius <= 0.5, np.minimum((radius / 0.5 * bands).astype(int), bands - 1), bands).ravel()
+        count += np.bincount(ring, minlength=bands + 1)
+        power += np.bincount(ring, (spectrum[part] ** 2).ravel(), minlength=bands + 1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return (np.arange(bands) + 0.5) * 0.5 / bands, np.sqrt(power / count)
+        return (np.arange(bands) + 0.5) * 0.5 / bands, np.sqrt(power[:bands] / count[:bands])
 
 
 def spectrum_chart(target: Float[np.ndarray, "H W 3"], result: Float[np.ndarray, "H W 3"], title: str) -> Figure:
     """Both spectra as pictures, and by frequency beside that of the error: where they cross, learning ends."""
     figure = Figure(figsize=(16, 5), dpi=DPI, layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.4))
-    spectra = {
-        "target": amplitudes(brightness(target)),
-        "result": amplitudes(brightness(result)),
-        "error": amplitudes(brightness(result) - brightness(target)),
-    }
-    top = max(float(spectra["target"].max()), 1e-9)
-    for axes, name in ((left, "target"), (middle, "result")):
-        decades = np.log10(np.maximum(spectra[name], top * 1e-6) / top)
-        shown = axes.imshow(decades, extent=(-0.5, 0.5, 0.5, -0.5), vmin=-6, vmax=0, cmap="magma", aspect="auto")
-        axes.set(title=f"{name}: amplitude, decades", xlabel="cycles a pixel, across", ylabel="cycles a pixel, down")
-    figure.colorbar(shown, ax=middle)
-    for (name, spectrum), colour in zip(spectra.items(), (BLUE, ORANGE, VERMILLION), strict=True):
+    drawn: tuple[tuple[str, Callable[[], Float[np.ndarray, "H W"]], str, Axes | None], ...] = (
+        ("target", lambda: brightness(target), BLUE, left),
+        ("result", lambda: brightness(result), ORANGE, middle),
+        ("error", lambda: brightness(result) - brightness(target), VERMILLION, None),
+    )
+    top = 0.0  # of the target, which is the first
+    for name, grey, colour, axes in drawn:
+        spectrum = amplitudes(grey())  # one after the other: that of a large picture is as large
+        top = top or max(float(spectrum.max()), 1e-9)
         frequency, size = by_frequency(spectrum)
         right.semilogy(frequency, np.maximum(size, top * 1e-9), color=colour, label=name)
+        if axes is not None:
+            decades = averaged(np.log10(np.maximum(spectrum, top * 1e-6) / top))
+            shown = axes.imshow(decades, extent=(-0.5, 0.5, 0.5, -0.5), vmin=-6, vmax=0, cmap="magma", aspect="auto")
+            axes.set(
+                title=f"{name}: amplitude, decades", xlabel="cycles a pixel, across", ylabel="cycles a pixel, down"
+            )
+    figure.colorbar(shown, ax=middle)
     right.set(title=title, xlabel="cycles a pixel (0.5: every other pixel)", ylabel="rms amplitude", xlim=(0, 0.5))
     right.grid(alpha=0.3)
     right.legend()

@@ -12,7 +12,7 @@ from PIL import Image
 from nerf_lightning.callbacks import Budget, PictureCharts, Results, Snapshots, TrainingGif
 from nerf_lightning.callbacks.picture.charts import curve_chart, error_chart
 from nerf_lightning.callbacks.snapshots import LOGGED_WIDTH
-from nerf_lightning.drawing.panels import narrowed, to_bytes
+from nerf_lightning.drawing.panels import WIDEST, narrowed, to_bytes
 from nerf_lightning.errors import InputError
 
 CURVE = [[0.5, 10, 20.0], [1.5, 100, 25.0], [4.0, 300, 31.0]]
@@ -189,6 +189,17 @@ def test_only_the_first_process_writes(make, trainer_with, system, tmp_path: Pat
 def test_charts_of_thin_pictures_stay_of_a_size_to_look_at(height: int, width: int):
     figure = error_chart(torch.zeros(height, width, 3), torch.ones(height, width, 3), "")
     assert all(2 <= side <= 25 for side in figure.get_size_inches())
+
+
+def test_the_error_of_a_large_picture_is_averaged_at_its_place():
+    rgb = torch.zeros(8, 2 * WIDEST, 3)
+    rgb[:, WIDEST:] = 10 / 255
+    axes = error_chart(rgb, torch.zeros_like(rgb), "").axes[0]
+    (shown,) = axes.images
+    assert shown.get_array().shape == (4, WIDEST)
+    assert shown.get_array()[:, : WIDEST // 2].max() == 0
+    np.testing.assert_allclose(shown.get_array()[:, WIDEST // 2 :], 10, rtol=1e-5)
+    assert axes.get_xlim() == (-0.5, 2 * WIDEST - 0.5) and axes.get_ylim() == (7.5, -0.5), "in the picture's pixels"
 
 
 def test_a_curve_that_took_no_time_is_drawn_all_the_same():

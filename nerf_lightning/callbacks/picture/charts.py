@@ -11,20 +11,21 @@ from torch import Tensor
 from nerf_lightning.callbacks.attached import attached, data_of
 from nerf_lightning.callbacks.results import Results
 from nerf_lightning.drawing.ink import BLUE, DPI, pixels_of
-from nerf_lightning.drawing.panels import write_png
+from nerf_lightning.drawing.panels import averaged, write_png
 from nerf_lightning.drawing.spectra import spectrum_chart
 from nerf_lightning.system import System
 
 
 def error_chart(rgb: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], title: str) -> Figure:
     """The error of every pixel, averaged over the colours, with a colour bar."""
-    error = (rgb - truth).abs().mean(-1).numpy() * 255
+    error = (rgb - truth).abs_().mean(-1).mul_(255).numpy()
     height, width = error.shape
     figure = Figure(figsize=(8, 1 + 7 * min(max(height / width, 0.2), 3)), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     # The largest errors would make all others look dark.
     top = max(float(np.percentile(error, 99.9)), 1e-3)
-    shown = axes.imshow(error, vmin=0, vmax=top, cmap="inferno")
+    edges = (-0.5, width - 0.5, height - 0.5, -0.5)
+    shown = axes.imshow(averaged(error), extent=edges, vmin=0, vmax=top, cmap="inferno")
     axes.set(title=title, xlabel="column, pixels", ylabel="row, pixels")
     figure.colorbar(shown, ax=axes, label="absolute error, mean over colours, 1/255", shrink=0.8)
     return figure
@@ -60,11 +61,9 @@ class PictureCharts(L.Callback):
         data, results = data_of(trainer), attached(trainer, Results)
         (result,) = pl_module.evaluate_held_out(data, [0])
         title = f"{data.scene.name}, step {trainer.global_step}, {result.psnr:.2f} dB"
-        charts = {
-            "error": error_chart(result.rgb, result.truth, title),
-            "spectrum": spectrum_chart(result.truth.numpy(), result.rgb.numpy(), title),
-        }
+        folder = Path(trainer.default_root_dir) / self.folder
+        write_png(folder / "error.png", pixels_of(error_chart(result.rgb, result.truth, title)))
+        spectrum = spectrum_chart(result.truth.numpy(), result.rgb.numpy(), title)
+        write_png(folder / "spectrum.png", pixels_of(spectrum))
         if results is not None and results.summary.get("curve"):
-            charts["curve"] = curve_chart(results.summary["curve"], title)
-        for name, figure in charts.items():
-            write_png(Path(trainer.default_root_dir) / self.folder / f"{name}.png", pixels_of(figure))
+            write_png(folder / "curve.png", pixels_of(curve_chart(results.summary["curve"], title)))
