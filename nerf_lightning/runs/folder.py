@@ -58,9 +58,10 @@ def load_config(folder: Path) -> DictConfig:
     path = folder / "config.yaml"
     existing_file(path, "the folder of a run", "look below outputs/")
     checked = check_config(read_yaml(path, "a run's configuration in YAML"), path)
-    missing = [group for group in GROUPS if group not in checked]
-    if missing:
-        raise InputError(path, missing[0], "nothing", "a run's whole configuration", "was the file cut short?")
+    for group in GROUPS:
+        if not isinstance(checked.get(group), dict):
+            found = repr(checked[group])[:60] if group in checked else "nothing"
+            raise InputError(path, group, found, "a run's whole configuration", "was the file cut short?")
     return OmegaConf.create(checked)
 
 

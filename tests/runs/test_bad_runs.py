@@ -54,6 +54,11 @@ def a_configuration_cut_between_groups(run: Path) -> None:
     (run / "config.yaml").write_text(whole[: whole.index("schedule:")])
 
 
+def text_for_a_group(run: Path) -> None:
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    (run / "config.yaml").write_text(yaml.safe_dump({**config, "dataset": "lego"}))
+
+
 def no_scene(run: Path) -> None:
     (run / "scene.json").unlink()
 
@@ -117,6 +122,7 @@ DAMAGES: dict[Callable[[Path], None], str] = {
     no_configuration: "config.yaml: found nothing there",
     half_a_configuration: "expected a run's configuration in YAML",
     a_configuration_cut_between_groups: "config.yaml: schedule: found nothing, expected a run's whole configuration",
+    text_for_a_group: "config.yaml: dataset: found 'lego', expected a run's whole configuration",
     no_scene: "scene.json: found nothing there, expected the scene of a run",
     half_a_scene: "expected the scene of a run, whole",
     a_list_for_a_scene: "expected the scene of a run, whole",
