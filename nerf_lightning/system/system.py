@@ -175,6 +175,7 @@ class System(L.LightningModule):
 
     def evaluate_held_out(self, data: StepDataModule, views: Iterable[int]) -> Iterator[ViewResult]:
         """Evaluates some of the held-out views, one after the other, in memory that training has given back."""
+        self.zero_grad()  # which the next step does in any case
         give_back_freed_memory()
         try:
             for view in views:
