@@ -166,6 +166,9 @@ def coarsest_sampler(cfg: DictConfig, data: Data, system: System, samplers: list
         data: whose held-out views measure it.
         system: the field.
         samplers: options, coarsest first; those that its sampler does not have are left out.
+
+    Raises:
+        InputError: where they ask for more memory than is free.
     """
     known = inspect.signature(target_of(cfg, "sampler")).parameters if isinstance(system, NeRF3D) else {}
     samplers = [options for options in samplers if options.keys() <= known.keys()]
@@ -175,6 +178,7 @@ def coarsest_sampler(cfg: DictConfig, data: Data, system: System, samplers: list
     for options in samplers:
         probe = build_system(set_options(cfg, "sampler", options), frame_of(data), system.device)
         assert isinstance(probe, NeRF3D)  # of the same data
+        check_room(probe, data, system.device)
         probe.field = system.field
         probe.to(system.device)
         probe.sampler.look_through(data.scene.train.cameras)

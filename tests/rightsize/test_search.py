@@ -8,11 +8,13 @@ import pytest
 import yaml
 
 from nerf_lightning.config import cli
+from nerf_lightning.config.build import build_data, build_system, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.rightsize.__main__ import task
 from nerf_lightning.rightsize.choose import Target
+from nerf_lightning.rightsize.climb import coarsest_sampler
 from nerf_lightning.rightsize.ladder import Ladder
 from nerf_lightning.rightsize.start import begin
 from nerf_lightning.runs.compact import load_compact
@@ -130,3 +132,10 @@ def test_a_picture_has_a_ladder_too(tmp_path: Path):
     given += [f"callbacks.{one}" for one in quiet]
     found = search([*given, "target.within_db=100", f"output={tmp_path}/found"], tmp_path)
     assert found["chosen"]["rung"] == 0 and found["reached"], "a hundred dB below the best is anything"
+
+
+def test_samplers_that_do_not_fit_are_refused(given: list[str], tmp_path: Path):
+    cfg = composed([*given, "target.psnr=14"], tmp_path, "rightsize")
+    data = build_data(cfg)
+    with pytest.raises(InputError, match=r"config: dataset.rays: found 1,024 rays a step, with"):
+        coarsest_sampler(cfg, data, build_system(cfg, frame_of(data)), [{"samples": 10**12}])
