@@ -2,9 +2,9 @@
 
 import math
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
-import imageio.v3 as imageio
 import lightning as L
 import numpy as np
 from jaxtyping import UInt8
@@ -13,7 +13,7 @@ from nerf_lightning.callbacks.attached import attached, data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.progress import Progress
 from nerf_lightning.dataset import Scene
-from nerf_lightning.drawing.panels import panel, to_bytes
+from nerf_lightning.drawing.panels import panel, to_bytes, write_animation
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.evenly import evenly
@@ -65,7 +65,7 @@ class Orbit(L.Callback):
             return panel([image], f"{scene.name}, step {trainer.global_step}")
 
         count, start = min(MOST if self.frames is None else self.frames, len(cameras)), time.perf_counter()
-        pictures = [picture(evenly(len(cameras), count)[0])]
+        drawn = [picture(evenly(len(cameras), count)[0])]
         if self.frames is None:
             one = time.perf_counter() - start
             fitting, shrink = affordable(count, one, Budget.of(trainer).drawing_seconds(trainer.global_step))
@@ -75,13 +75,17 @@ class Orbit(L.Callback):
                     f"{self.path}: {fitting} frames of {smaller.width}x{smaller.height}, as one of "
                     f"{cameras.width}x{cameras.height} takes {one:.1f} s; callbacks.orbit.frames={count} draws all"
                 )
-                count, cameras, pictures = fitting, smaller, []
-        for view in evenly(len(cameras), count)[len(pictures) :]:
-            pictures.append(picture(view))
-            if progress is not None:
-                progress.frame(len(pictures), count)
+                count, cameras, drawn = fitting, smaller, []
+
+        def frames() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+            yield from drawn
+            for number, view in enumerate(evenly(len(cameras), count)[len(drawn) :], len(drawn) + 1):
+                yield picture(view)
+                if progress is not None:
+                    progress.frame(number, count)
+
         with atomic(Path(trainer.default_root_dir) / self.path) as temporary:
-            imageio.imwrite(temporary, np.stack(pictures), duration=1000 / self.fps, loop=0)
+            write_animation(temporary, frames(), 1 / self.fps)
 
 
 def affordable(frames: int, seconds: float, allowed: float) -> tuple[int, float]:

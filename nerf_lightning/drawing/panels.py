@@ -1,6 +1,7 @@
 """Pictures for people: panels side by side with a caption under them."""
 
 import base64
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import imageio.v3 as imageio
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
+from PIL import Image
 from torch import Tensor
 
 from nerf_lightning.dataset.resize import area_resize, fit_size
@@ -17,6 +19,9 @@ from nerf_lightning.utils.files import atomic
 
 SMALLEST_SIDE = 160
 """Panels below this height are magnified (whole multiples, hard edges), so that the caption stays readable."""
+
+QUALITY = 90
+"""Of a WebP, out of 100."""
 
 WIDEST = 2048
 """Pixels across of a picture that stands beside others."""
@@ -91,6 +96,20 @@ def averaged(values: Float[ndarray, "H W"]) -> Float[ndarray, "h w"]:
 def write_png(path: Path, image: UInt8[ndarray, "H W 3"]) -> None:
     with atomic(path) as temporary:
         imageio.imwrite(temporary, image, compress_level=3)  # half the time of the default, a tenth more bytes
+
+
+def write_animation(path: Path, frames: Iterable[UInt8[ndarray, "H W C"]], seconds: float) -> None:
+    """Frames of one size -> GIF or WebP that begins again and again, into a file that the caller renames.
+
+    Of a GIF no more than a byte a pixel is kept: its frames may be drawn while it is written.
+
+    Args:
+        path: its suffix says which.
+        frames: at least one.
+        seconds: that each is shown.
+    """
+    images = map(Image.fromarray, frames)
+    next(images).save(path, save_all=True, append_images=images, duration=1000 * seconds, loop=0, quality=QUALITY)
 
 
 MEDIA = {".jpg": "image/jpeg", ".png": "image/png", ".webp": "image/webp"}

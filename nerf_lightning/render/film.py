@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from nerf_lightning.dataset.formats.decode import image_header
+from nerf_lightning.drawing.panels import write_animation
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.files import atomic, write_json
@@ -22,12 +23,10 @@ Picture = UInt8[ndarray, "H W C"]
 PLAN = "frames.json"
 """Beside the frames: what they show, so that frames of something else are never reused."""
 FILMS = (".gif", ".mp4", ".webp")
-JOINED_AT_ONCE = (".gif", ".webp")
-"""Formats whose frames are all in memory when they are joined."""
+KEPT = {".gif": 1, ".webp": 4}
+"""Bytes of each pixel that formats keep in memory while frames are joined."""
 OPAQUE = (".gif", ".mp4")
 """Formats without partial transparency."""
-QUALITY = 90
-"""Of WebP, out of 100."""
 CRF = 18
 """Of H.264: smaller is better, 18 looks like the original."""
 
@@ -107,9 +106,7 @@ def join(files: list[Path], output: Path, fps: float) -> None:
     if output.suffix == ".mp4":
         join_mp4(files, output, fps)
         return
-    frames = np.stack(list(framed(files)))
-    quality: dict[str, Any] = {"quality": QUALITY} if output.suffix == ".webp" else {}
-    imageio.imwrite(output, frames, plugin="pillow", duration=1000 / fps, loop=0, **quality)
+    write_animation(output, framed(files), 1 / fps)
 
 
 def join_mp4(files: list[Path], output: Path, fps: float) -> None:

@@ -12,7 +12,7 @@ from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.drawing.frame import CHANNELS, ERROR_TIMES, Style, depth_range, draw, error_picture
 from nerf_lightning.drawing.panels import panel
 from nerf_lightning.errors import InputError
-from nerf_lightning.render.film import JOINED_AT_ONCE, Picture, check_output, make_film
+from nerf_lightning.render.film import KEPT, Picture, check_output, make_film
 from nerf_lightning.render.options import RenderOptions
 from nerf_lightning.render.route import WITH_PHOTOS, Route, find_route
 from nerf_lightning.renderer.renderer import NAMED
@@ -101,9 +101,9 @@ def check_room(route: Route, output: Path) -> None:
     pixels = route.cameras.sizes.prod(1)
     frame, todo = int(pixels.max()), "give less of scale or frames"
     check_memory("config", "scale", f"a frame's {frame:,} pixels", RENDERED * frame, todo)
-    if output.suffix in JOINED_AT_ONCE:
-        what = f"{len(pixels):,} frames in one film"
-        check_memory("config", "frames", what, 3 * frame * len(pixels), f"{todo}, or output=FILE.mp4")
+    if output.suffix in KEPT:
+        what, kept = f"{len(pixels):,} frames in one film", KEPT[output.suffix] * frame * len(pixels)
+        check_memory("config", "frames", what, kept, f"{todo}, or output=FILE.mp4")
 
 
 def the_background(options: RenderOptions, system: NeRF3D, route: Route) -> tuple[float, float, float] | None:

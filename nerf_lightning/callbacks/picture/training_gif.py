@@ -4,11 +4,10 @@ from pathlib import Path
 
 import imageio.v3 as imageio
 import lightning as L
-import numpy as np
 
 from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.callbacks.snapshots import Snapshots
-from nerf_lightning.drawing.panels import narrowed
+from nerf_lightning.drawing.panels import narrowed, write_animation
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.files import atomic
@@ -41,8 +40,8 @@ class TrainingGif(L.Callback):
         if snapshots is None or not trainer.is_global_zero:
             return
         files = sorted((Path(trainer.default_root_dir) / snapshots.folder).glob("step_*.png"))
-        frames = [narrowed(imageio.imread(file), self.width) for file in files]
-        if not frames:
+        if not files:
             return
+        frames = (narrowed(imageio.imread(file), self.width) for file in [*files, files[-1], files[-1]])
         with atomic(Path(trainer.default_root_dir) / self.path) as temporary:
-            imageio.imwrite(temporary, np.stack([*frames, frames[-1], frames[-1]]), duration=1000 / self.fps, loop=0)
+            write_animation(temporary, frames, 1 / self.fps)
