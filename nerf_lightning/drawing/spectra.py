@@ -1,10 +1,7 @@
 """Frequencies of a picture: how much of each is there, and how much of it a field has learned."""
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.fft import fft2
 
@@ -53,14 +50,11 @@ def spectrum_chart(target: Float[np.ndarray, "H W 3"], result: Float[np.ndarray,
     """Both spectra as pictures, and by frequency beside that of the error: where they cross, learning ends."""
     figure = Figure(figsize=(16, 5), dpi=DPI, layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.4))
-    drawn: tuple[tuple[str, Callable[[], Float[np.ndarray, "H W"]], str, Axes | None], ...] = (
-        ("target", lambda: brightness(target), BLUE, left),
-        ("result", lambda: brightness(result), ORANGE, middle),
-        ("error", lambda: brightness(result) - brightness(target), VERMILLION, None),
-    )
+    greys = {"target": brightness(target), "result": brightness(result)}
+    greys["error"] = greys["result"] - greys["target"]
     top = 0.0  # of the target, which is the first
-    for name, grey, colour, axes in drawn:
-        spectrum = amplitudes(grey())  # one after the other: that of a large picture is as large
+    for (name, grey), colour, axes in zip(greys.items(), (BLUE, ORANGE, VERMILLION), (left, middle, None), strict=True):
+        spectrum = amplitudes(grey)  # one after the other: that of a large picture is as large
         top = top or max(float(spectrum.max()), 1e-9)
         frequency, size = by_frequency(spectrum)
         right.semilogy(frequency, np.maximum(size, top * 1e-9), color=colour, label=name)

@@ -1,9 +1,21 @@
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+
 import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.drawing.panels import SMALLEST_SIDE, depth_colours, panel, result_panel, to_bytes, write_png
+from nerf_lightning.drawing.panels import (
+    SMALLEST_SIDE,
+    depth_colours,
+    panel,
+    result_panel,
+    to_bytes,
+    write_animation,
+    write_png,
+)
 from nerf_lightning.system import ViewResult
 
 
@@ -94,3 +106,22 @@ def test_a_picture_is_written_whole(tmp_path):
     write_png(tmp_path / "new" / "a.png", image)
     assert np.array_equal(imageio.imread(tmp_path / "new" / "a.png"), image)
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["a.png"]
+
+
+def test_an_animation_is_written_while_its_frames_are_drawn(tmp_path: Path):
+    alive: list[weakref.ref] = []
+
+    def frames() -> Iterator[np.ndarray]:
+        for level in (0, 80, 160, 240):
+            assert sum(one() is not None for one in alive) <= 1, "each frame goes once it is written"
+            frame = np.full((6, 8, 3), level, np.uint8)
+            alive.append(weakref.ref(frame))
+            yield frame
+
+    write_animation(tmp_path / "a.gif", frames(), 0.2)
+    assert len(alive) == 4
+    assert imageio.imread(tmp_path / "a.gif", mode="RGB")[:, 3, 4, 1].tolist() == [0, 80, 160, 240]
+    about = imageio.immeta(tmp_path / "a.gif")
+    assert about["duration"] == 200 and about["loop"] == 0
+    write_animation(tmp_path / "a.webp", [np.zeros((6, 8, 4), np.uint8)], 0.2)
+    assert imageio.imread(tmp_path / "a.webp", mode="RGBA").shape[-3:] == (6, 8, 4), "a single one, transparent"
