@@ -25,6 +25,9 @@ from nerf_lightning.utils.files import write_json
 TIMES = 8
 """Limits against what the hungriest good command takes: damage may leave something twice as wide, as high and as many."""
 
+TOLD = 250
+"""Cases between two lines about how far it is."""
+
 
 @dataclass(frozen=True)
 class Ready:
@@ -128,6 +131,8 @@ def measure(seeds: list[int], cases: int, single: int | None, output: Path) -> d
             if single is not None:
                 show(found, ended, command, done)
                 shutil.copytree(folder, output / f"case_{case.seed}_{case.number}", symlinks=True, dirs_exist_ok=True)
+            elif (case.number + 1) % TOLD == 0:
+                print(f"hostile: seed {case.seed}, {case.number + 1:,} of {cases:,} cases", flush=True)
             shutil.rmtree(folder)
     whole = sum(rows.values(), Counter[str]())
     table = [{"kind": kind.name, **_counts(rows[kind.name])} for kind in kinds.KINDS if kind.name in rows]
