@@ -54,6 +54,7 @@ from torch.nn.functional import normalize
 from benchmarks.synthetic.photos import Flaws, Truth, write_capture
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import use_kernels
+from nerf_lightning.kernels.cpu import apart
 from nerf_lightning.utils.ending import listen
 
 
@@ -74,8 +75,9 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(autouse=True, scope="session")
 def kernels_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """On a new machine each kernel is compiled by one process; the others wait for it and load what it has cached."""
+    """On a new machine each kernel is compiled by one test process, itself; the others wait and load what it has cached."""
     compile, folder = Dispatcher.compile, shared_folder(tmp_path_factory)
+    apart.ask = lambda dispatcher, signature: None
 
     def compile_once(self: Dispatcher, signature: object) -> object:
         # One lock object a file: a kernel that needs itself in another signature does not wait for itself.

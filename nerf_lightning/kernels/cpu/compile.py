@@ -1,17 +1,26 @@
 """How the CPU kernels are compiled."""
 
+from collections.abc import Callable
 from functools import partial
 
 import numba
 import torch
+from numba.core.dispatcher import Dispatcher
+
+from nerf_lightning.kernels.cpu.apart import compile_apart
 
 # No fast maths. Numba optimises a function again for every other one it is linked into, and a process that compiles a kernel
 # runs another copy than one that loads it from the cache: where the optimiser may reorder or fuse, their last bits differ.
 # Vector code is written out instead: see `lanes`.
 inner = partial(numba.njit, cache=True, error_model="numpy")
 """Decorates functions that kernels call."""
-kernel = partial(inner, parallel=True)
-"""Decorates an entry point; its argument `workers` is the number of pieces its work is split into."""
+
+
+def kernel(function: Callable) -> Dispatcher:
+    """Decorates an entry point; its argument `workers` is the number of pieces its work is split into."""
+    dispatcher = inner(function, parallel=True)
+    dispatcher.compile = partial(compile_apart, dispatcher)
+    return dispatcher
 
 
 def workers() -> int:
