@@ -25,6 +25,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.utils.device import CPU, the_device
+from nerf_lightning.utils.files import output_path
 from nerf_lightning.utils.memory import Frugal
 from nerf_lightning.utils.options import check_options
 
@@ -210,13 +211,18 @@ def build_budget(cfg: DictConfig) -> Budget:
 
 
 def build_logger(cfg: DictConfig, folder: Path) -> Logger:
-    """Where curves go. TensorBoard's gives options that it does not know to its writer, which is made later."""
+    """Where curves go. TensorBoard's gives options that it does not know to its writer, which is made later, as its folder is.
+
+    Raises:
+        InputError: for options that neither knows, and a folder that cannot be written.
+    """
     logger = make(cfg, "logger", save_dir=folder)
     if isinstance(logger, TensorBoardLogger):
         from torch.utils.tensorboard import SummaryWriter
 
         own = {"_target_", *inspect.signature(TensorBoardLogger).parameters}
         check_options("logger", SummaryWriter, {k: v for k, v in resolved(cfg.logger).items() if k not in own})
+        output_path(logger.log_dir)
     return logger
 
 

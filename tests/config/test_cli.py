@@ -37,6 +37,7 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
     [
         (["model.widht=3"], ["model.widht", "--cfg job"]),
         (["+model.widht=3"], ["model.widht", "unknown option", "did you mean width?"]),
+        ([f"logger.name={'x' * 300}"], ["letters, expected a path that a file or folder can have"]),
         (["+logger.flush_sec=3"], ["logger.flush_sec", "unknown option", "did you mean flush_secs?"]),
         (["model=nope"], ["model/nope", "hashgrid hashgrid2d"]),
         (["+experiment=nope"], ["experiment/nope", "lego"]),
