@@ -18,6 +18,7 @@ AGAIN = "the same command goes on"
 _asked: int | None = None
 _pending = False  # not raised yet
 _holding = 0
+_tell = sys.unraisablehook
 
 
 class Interrupted(BaseException):
@@ -38,9 +39,11 @@ class Interrupted(BaseException):
 
 def listen() -> None:
     """From now on signals raise `Interrupted`; those before are forgotten."""
-    global _asked, _pending
+    global _asked, _pending, _tell
     _asked, _pending = None, False
     _take(_raise)
+    if sys.unraisablehook is not _untold:
+        _tell, sys.unraisablehook = sys.unraisablehook, _untold
 
 
 def listen_again() -> None:
@@ -57,13 +60,14 @@ def end_at_once() -> None:
 def listening() -> Iterator[None]:
     """Listens for a while in somebody else's process. The signal then does there what it would have done."""
     global _asked, _pending
-    before = {number: signal.getsignal(number) for number in SIGNALS}
+    before, tell = {number: signal.getsignal(number) for number in SIGNALS}, sys.unraisablehook
     listen()
     try:
         yield
     finally:
         number = _asked
         _asked, _pending = None, False
+        sys.unraisablehook = tell
         if threading.current_thread() is threading.main_thread():
             for one, handler in before.items():
                 signal.signal(one, handler)
@@ -125,6 +129,12 @@ def _raise(number: int, frame: FrameType | None) -> None:
     _asked, _pending = _asked or number, True
     if not _holding:
         interrupt(_asked)
+
+
+def _untold(what: "sys.UnraisableHookArgs") -> None:
+    """Of what is lost in a clean-up Python prints a traceback. Of a signal nothing is: `leave_if_asked` raises it again."""
+    if not isinstance(what.exc_value, Interrupted):
+        _tell(what)
 
 
 def _exit(number: int, frame: FrameType | None) -> None:

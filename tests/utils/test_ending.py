@@ -5,7 +5,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -44,6 +44,29 @@ def test_a_signal_is_raised_where_it_comes_and_after_what_must_be_whole(number: 
         leave_if_asked()
     with pytest.raises(KeyError), held():  # what failed is told, and no signal instead
         raise KeyError
+
+
+def test_what_is_lost_in_a_clean_up_is_raised_later_and_prints_nothing(number: int, monkeypatch: pytest.MonkeyPatch):
+    class Cleans:
+        def __init__(self, how: Callable[[], None]):
+            self.how = how
+
+        def __del__(self) -> None:
+            self.how()
+
+    printed: list[object] = []
+    monkeypatch.setattr(ending, "_tell", printed.append)
+    Cleans(lambda: signal.raise_signal(number))
+    assert not printed
+    with pytest.raises(Interrupted):
+        leave_if_asked()
+    Cleans(lambda: [][0])
+    assert len(printed) == 1
+    usual = sys.unraisablehook
+    monkeypatch.setattr(sys, "unraisablehook", printed.append)  # somebody else's
+    with listening():
+        assert sys.unraisablehook == usual
+    assert sys.unraisablehook == printed.append
 
 
 @pytest.mark.parametrize("kind", [atomic, atomic_folder])
