@@ -23,6 +23,9 @@ from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
+from nerf_lightning.refine import Corrections
+from nerf_lightning.renderer import VolumeRenderer
+from nerf_lightning.sampler import Sampler
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.utils.device import CPU, the_device
 from nerf_lightning.utils.files import output_path
@@ -36,11 +39,17 @@ MOST_DEVICES = 1024
 """Lightning lists all, and starts a process for each: no machine has as many."""
 
 
-def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
+def make(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> Any:
     """Builds what the node at `path` describes, passing `extra`; errors name the config's keys.
 
+    Args:
+        cfg: the whole configuration.
+        path: of the node.
+        kinds: classes, of one of which it must be.
+        extra: what the target takes beside the node's options.
+
     Raises:
-        InputError: where the key is missing, or its target refuses or does not know an option.
+        InputError: where the key is missing, or its target refuses or does not know an option, or makes something else.
     """
     target, node = target_of(cfg, path), OmegaConf.select(cfg, path)
     missing = sorted(OmegaConf.missing_keys(node))
@@ -53,14 +62,16 @@ def make(cfg: DictConfig, path: str, **extra: Any) -> Any:
     check_options(path, target, options, extra, complete=not late)
     # Hydra only binds the options: it would turn dataclasses among `extra` into configs.
     bound = hydra.utils.instantiate(node, _partial_=True, _convert_="all")
-    if late:
-        return partial(bound, **extra)
     try:
-        return bound(**extra)
+        made = partial(bound, **extra) if late else bound(**extra)
     except (ValueError, TypeError, MisconfigurationException) as error:
         if isinstance(error, InputError) or target.__module__.split(".")[0] == "nerf_lightning":
             raise  # our own targets raise InputError for bad options, so this is a defect
         raise InputError("config", path, str(error), f"options that {target.__name__} takes") from error
+    if kinds and not isinstance(made, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise InputError("config", f"{path}._target_", f"what makes a {type(made).__name__}", f"what makes a {wanted}")
+    return made
 
 
 def target_of(cfg: DictConfig, path: str) -> Any:
@@ -98,13 +109,13 @@ def device_of(cfg: DictConfig) -> torch.device:
 def build_data(cfg: DictConfig, path: str | None = None) -> RayDataModule | PixelDataModule:
     """The data module, with its scene loaded; `path` names other photos than the configuration does."""
     if path is None:
-        return make(cfg, "dataset")
+        return make(cfg, "dataset", RayDataModule, PixelDataModule)
     elsewhere = copy.deepcopy(cfg)
     if "path" in inspect.signature(target_of(cfg, "dataset")).parameters:
         elsewhere.dataset.path = path
     else:  # a built-in scene
         elsewhere.dataset = {"_target_": "nerf_lightning.dataset.from_photos", "path": path}
-    return make(elsewhere, "dataset")
+    return make(elsewhere, "dataset", RayDataModule, PixelDataModule)
 
 
 def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> Any:
@@ -115,7 +126,7 @@ def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> A
         advice = "model=hashgrid or model=mlp" if kind is Field else "model=hashgrid2d or model=picture_mlp"
         raise InputError("config", "model", name, f"a field of {dimensions} for this dataset", f"choose {advice}")
     with Frugal("config", "model"):
-        return make(cfg, "model", **extra)
+        return make(cfg, "model", kind, **extra)
 
 
 def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) -> System:
@@ -132,12 +143,13 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     bounds = frame.bounds
     field = build_field(cfg, Field, "three coordinates", bounds=bounds)
     with Frugal("config", "sampler"):
-        sampler = make(cfg, "sampler", bounds=bounds)
+        sampler = make(cfg, "sampler", Sampler, bounds=bounds)
     seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
-    renderer = make(cfg, "renderer", scene_background=frame.background, **seen)
+    renderer = make(cfg, "renderer", VolumeRenderer, scene_background=frame.background, **seen)
     corrections = None
     if cfg.get("refine") is not None and frame.cameras is not None:
-        corrections = make(cfg, "refine", cameras=frame.cameras, bounds=frame.bounds, exposures=frame.exposures)
+        photographed = {"cameras": frame.cameras, "bounds": frame.bounds, "exposures": frame.exposures}
+        corrections = make(cfg, "refine", Corrections, **photographed)
     return NeRF3D(field, sampler, renderer, **common, corrections=corrections)
 
 
@@ -216,7 +228,7 @@ def build_logger(cfg: DictConfig, folder: Path) -> Logger:
     Raises:
         InputError: for options that neither knows, and a folder that cannot be written.
     """
-    logger = make(cfg, "logger", save_dir=folder)
+    logger = make(cfg, "logger", Logger, save_dir=folder)
     if isinstance(logger, TensorBoardLogger):
         from torch.utils.tensorboard import SummaryWriter
 
@@ -233,7 +245,7 @@ def build_trainer(cfg: DictConfig, folder: Path, device: torch.device, results: 
     if not isinstance(asked, Mapping):
         raise InputError("config", "callbacks", repr(asked)[:60], "callbacks by name")
     chosen = [name for name, node in asked.items() if node is not None]
-    callbacks = [make(cfg, f"callbacks.{name}") for name in chosen]
+    callbacks = [make(cfg, f"callbacks.{name}", L.Callback) for name in chosen]
     # The budget comes first, as the others read its clock; results before the orbit, as figures should not wait for a GIF.
     callbacks = [build_budget(cfg), *([results] if results else []), *callbacks]
     devices = str(OmegaConf.select(cfg, "trainer.devices"))
@@ -244,4 +256,4 @@ def build_trainer(cfg: DictConfig, folder: Path, device: torch.device, results: 
     where: dict[str, Any] = {"accelerator": device.type, "enable_checkpointing": False}  # callbacks/checkpoints does it
     if device.type not in KNOWN:
         where["strategy"] = SingleDeviceStrategy(device)
-    return make(cfg, "trainer", callbacks=callbacks, logger=logger, default_root_dir=folder, **where)
+    return make(cfg, "trainer", L.Trainer, callbacks=callbacks, logger=logger, default_root_dir=folder, **where)

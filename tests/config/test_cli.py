@@ -58,6 +58,10 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
         (["dataset=photos", "dataset.path=missing.npz"], ["missing.npz", "nothing there", "check the path"]),
         (["dataset=photos", "dataset.path=notes.txt"], ["notes.txt", "expected"]),
         (["dataset=photos", "dataset.path=broken.npz"], ["broken.npz", "no zip archive", "expected"]),
+        (
+            ["+dataset._partial_=true"],
+            ["dataset._target_", "makes a partial", "makes a RayDataModule or PixelDataModule"],
+        ),
         (["dataset.rays=0"], ["dataset.rays", "found 0", "at least 1"]),
         (["callbacks.orbit.fps=0"], ["callbacks.orbit.fps", "found 0", "at least 0.01"]),
         (["callbacks.heldout.at=[0.5,0.1]"], ["callbacks.heldout.at", "[0.5, 0.1]", "ascending"]),
