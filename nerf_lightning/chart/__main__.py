@@ -34,7 +34,7 @@ def task(cfg: "DictConfig") -> None:
 
     given = {str(key): cfg[key] for key in cfg if not OmegaConf.is_missing(cfg, key)}
     given |= {key: OmegaConf.to_container(value) for key, value in given.items() if OmegaConf.is_config(value)}
-    if "runs" not in given:
+    if not given.get("runs"):
         raise InputError("config", "runs", "nothing", "folders with runs", "give runs=outputs/pareto")
     check_options("", options, given)
     folders = (

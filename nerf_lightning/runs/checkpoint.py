@@ -88,11 +88,13 @@ def check_optimizer(path: Path, optimizer: torch.optim.Optimizer) -> None:
     """Refuses a state that an optimizer has taken from a file, and could not make a step with.
 
     Raises:
-        InputError: where an option is of another kind than that which it was built with, or not finite; or where what it keeps
-            of a parameter is of another shape.
+        InputError: where an option is missing, of another kind than that which it was built with, or not finite; or where what
+            it keeps of a parameter is of another shape.
     """
     todo = "start the run anew"
     for group in optimizer.param_groups:
+        if missing := sorted({*optimizer.defaults, "initial_lr"} - group.keys()):
+            raise InputError(path, f"optimizer_states.{missing[0]}", "nothing", "what it was saved with", todo)
         for key, value in group.items():
             if key != "params" and not _alike(value, optimizer.defaults.get(key, 0.0)):
                 raise InputError(path, f"optimizer_states.{key}", repr(value)[:60], "what it was saved with", todo)

@@ -32,6 +32,7 @@ def test_folders_and_their_chart(make_run: MakeRun, chart, tmp_path: Path):
     ("arguments", "words"),
     [
         ([], "runs: found nothing"),
+        (["runs=[]"], "runs: found nothing, expected folders with runs"),
         (["runs=nowhere"], "nowhere: found no such folder"),
         (["runs=."], "found no run in it"),
         (["runs=.", "seconds=-1"], "seconds: found -1, expected a number at least 0"),

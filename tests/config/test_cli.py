@@ -202,10 +202,13 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
         (total, "total", 1.0, "last.ckpt: loops: found something else"),
         (total, "total", 1, "last.ckpt: found TypeError"),
         (groups[0], "betas", True, "last.ckpt: optimizer_states.betas: found True"),
+        (groups[0], "initial_lr", ..., "last.ckpt: optimizer_states.initial_lr: found nothing"),
         (groups[0], "lr", float("nan"), "last.ckpt: optimizer_states.lr: found nan"),
         (moments, "exp_avg", torch.zeros(3), "last.ckpt: optimizer_states.exp_avg: found (3,)"),
     ):
         right, where[key] = where[key], wrong
+        if wrong is ...:
+            del where[key]
         torch.save(state, last)
         where[key] = right
         code, _, err = inside(f"resume={run}", "budget.steps=12")
