@@ -23,7 +23,9 @@ def compile_apart(dispatcher: Dispatcher, signature: tuple) -> object:
 
     Where that fails, for want of a folder, memory or time, it is compiled here, as numba would by itself.
     """
-    if dispatcher._cache.load_overload(signature, dispatcher.targetctx) is None:
+    cache = dispatcher._cache
+    # Its list is read, not the kernel: numba loads that itself, and would do so twice.
+    if cache._index_key(signature, dispatcher.targetctx.codegen()) not in cache._cache_file._load_index():
         ask(dispatcher, signature)
     return Dispatcher.compile(dispatcher, signature)
 
