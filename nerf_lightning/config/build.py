@@ -63,7 +63,8 @@ def make(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> Any:
     # Hydra only binds the options: it would turn dataclasses among `extra` into configs.
     bound = hydra.utils.instantiate(node, _partial_=True, _convert_="all")
     try:
-        made = partial(bound, **extra) if late else bound(**extra)
+        # What Hydra binds it examines at every call, which a training step would pay for: once is enough.
+        made = partial(bound.func, *bound.args, **{**bound.keywords, **extra}) if late else bound(**extra)
     except (ValueError, TypeError, MisconfigurationException) as error:
         if isinstance(error, InputError) or target.__module__.split(".")[0] == "nerf_lightning":
             raise  # our own targets raise InputError for bad options, so this is a defect
