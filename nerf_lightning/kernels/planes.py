@@ -119,7 +119,7 @@ class _PlaneLine(torch.autograd.Function):
         grad_planes, grad_lines = torch.zeros_like(planes), torch.zeros_like(lines)
         given = planes.flatten(1, 2).numpy(), lines.numpy(), places.numpy(), grad.T.contiguous().numpy()
         lanes = (0,) * _block(lines.shape[2])
-        cpu.scatter(*given, grad_planes.flatten(1, 2).numpy(), grad_lines.numpy(), lanes, workers())
+        cpu.scatter(*given, grad_planes.flatten(1, 2).numpy(), grad_lines.numpy(), lanes, 2 * lanes, workers())
         moved = None
         if ctx.needs_input_grad[2]:
             moved = torch.empty_like(places)

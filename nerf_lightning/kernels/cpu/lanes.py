@@ -55,6 +55,21 @@ def store(typing, array, row, first, values):
 
 
 @intrinsic
+def prefetch(typing, array, row, first):
+    """Brings array[row, first] and what stands beside it into the core's cache, without waiting for it."""
+
+    def code(context, builder, signature, values):
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        ask = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        place = builder.bitcast(_pointer(context, builder, signature.args, values, 1), byte)
+        builder.call(ask, [place, number(0), number(3), number(1)])  # to read, more than once, data
+        return context.get_dummy_value()
+
+    return types.none(array, row, first), code
+
+
+@intrinsic
 def zeros(typing, lanes):
     """Zeros, one for each entry of the tuple `lanes`."""
     width = len(lanes)

@@ -5,19 +5,43 @@ from numba import float32, prange, uint32
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
 from nerf_lightning.kernels.cpu.hashgrid import cell_of, steepness
-from nerf_lightning.kernels.cpu.lanes import load, store, total
+from nerf_lightning.kernels.cpu.lanes import load, prefetch, store, total
 
 TILE = 512
 """Samples worked on together where features [C, N] turn into rows [N, C], or back: long runs in memory, still in cache."""
+AHEAD = 8
+"""Samples by which a plane's rows are asked for in advance: a large one does not fit the core's cache."""
+
+
+@inner
+def room():
+    """What `locate` fills for a tile: rows of the plane, fractions in its cells, rows of the line, fractions on it."""
+    corners, ends = np.empty(TILE + AHEAD, np.uint32), np.empty(TILE, np.uint32)
+    return corners, np.empty((2, TILE), np.float32), ends, np.empty(TILE, np.float32)
+
+
+@inner
+def locate(unit, first, count, mode, cells, at):
+    """Where places [3, N] from `first` on lie: fills `room` with the rows of the lower corners on the plane, the last one a few
+    times more, and with those of the lower ends on the line along axis `mode`."""
+    corners, within, ends, along = at
+    across, down = unit[1 if mode == 0 else 0], unit[1 if mode == 2 else 2]
+    for k in range(count):
+        a, within[0, k] = cell_of(across[first + k], cells)
+        b, within[1, k] = cell_of(down[first + k], cells)
+        corners[k] = a * uint32(cells + 1) + b
+        ends[k], along[k] = cell_of(unit[mode, first + k], cells)
+    corners[count : count + AHEAD] = corners[count - 1]
 
 
 @inner(inline="always")
-def locate(unit, n, mode, cells):
-    """Row of the plane's lower corner and the fractions in it, then row and fraction on the line along axis `mode`."""
-    a, fa = cell_of(unit[1 if mode == 0 else 0, n], cells)
-    b, fb = cell_of(unit[1 if mode == 2 else 2, n], cells)
-    c, fc = cell_of(unit[mode, n], cells)
-    return a * uint32(cells + 1) + b, fa, fb, c, fc
+def fetch(plane, corner, cells, first):
+    """Brings the rows of a cell's corners near, without waiting for them."""
+    above = corner + uint32(cells + 1)
+    prefetch(plane, corner, first)
+    prefetch(plane, corner + uint32(1), first)
+    prefetch(plane, above, first)
+    prefetch(plane, above + uint32(1), first)
 
 
 @inner(inline="always")
@@ -41,16 +65,18 @@ def products(planes, lines, unit, out, lanes, workers):
     samples, cells, channels = unit.shape[1], lines.shape[1] - 1, len(lanes)
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
-        rows = np.empty((TILE, len(lanes)), np.float32)
+        rows, at = np.empty((TILE, len(lanes)), np.float32), room()
+        corners, within, ends, along = at
         # One mode after the other: its plane then stays in the core's cache.
         for mode in range(3):
             plane, line = planes[mode], lines[mode]
             for first in range(start, end, TILE):
                 count = min(TILE, end - first)
+                locate(unit, first, count, mode, cells, at)
                 for k in range(count):
-                    corner, fa, fb, place, fc = locate(unit, first + k, mode, cells)
-                    value = on_plane(plane, corner, cells, fa, fb, 0, lanes) * on_line(line, place, fc, 0, lanes)
-                    store(rows, k, 0, value)
+                    fetch(plane, corners[k + AHEAD], cells, 0)
+                    value = on_plane(plane, corners[k], cells, within[0, k], within[1, k], 0, lanes)
+                    store(rows, k, 0, value * on_line(line, ends[k], along[k], 0, lanes))
                 for c in range(channels):
                     for k in range(count):
                         out[mode * channels + c, first + k] = rows[k, c]
@@ -63,12 +89,17 @@ def sums(planes, lines, unit, out, lanes, workers):
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
         out[0, start:end] = float32(0)
+        at = room()
+        corners, within, ends, along = at
         for mode in range(3):
             plane, line = planes[mode], lines[mode]
-            for n in range(start, end):
-                corner, fa, fb, place, fc = locate(unit, n, mode, cells)
-                value = on_plane(plane, corner, cells, fa, fb, 0, lanes) * on_line(line, place, fc, 0, lanes)
-                out[0, n] += total(value)
+            for first in range(start, end, TILE):
+                count = min(TILE, end - first)
+                locate(unit, first, count, mode, cells, at)
+                for k in range(count):
+                    fetch(plane, corners[k + AHEAD], cells, 0)
+                    value = on_plane(plane, corners[k], cells, within[0, k], within[1, k], 0, lanes)
+                    out[0, first + k] += total(value * on_line(line, ends[k], along[k], 0, lanes))
 
 
 @inner(inline="always")
@@ -80,15 +111,19 @@ def add_to(rows, row, first, values, lanes):
 def scatter_block(plane, line, grad_plane, grad_line, unit, above, mode, channel, lanes):
     """Adds the gradient of one mode's channels from `channel` on; `above` is [C, N], or one row that serves all channels."""
     samples, cells, one = unit.shape[1], len(line) - 1, uint32(1)
-    rows = np.empty((TILE, len(lanes)), np.float32)
+    rows, at = np.empty((TILE, len(lanes)), np.float32), room()
+    corners, within, ends, along = at
     for first in range(0, samples, TILE):
         count = min(TILE, samples - first)
+        locate(unit, first, count, mode, cells, at)
         for c in range(len(lanes)):
             row = above[c if len(above) > 1 else 0]
             for k in range(count):
                 rows[k, c] = row[first + k]
         for k in range(count):
-            corner, fa, fb, place, fc = locate(unit, first + k, mode, cells)
+            fetch(plane, corners[k + AHEAD], cells, channel)
+            fetch(grad_plane, corners[k + AHEAD], cells, channel)
+            corner, fa, fb, place, fc = corners[k], within[0, k], within[1, k], ends[k], along[k]
             ga, gb, next_row = float32(1) - fa, float32(1) - fb, corner + uint32(cells + 1)
             given = load(rows, k, 0, lanes)
             to_line = given * on_plane(plane, corner, cells, fa, fb, channel, lanes)
@@ -102,19 +137,29 @@ def scatter_block(plane, line, grad_plane, grad_line, unit, above, mode, channel
 
 
 @kernel
-def scatter(planes, lines, unit, above, grad_planes, grad_lines, lanes, workers):
-    """Adds to the gradients. A mode's block of channels, as many as `lanes`, belongs to one worker, so no two share a place."""
+def scatter(planes, lines, unit, above, grad_planes, grad_lines, lanes, pair, workers):
+    """Adds to the gradients. A mode's block of channels, as many as `lanes`, belongs to one worker, so no two share a place.
+
+    Args:
+        pair: a tuple of twice the length: two blocks that a worker has of one mode are added together.
+    """
     channels = planes.shape[2]
     blocks = channels // len(lanes)
     for worker in prange(workers):
         # Neighbouring blocks go to one worker: two workers on one plane would fight over cache lines.
-        for index in range(3 * blocks * worker // workers, 3 * blocks * (worker + 1) // workers):
+        index, end = 3 * blocks * worker // workers, 3 * blocks * (worker + 1) // workers
+        while index < end:
             mode, channel = index // blocks, index % blocks * len(lanes)
             start = mode * channels + channel if len(above) > 1 else 0
-            given = above[start : start + len(lanes)]
-            scatter_block(
-                planes[mode], lines[mode], grad_planes[mode], grad_lines[mode], unit, given, mode, channel, lanes
-            )
+            plane, line, to_plane, to_line = planes[mode], lines[mode], grad_planes[mode], grad_lines[mode]
+            if blocks % 2 == 0 and index % 2 == 0 and index + 1 < end:
+                given = above[start : start + len(pair)]
+                scatter_block(plane, line, to_plane, to_line, unit, given, mode, channel, pair)
+                index += 2
+            else:
+                given = above[start : start + len(lanes)]
+                scatter_block(plane, line, to_plane, to_line, unit, given, mode, channel, lanes)
+                index += 1
 
 
 @inner(inline="always")
@@ -133,25 +178,27 @@ def slope(planes, lines, unit, above, grad, lanes, workers):
     samples, cells, channels = unit.shape[1], lines.shape[1] - 1, len(lanes)
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
-        rows = np.empty((TILE, len(lanes)), np.float32)
+        rows, at = np.empty((TILE, len(lanes)), np.float32), room()
+        corners, within, ends, along = at
         grad[:, start:end] = float32(0)
         for mode in range(3):
             plane, line, one = planes[mode], lines[mode], uint32(1)
             first_axis, second_axis = 1 if mode == 0 else 0, 1 if mode == 2 else 2
             for first in range(start, end, TILE):
                 count = min(TILE, end - first)
+                locate(unit, first, count, mode, cells, at)
                 for c in range(channels):
                     row = above[mode * channels + c if len(above) > 1 else 0]
                     for k in range(count):
                         rows[k, c] = row[first + k]
                 for k in range(count):
-                    n = first + k
-                    corner, fa, fb, place, fc = locate(unit, n, mode, cells)
+                    fetch(plane, corners[k + AHEAD], cells, 0)
+                    n, corner, fa, fb, place = first + k, corners[k], within[0, k], within[1, k], ends[k]
                     given = load(rows, k, 0, lanes)
-                    to_plane = given * on_line(line, place, fc, 0, lanes)
-                    along = load(line, place + one, 0, lanes) + float32(-1) * load(line, place, 0, lanes)
+                    to_plane = given * on_line(line, place, along[k], 0, lanes)
+                    change = load(line, place + one, 0, lanes) + float32(-1) * load(line, place, 0, lanes)
                     to_line = given * on_plane(plane, corner, cells, fa, fb, 0, lanes)
                     da, db = slopes_on_plane(plane, corner, cells, fa, fb, lanes)
                     grad[first_axis, n] += steepness(unit[first_axis, n], cells) * total(to_plane * da)
                     grad[second_axis, n] += steepness(unit[second_axis, n], cells) * total(to_plane * db)
-                    grad[mode, n] += steepness(unit[mode, n], cells) * total(to_line * along)
+                    grad[mode, n] += steepness(unit[mode, n], cells) * total(to_line * change)
