@@ -119,8 +119,11 @@ def _pick(builder, first, second, places):
     return builder.shuffle_vector(first, second, mask)
 
 
-FUSES = binding.get_host_cpu_features().get("fma", True)
+FEATURES = binding.get_host_cpu_features()
+FUSES = FEATURES.get("fma", True)
 """Whether the processor has fused multiply-add; only some x86 ones lack it."""
+WIDEST = 16 if FEATURES.get("avx512f", False) else 8
+"""Numbers in the processor's widest registers; on those whose registers hold four, two together are one value."""
 
 
 @intrinsic

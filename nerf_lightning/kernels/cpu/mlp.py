@@ -8,11 +8,13 @@ import numpy as np
 from numba import float32, prange
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
-from nerf_lightning.kernels.cpu.lanes import fused, load, spread, store, total, zeros
+from nerf_lightning.kernels.cpu.lanes import WIDEST, fused, load, prefetch, spread, store, total, zeros
 
 TILE = 128
 """Samples worked on together; a constant, so that the inner loops need no remainder."""
-RUN = (0,) * 8
+ROW = TILE + 16
+"""Room for a row of a tile: rows a power of two apart would all want the same few places of the cache."""
+RUN = (0,) * WIDEST
 """Samples of a tile in one register."""
 
 
@@ -21,8 +23,8 @@ def add_product(W, x, y):
     """y += W x, four rows by two registers of samples at a time: eight sums, as many as a processor adds to at once."""
     outputs, inputs = W.shape
     half = len(RUN)
-    for o in range(0, outputs, 4):
-        for n in range(0, TILE, 2 * half):
+    for n in range(0, TILE, 2 * half):
+        for o in range(0, outputs, 4):
             a0, a1 = load(y, o, n, RUN), load(y, o, n + half, RUN)
             b0, b1 = load(y, o + 1, n, RUN), load(y, o + 1, n + half, RUN)
             c0, c1 = load(y, o + 2, n, RUN), load(y, o + 2, n + half, RUN)
@@ -89,14 +91,25 @@ def back_weight(dW, db, dy, x):
 
 
 @inner
+def copy(x, first, y, start, count):
+    """y[:, start : start + count] = x[:, first : first + count], for as many rows as the one that has fewer."""
+    for i in range(min(len(x), len(y))):
+        if count == TILE:
+            for n in range(0, TILE, len(RUN)):
+                prefetch(x, i, first + TILE + n)  # where the next tile's come from
+                store(y, i, start + n, load(x, i, first + n, RUN))
+        else:
+            for n in range(count):
+                y[i, start + n] = x[i, first + n]
+
+
+@inner
 def fill(x, extra, first, count, tile):
     """Copies columns first : first + count of x, then of extra, into a tile; zeros fill the rest of it."""
     rows = len(x)
+    copy(x, first, tile, 0, count)
+    copy(extra, first, tile[rows:], 0, count)
     tile[rows + len(extra) :] = float32(0)
-    for i in range(rows):
-        tile[i, :count] = x[i, first : first + count]
-    for i in range(len(extra)):
-        tile[rows + i, :count] = extra[i, first : first + count]
     if count < TILE:
         tile[:, count:] = float32(0)
 
@@ -131,14 +144,13 @@ def forward(weights, widths, x, extra, out, workers):
     samples = x.shape[1]
     tiles = (samples + TILE - 1) // TILE
     for worker in prange(workers):
-        activations = np.empty((widths.sum(), TILE), np.float32)
+        activations = np.empty((widths.sum(), ROW), np.float32)
         for tile in range(tiles * worker // workers, tiles * (worker + 1) // workers):
             first = tile * TILE
             count = min(TILE, samples - first)
             fill(x, extra, first, count, activations[: widths[0]])
             row, _ = run_tile(weights, widths, activations)
-            for o in range(len(out)):
-                out[o, first : first + count] = activations[row + o, :count]
+            copy(activations[row:], 0, out, first, count)
 
 
 @kernel
@@ -148,9 +160,9 @@ def backward(weights, widths, x, extra, above, grad_x, grad_weights, workers):
     tiles, layers = (samples + TILE - 1) // TILE, len(widths) - 1
     nothing = np.empty((0, samples), np.float32)
     for worker in prange(workers):
-        activations = np.empty((widths.sum(), TILE), np.float32)
-        grad_out = np.empty((widths.max(), TILE), np.float32)
-        grad_in = np.empty((widths.max(), TILE), np.float32)
+        activations = np.empty((widths.sum(), ROW), np.float32)
+        grad_out = np.empty((widths.max(), ROW), np.float32)
+        grad_in = np.empty((widths.max(), ROW), np.float32)
         sums = grad_weights[worker]
         sums[:] = float32(0)
         for tile in range(tiles * worker // workers, tiles * (worker + 1) // workers):
@@ -172,5 +184,4 @@ def backward(weights, widths, x, extra, above, grad_x, grad_weights, workers):
                     for i in range(inputs):
                         for n in range(TILE):
                             grad_out[i, n] = grad_in[i, n] if entered[i, n] > float32(0) else float32(0)
-            for i in range(len(grad_x)):
-                grad_x[i, first : first + count] = grad_in[i, :count]
+            copy(grad_in, 0, grad_x, first, count)
