@@ -91,9 +91,10 @@ def _each(*volumes: tuple[Tensor, Tensor], unit: Float[Tensor, "N 3"]) -> list[T
     return [_products(*volume, at) for volume in volumes]
 
 
-def _block(channels: int) -> int:
-    """Channels that one worker adds up together: enough to fill a register, few enough that every worker gets some."""
-    return next(width for width in (8, 4, 2, 1) if channels % width == 0)
+def _block(channels: int) -> tuple[int, ...]:
+    """As long as a block of channels that one worker adds up together: enough to fill a register, few enough that every worker
+    gets some."""
+    return (0,) * next(width for width in (8, 4, 2, 1) if channels % width == 0)
 
 
 class _PlaneLine(torch.autograd.Function):
@@ -105,8 +106,11 @@ class _PlaneLine(torch.autograd.Function):
         planes, lines, places, channels = planes.contiguous(), lines.contiguous(), unit.T.contiguous(), lines.shape[2]
         out = torch.empty(1 if summed else 3 * channels, len(unit))
         given = planes.detach().flatten(1, 2).numpy(), lines.detach().numpy(), places.numpy()
-        kernel = cpu.sums if summed else cpu.products
-        kernel(*given, out.numpy(), (0,) * channels, workers())
+        lanes = (0,) * channels
+        if summed:
+            cpu.sums(*given, out.numpy(), lanes, workers())
+        else:
+            cpu.products(*given, out.numpy(), lanes, _block(channels), workers())
         ctx.save_for_backward(planes, lines, places)
         return out.T
 
@@ -118,12 +122,12 @@ class _PlaneLine(torch.autograd.Function):
         planes, lines, places = ctx.saved_tensors
         grad_planes, grad_lines = torch.zeros_like(planes), torch.zeros_like(lines)
         given = planes.flatten(1, 2).numpy(), lines.numpy(), places.numpy(), grad.T.contiguous().numpy()
-        lanes = (0,) * _block(lines.shape[2])
-        cpu.scatter(*given, grad_planes.flatten(1, 2).numpy(), grad_lines.numpy(), lanes, 2 * lanes, workers())
+        block = _block(lines.shape[2])
+        cpu.scatter(*given, grad_planes.flatten(1, 2).numpy(), grad_lines.numpy(), block, 2 * block, workers())
         moved = None
         if ctx.needs_input_grad[2]:
             moved = torch.empty_like(places)
-            cpu.slope(*given, moved.numpy(), (0,) * lines.shape[2], workers())
+            cpu.slope(*given, moved.numpy(), (0,) * lines.shape[2], block, workers())
             moved = moved.T
         return grad_planes, grad_lines, moved, None
 

@@ -9,6 +9,8 @@ from llvmlite import binding, ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, models, overload, register_model
 
+from nerf_lightning.kernels.cpu.compile import inner
+
 
 class Lanes(types.Type):
     """`width` single-precision numbers."""
@@ -140,6 +142,46 @@ def fused(typing, a, b, c):
         )
 
     return a(a, a, a), code
+
+
+@intrinsic
+def transpose(typing, source, row, column, target, to_row, to_column, lanes):
+    """target[to_row + j, to_column + i] = source[row + i, column + j] for i and j below the length of the tuple `lanes`, a
+    power of two."""
+    width = len(lanes)
+
+    def code(context, builder, signature, values):
+        def places(start):
+            """To all rows of a block, given where its array, row and column stand among the arguments."""
+            array, first, column = values[start : start + 3]
+            kinds = signature.args[start], types.intp, signature.args[start + 2]
+            first = context.cast(builder, first, signature.args[start + 1], types.intp)
+            numbers = [builder.add(first, first.type(i)) for i in range(width)]
+            return [_pointer(context, builder, kinds, (array, number, column), width) for number in numbers]
+
+        rows, half = [builder.load(place, align=4) for place in places(0)], width // 2
+        lower = [i // 2 + width * (i % 2) for i in range(width)]
+        mixes = lower, [place + half for place in lower]
+        for _ in range(width.bit_length() - 1):  # each time, what says the row takes a bit from what says the column
+            rows = [_pick(builder, rows[i], rows[i + half], mix) for i in range(half) for mix in mixes]
+        for found, place in zip(rows, places(3), strict=True):
+            builder.store(found, place, align=4)
+        return context.get_dummy_value()
+
+    return types.none(source, row, column, target, to_row, to_column, lanes), code
+
+
+@inner
+def turn(source, row, column, target, to_row, to_column, height, width, block):
+    """target[to_row + j, to_column + i] = source[row + i, column + j] for i < height and j < width, by squares with a side as
+    long as the tuple `block`."""
+    side = len(block)
+    for i in range(0, height - side + 1, side):
+        for j in range(0, width - side + 1, side):
+            transpose(source, row + i, column + j, target, to_row + j, to_column + i, block)
+    for i in range(height):
+        for j in range(width - width % side if i < height - height % side else 0, width):
+            target[to_row + j, to_column + i] = source[row + i, column + j]
 
 
 @intrinsic

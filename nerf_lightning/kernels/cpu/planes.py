@@ -5,7 +5,7 @@ from numba import float32, prange, uint32
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
 from nerf_lightning.kernels.cpu.hashgrid import cell_of, steepness
-from nerf_lightning.kernels.cpu.lanes import load, prefetch, store, total
+from nerf_lightning.kernels.cpu.lanes import load, prefetch, spread, store, total, turn
 
 TILE = 512
 """Samples worked on together where features [C, N] turn into rows [N, C], or back: long runs in memory, still in cache."""
@@ -34,6 +34,16 @@ def locate(unit, first, count, mode, cells, at):
     corners[count : count + AHEAD] = corners[count - 1]
 
 
+@inner
+def give_rows(above, feature, first, count, rows, lanes, block):
+    """rows[k, c] = above[feature + c, first + k], or above[0, first + k] where there is but one row that serves all."""
+    if len(above) > 1:
+        turn(above, feature, first, rows, 0, 0, rows.shape[1], count, block)
+    else:
+        for k in range(count):
+            store(rows, k, 0, spread(above[0, first + k], lanes))
+
+
 @inner(inline="always")
 def fetch(plane, corner, cells, first):
     """Brings the rows of a cell's corners near, without waiting for them."""
@@ -60,8 +70,9 @@ def on_line(line, place, f, first, lanes):
 
 
 @kernel
-def products(planes, lines, unit, out, lanes, workers):
-    """out [3 C, N] from planes [3, S S, C], lines [3, S, C] and unit [3, N]. `lanes` is a tuple of length C."""
+def products(planes, lines, unit, out, lanes, block, workers):
+    """out [3 C, N] from planes [3, S S, C], lines [3, S, C] and unit [3, N]. `lanes` is a tuple of length C, `block` one of a
+    length that divides it."""
     samples, cells, channels = unit.shape[1], lines.shape[1] - 1, len(lanes)
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
@@ -77,9 +88,7 @@ def products(planes, lines, unit, out, lanes, workers):
                     fetch(plane, corners[k + AHEAD], cells, 0)
                     value = on_plane(plane, corners[k], cells, within[0, k], within[1, k], 0, lanes)
                     store(rows, k, 0, value * on_line(line, ends[k], along[k], 0, lanes))
-                for c in range(channels):
-                    for k in range(count):
-                        out[mode * channels + c, first + k] = rows[k, c]
+                turn(rows, 0, 0, out, mode * channels, first, count, channels, block)
 
 
 @kernel
@@ -108,18 +117,15 @@ def add_to(rows, row, first, values, lanes):
 
 
 @inner
-def scatter_block(plane, line, grad_plane, grad_line, unit, above, mode, channel, lanes):
-    """Adds the gradient of one mode's channels from `channel` on; `above` is [C, N], or one row that serves all channels."""
+def scatter_block(plane, line, grad_plane, grad_line, unit, above, feature, mode, channel, lanes, block):
+    """Adds the gradient of one mode's channels from `channel` on, which are the features from `feature` on."""
     samples, cells, one = unit.shape[1], len(line) - 1, uint32(1)
     rows, at = np.empty((TILE, len(lanes)), np.float32), room()
     corners, within, ends, along = at
     for first in range(0, samples, TILE):
         count = min(TILE, samples - first)
         locate(unit, first, count, mode, cells, at)
-        for c in range(len(lanes)):
-            row = above[c if len(above) > 1 else 0]
-            for k in range(count):
-                rows[k, c] = row[first + k]
+        give_rows(above, feature, first, count, rows, lanes, block)
         for k in range(count):
             fetch(plane, corners[k + AHEAD], cells, channel)
             fetch(grad_plane, corners[k + AHEAD], cells, channel)
@@ -137,28 +143,26 @@ def scatter_block(plane, line, grad_plane, grad_line, unit, above, mode, channel
 
 
 @kernel
-def scatter(planes, lines, unit, above, grad_planes, grad_lines, lanes, pair, workers):
-    """Adds to the gradients. A mode's block of channels, as many as `lanes`, belongs to one worker, so no two share a place.
+def scatter(planes, lines, unit, above, grad_planes, grad_lines, block, pair, workers):
+    """Adds to the gradients. A mode's block of channels, as many as `block`, belongs to one worker, so no two share a place.
 
     Args:
-        pair: a tuple of twice the length: two blocks that a worker has of one mode are added together.
+        above: [3 C, N], or one row that serves all features.
+        pair: a tuple of twice the length of `block`: two blocks that a worker has of one mode are added together.
     """
     channels = planes.shape[2]
-    blocks = channels // len(lanes)
+    blocks = channels // len(block)
     for worker in prange(workers):
         # Neighbouring blocks go to one worker: two workers on one plane would fight over cache lines.
         index, end = 3 * blocks * worker // workers, 3 * blocks * (worker + 1) // workers
         while index < end:
-            mode, channel = index // blocks, index % blocks * len(lanes)
-            start = mode * channels + channel if len(above) > 1 else 0
+            mode, channel, feature = index // blocks, index % blocks * len(block), index * len(block)
             plane, line, to_plane, to_line = planes[mode], lines[mode], grad_planes[mode], grad_lines[mode]
             if blocks % 2 == 0 and index % 2 == 0 and index + 1 < end:
-                given = above[start : start + len(pair)]
-                scatter_block(plane, line, to_plane, to_line, unit, given, mode, channel, pair)
+                scatter_block(plane, line, to_plane, to_line, unit, above, feature, mode, channel, pair, block)
                 index += 2
             else:
-                given = above[start : start + len(lanes)]
-                scatter_block(plane, line, to_plane, to_line, unit, given, mode, channel, lanes)
+                scatter_block(plane, line, to_plane, to_line, unit, above, feature, mode, channel, block, block)
                 index += 1
 
 
@@ -173,8 +177,8 @@ def slopes_on_plane(plane, corner, cells, fa, fb, lanes):
 
 
 @kernel
-def slope(planes, lines, unit, above, grad, lanes, workers):
-    """Fills grad [3, N], the gradient in the places; `above` as in `scatter`, `lanes` as in `products`."""
+def slope(planes, lines, unit, above, grad, lanes, block, workers):
+    """Fills grad [3, N], the gradient in the places; `above` as in `scatter`, `lanes` and `block` as in `products`."""
     samples, cells, channels = unit.shape[1], lines.shape[1] - 1, len(lanes)
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
@@ -187,10 +191,7 @@ def slope(planes, lines, unit, above, grad, lanes, workers):
             for first in range(start, end, TILE):
                 count = min(TILE, end - first)
                 locate(unit, first, count, mode, cells, at)
-                for c in range(channels):
-                    row = above[mode * channels + c if len(above) > 1 else 0]
-                    for k in range(count):
-                        rows[k, c] = row[first + k]
+                give_rows(above, mode * channels, first, count, rows, lanes, block)
                 for k in range(count):
                     fetch(plane, corners[k + AHEAD], cells, 0)
                     n, corner, fa, fb, place = first + k, corners[k], within[0, k], within[1, k], ends[k]

@@ -9,10 +9,12 @@ from numba import float32, int64, prange
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
 from nerf_lightning.kernels.cpu.hashgrid import cell_of, steepness, trilinear_slope
-from nerf_lightning.kernels.cpu.lanes import load, store, total
+from nerf_lightning.kernels.cpu.lanes import load, store, total, turn
 
 TILE = 64
 """Samples whose basis functions are transposed together."""
+SQUARE = (0,) * 8
+"""As long as the side of the squares in which that is done."""
 BINS = 256
 """Pieces of the table in which a gradient's work is counted before it is divided among workers."""
 
@@ -121,20 +123,12 @@ def pull(density, colour, rows, raw, rgb, grad, workers):
 
 
 @inner
-def turn(basis, first, count, tile):
-    """tile [TILE, B] from `count` columns of basis [B, N]."""
-    for b in range(tile.shape[1]):
-        for k in range(count):
-            tile[k, b] = basis[b, first + k]
-
-
-@inner
 def add_views_run(views, rows, weights, basis, rgb, lanes, start, end):
     terms = len(lanes)
     tile = np.empty((TILE, terms), np.float32)
     for first in range(start, end, TILE):
         count = min(TILE, end - first)
-        turn(basis, first, count, tile)
+        turn(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
         for k in range(count):
             n = first + k
             row, weight = rows[n, 0], weights[n, 0]
@@ -167,7 +161,7 @@ def pull_views_run(views, rows, basis, rgb, grad, lanes, start, end):
     tile = np.empty((TILE, terms), np.float32)
     for first in range(start, end, TILE):
         count = min(TILE, end - first)
-        turn(basis, first, count, tile)
+        turn(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
         for k in range(count):
             n = first + k
             given = load(tile, k, 0, lanes)
@@ -228,7 +222,7 @@ def scatter_views_run(grad, rows, weights, basis, rgb, lanes, first, last):
     tile = np.empty((TILE, terms), np.float32)
     for begin in range(0, samples, TILE):
         count = min(TILE, samples - begin)
-        turn(basis, begin, count, tile)
+        turn(basis, 0, begin, tile, 0, 0, terms, count, SQUARE)
         for k in range(count):
             n = begin + k
             given = load(tile, k, 0, lanes)
