@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays
@@ -29,6 +29,11 @@ what 8 bits tell."""
 ROOM = 1.25
 """Room for steps that are not counted, as a multiple of the last count."""
 
+FINE = 1 << 24
+"""Places along an axis of a cell: as many as single precision tells apart."""
+PLASTIC = 1.2207440846057596
+"""The root above 1 of x^4 = x + 1."""
+
 CROSSED = 1 / 8
 """Share of the diagonal that rays cross: those through a cube cross 0.38 on average, and two in three may miss it."""
 CELL = 56
@@ -38,6 +43,15 @@ CELL = 56
 def in_view(camera: Cameras, points: Float[Tensor, "N 3"], near: float) -> Bool[Tensor, "N"]:
     """Which world points one camera sees, farther from it than `near`."""
     return camera.project(points, 0)[2] & ((points - camera.centres).norm(dim=1) > near)
+
+
+def spread_evenly(numbers: Int[Tensor, "N"], generator: Generator) -> Float[Tensor, "3 N"]:
+    """A place in [0, 1)^3 for each whole number: a lattice of irrational steps, moved at random as a whole (the additive
+    recurrence R3; Roberts 2018). For a million cells this takes a fraction of the time of as many random numbers."""
+    device = numbers.device
+    steps = torch.tensor([[round(FINE / PLASTIC**power)] for power in (1, 2, 3)], dtype=torch.int32, device=device)
+    start = torch.randint(FINE, (3, 1), generator=generator, device=device, dtype=torch.int32)
+    return ((numbers * steps + start) & (FINE - 1)) / FINE  # what overflows is beyond the bits that count
 
 
 class OccupancySampler(Sampler):
@@ -267,10 +281,14 @@ class OccupancySampler(Sampler):
         else:
             # Every fourth cell from a random start: no cell twice, all equally likely.
             start = torch.randint(4, (1,), generator=generator, device=device)
-            cells = (torch.arange(0, total, 4, device=device) + start) % total
+            cells = torch.arange(0, total, 4, device=device) + start
+            cells = torch.where(cells < total, cells, cells - total)
         n = self.resolution
-        corner = torch.stack([cells // (n * n), cells // n % n, cells % n])
-        unit = ((corner + torch.rand(corner.shape, generator=generator, device=device)) / n).T
+        number = cells.int() if total < 1 << 31 else cells  # 32 bits are divided in a fraction of the time
+        row = number // n
+        plane = row // n
+        corner = torch.stack([plane, row - plane * n, number - row * n])
+        unit = ((corner + spread_evenly(number, generator)) / n).T
         found = torch.cat(
             [density(part) for part in self.bounds.to_world(unit).split(ASKED * self.chunk)]
         ) * self.length(self.samples)

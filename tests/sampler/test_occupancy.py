@@ -8,6 +8,7 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at
 from nerf_lightning.kernels import cell_index, use_kernels
 from nerf_lightning.sampler import OccupancySampler, occupancy
+from nerf_lightning.sampler.occupancy import spread_evenly
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 
@@ -264,3 +265,15 @@ def test_pictures_take_finer_steps_than_training(rays: Rays, box: Bounds):
     sampler = OccupancySampler(box, resolution=8)
     training, picture = (sampler(rays, lambda x: torch.ones(len(x)), generator) for generator in (seeded(), None))
     assert picture.dt.max() < 0.76 * training.dt.max() and len(picture) > 1.2 * len(training)
+
+
+def test_cells_are_looked_at_all_over_and_elsewhere_each_time():
+    numbers = torch.arange(0, 40000, 4, dtype=torch.int32)
+    one, other = (spread_evenly(numbers, torch.Generator().manual_seed(seed)) for seed in (0, 1))
+    for places in (one, other, spread_evenly(numbers + 2_000_000_000, torch.Generator().manual_seed(0))):
+        assert float(places.min()) >= 0 and float(places.max()) < 1
+        cells = (places * 10).long()
+        counts = torch.bincount((cells[0] * 10 + cells[1]) * 10 + cells[2], minlength=1000)
+        assert int(counts.min()) >= 5 and int(counts.max()) <= 16  # 10 each
+    moved = (other - one) % 1
+    assert (moved - moved[:, :1]).abs().max() < 1e-6 and moved[:, 0].min() > 1e-3
