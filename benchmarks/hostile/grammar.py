@@ -11,6 +11,8 @@ from benchmarks.hostile.case import Command
 
 ENDLESS = ("budget.", "trainer.max_", "target.", "seconds", "within_db", "smallest_within_db", "steps", "seeds", "fps")
 """Options that may ask for any amount of time: a command that takes long is right then. They get no large numbers."""
+EVERYTHING = ("methods",)
+"""Options where null stands for all there are: right as well, and hours of work with a suite's other defaults."""
 NOT_ASKED = (
     "trainer.devices", "trainer.strategy", "trainer.num_nodes", "trainer.accelerator", "trainer.profiler", "compile", "kernels",
     "dataset.url", "dataset.download", "resume", "workers",
@@ -59,7 +61,8 @@ def word(rng: Random, key: str) -> str:
         return rng.choice(PLACES)
     if rng.random() < 0.25 and not key.startswith(ENDLESS):
         return rng.choice(LARGE)
-    return rng.choice(WORDS)
+    chosen = rng.choice(WORDS)
+    return "nope" if key in EVERYTHING and chosen == "null" else chosen
 
 
 def argument(rng: Random, verb: str, options: Mapping[str, str]) -> str:
