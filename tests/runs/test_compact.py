@@ -74,7 +74,7 @@ def test_it_shows_what_the_run_shows_in_far_fewer_bytes(
 
     view = build_data(load_run(folder).cfg).held_out(0)
     assert (run.evaluate(view).rgb - small.evaluate(view).rgb).abs().max() < 0.1
-    assert abs(run.evaluate(view).psnr - small.evaluate(view).psnr) < 0.2
+    assert abs(run.evaluate(view).psnr - small.evaluate(view).psnr) < 0.5  # of 400 pixels, near 38 dB in one case
 
 
 def test_halves_are_nearer_than_bytes(run_folder: Path):
