@@ -69,6 +69,15 @@ def on_line(line, place, f, first, lanes):
     return (float32(1) - f) * load(line, place, first, lanes) + f * load(line, place + uint32(1), first, lanes)
 
 
+@inner(inline="always")
+def product(plane, line, k, cells, at, lanes):
+    """All channels of a plane times those of the line across it, at place k of a tile; a later one's rows are asked for."""
+    corners, within, ends, along = at
+    fetch(plane, corners[k + AHEAD], cells, 0)
+    value = on_plane(plane, corners[k], cells, within[0, k], within[1, k], 0, lanes)
+    return value * on_line(line, ends[k], along[k], 0, lanes)
+
+
 @kernel
 def products(planes, lines, unit, out, lanes, block, workers):
     """out [3 C, N] from planes [3, S S, C], lines [3, S, C] and unit [3, N]. `lanes` is a tuple of length C, `block` one of a
@@ -77,7 +86,6 @@ def products(planes, lines, unit, out, lanes, block, workers):
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
         rows, at = np.empty((TILE, len(lanes)), np.float32), room()
-        corners, within, ends, along = at
         # One mode after the other: its plane then stays in the core's cache.
         for mode in range(3):
             plane, line = planes[mode], lines[mode]
@@ -85,9 +93,7 @@ def products(planes, lines, unit, out, lanes, block, workers):
                 count = min(TILE, end - first)
                 locate(unit, first, count, mode, cells, at)
                 for k in range(count):
-                    fetch(plane, corners[k + AHEAD], cells, 0)
-                    value = on_plane(plane, corners[k], cells, within[0, k], within[1, k], 0, lanes)
-                    store(rows, k, 0, value * on_line(line, ends[k], along[k], 0, lanes))
+                    store(rows, k, 0, product(plane, line, k, cells, at, lanes))
                 turn(rows, 0, 0, out, mode * channels, first, count, channels, block)
 
 
@@ -99,16 +105,13 @@ def sums(planes, lines, unit, out, lanes, workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
         out[0, start:end] = float32(0)
         at = room()
-        corners, within, ends, along = at
         for mode in range(3):
             plane, line = planes[mode], lines[mode]
             for first in range(start, end, TILE):
                 count = min(TILE, end - first)
                 locate(unit, first, count, mode, cells, at)
                 for k in range(count):
-                    fetch(plane, corners[k + AHEAD], cells, 0)
-                    value = on_plane(plane, corners[k], cells, within[0, k], within[1, k], 0, lanes)
-                    out[0, first + k] += total(value * on_line(line, ends[k], along[k], 0, lanes))
+                    out[0, first + k] += total(product(plane, line, k, cells, at, lanes))
 
 
 @inner(inline="always")
