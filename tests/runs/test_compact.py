@@ -64,7 +64,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory, own_cache: None, tmp_pa
 def test_it_shows_what_the_run_shows_in_far_fewer_bytes(
     recipe: str, more: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    folder = trained(tmp_path, recipe, *more)
+    folder = trained(tmp_path, recipe, *more, "budget.steps=80")  # after 40, one of 400 pixels may make 0.3 dB
     export(folder)
     assert "dB lost" in capsys.readouterr().out
     run, small = load_run(folder).system, load_compact(folder / "compact.npz").system
@@ -74,7 +74,7 @@ def test_it_shows_what_the_run_shows_in_far_fewer_bytes(
 
     view = build_data(load_run(folder).cfg).held_out(0)
     assert (run.evaluate(view).rgb - small.evaluate(view).rgb).abs().max() < 0.1
-    assert abs(run.evaluate(view).psnr - small.evaluate(view).psnr) < 0.5  # of 400 pixels, near 38 dB in one case
+    assert abs(run.evaluate(view).psnr - small.evaluate(view).psnr) < 0.2
 
 
 def test_halves_are_nearer_than_bytes(run_folder: Path):

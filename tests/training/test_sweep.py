@@ -193,7 +193,8 @@ SHARED = {
 
 @pytest.mark.parametrize("what", ["planes that grow", pytest.param("a picture", marks=pytest.mark.long)])
 def test_two_processes_share_a_run_and_leave_one_folder(what: str, inside, tmp_path: Path):
-    options = [*SHARED[what], "budget.steps=100", "trainer.accelerator=cpu", "threads=1"]
+    steps = 100 if what == "a picture" else 200  # after 100 of so small a scene, seeds alone differ by 1.2 dB
+    options = [*SHARED[what], f"budget.steps={steps}", "trainer.accelerator=cpu", "threads=1"]
     code, out, err = inside(*options, "name=one")
     assert code == 0, err
     done = command(*options, "trainer=ddp", "name=two", cwd=tmp_path)
@@ -206,9 +207,8 @@ def test_two_processes_share_a_run_and_leave_one_folder(what: str, inside, tmp_p
         assert (folder / "checkpoints" / "last.ckpt").stat().st_size > 0
         assert told.count("everything is in") == 1
     one, two = results
-    most = 0.2 if what == "a picture" else 2.0  # of a scene so small, seeds alone differ by 1.2 dB
-    assert abs(one["psnr"] - two["psnr"]) < most and min(one["psnr"], two["psnr"]) > 15
-    assert (two["steps"], two["status"]) == (100, "finished")
+    assert abs(one["psnr"] - two["psnr"]) < (0.2 if what == "a picture" else 1.0) and one["psnr"] > 15
+    assert (two["steps"], two["status"]) == (steps, "finished")
 
 
 def test_a_missing_launcher_says_what_to_install(inside, monkeypatch):
