@@ -2,6 +2,7 @@
 
 import difflib
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -56,7 +57,7 @@ def check_keys(cfg: DictConfig, config: str, choices: Mapping[str, str | None]) 
         choices: what was chosen of each group, as Hydra keeps it.
 
     Raises:
-        InputError: for a key that does not stand in conf/.
+        InputError: for a key that does not stand in conf/, and a whole number that no float can hold.
     """
     with open_dict(cfg):
         for group in OPTIONAL:
@@ -69,7 +70,17 @@ def check_keys(cfg: DictConfig, config: str, choices: Mapping[str, str | None]) 
     packages = {re.split("[/.]", name.rpartition("@")[2])[0] for name in choices}
     groups = dict.fromkeys(packages - {"hydra", "experiment"})
     found = OmegaConf.to_container(cfg)
+    _check_numbers(found, "")
     _check(found, {**known, **groups}, "", str(found))
+
+
+def _check_numbers(found: Any, where: str) -> None:
+    inside = found.items() if isinstance(found, dict) else enumerate(found) if isinstance(found, list) else ()
+    for key, value in inside:
+        _check_numbers(value, f"{where}.{key}" if where else str(key))
+    if isinstance(found, int) and abs(found) > sys.float_info.max:
+        digits, most = len(str(abs(found))), sys.float_info.max_10_exp
+        raise InputError("config", where, f"a whole number of {digits} digits", f"at most {most}")
 
 
 def _check(found: Any, known: Mapping[str, Any], where: str, text: str) -> None:

@@ -74,6 +74,7 @@ def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
         (["schedule._partial_=3"], ["schedule._partial_", "true or false"]),
         (["--nope"], ["command line: found unrecognized arguments: --nope"]),
         (["+foo=1"], ["config: foo", "unknown option"]),
+        ([f"optimizer.betas=[0.9,{'9' * 400}]"], ["optimizer.betas.1", "a whole number of 400 digits"]),
         (["+buget.steps=1"], ["config: buget", "did you mean budget?"]),
         (["+limits.chnk=1"], ["limits.chnk", "did you mean chunk?"]),
         (["+budget.default.step=1"], ["budget.default.step", "did you mean steps?"]),
