@@ -28,6 +28,10 @@ import torch
 HOW = ("told", "killed", "ended before", "other")
 """A signal that a command answers, SIGKILL, too late for either, and what should not happen."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+LONGEST = 120.0
+"""Seconds after a signal in which a command, and all processes that it has started, must have ended."""
+HANGS = 124
+"""Exit code of one that has not, as `timeout` gives."""
 BRICKS = ("dataset=bricks", "dataset.size=48", "dataset.train_views=16", "dataset.val_views=2", "threads=1")
 TRAINING = (
     *BRICKS,
@@ -126,14 +130,24 @@ def start(words: tuple[str, ...], after: float | None = None, number: int = 0) -
     """Runs a command, and sends it a signal after so many seconds unless it has ended."""
     began = time.monotonic()
     process = subprocess.Popen(
-        [sys.executable, "-m", *words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
+    code = None
     try:
         _, err = process.communicate(timeout=after)
     except subprocess.TimeoutExpired:  # it is still at work
         process.send_signal(number)
-        _, err = process.communicate()
-    return Ended(process.returncode, err, time.monotonic() - began)
+        try:
+            _, err = process.communicate(timeout=LONGEST)
+        except subprocess.TimeoutExpired:  # so is it, or a process that it has left behind
+            os.killpg(process.pid, signal.SIGKILL)
+            _, err = process.communicate()
+            code, err = HANGS, f"{err}still at work {LONGEST:.0f} s after the signal"
+    return Ended(process.returncode if code is None else code, err, time.monotonic() - began)
 
 
 def wrong(job: Job, out: Path, wanted: list[str], after: float, number: int) -> tuple[str, str]:

@@ -35,6 +35,8 @@ def stability(
     Raises:
         InputError: for a suite or a method that is not known, and a folder that another process writes into.
     """
+    from contextlib import closing
+
     from nerf_lightning.runs.owner import owned
     from nerf_lightning.stability.conditions import CONDITIONS
     from nerf_lightning.stability.methods import METHODS
@@ -51,8 +53,8 @@ def stability(
         raise InputError("config", "methods", found, f"some of {', '.join(METHODS)}")
     cells = cells_of(QUICK if suite == "quick" else every, methods or list(METHODS), seeds, steps)
     root = output_path(output)
-    with owned(root):
-        outcomes = dict(tracked(run_all(cells, root, workers), len(cells), "cells"))
+    with owned(root), closing(run_all(cells, root, workers)) as done:  # also where a signal comes between two of them
+        outcomes = dict(tracked(done, len(cells), "cells"))
         write_report([outcomes[cell] for cell in cells], suite, root)
 
 

@@ -3,16 +3,19 @@
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Thread
 
 import psutil
 
 from nerf_lightning.stability.cell import Cell, Outcome, run
 from nerf_lightning.stability.conditions import CONDITIONS
 from nerf_lightning.stability.methods import METHODS
+from nerf_lightning.utils.ending import held
 from nerf_lightning.utils.machine import cores
 from nerf_lightning.utils.memory import check_memory
 
@@ -21,6 +24,8 @@ QUICK = (
     *("2D: clean", "2D: rate x10", "2D: L = 40"),
 )
 """Conditions of the shortest suite."""
+GRACE = 5.0
+"""Seconds that processes have to end by themselves."""
 
 
 def cells_of(conditions: Sequence[str], methods: Sequence[str], seeds: int, steps: int) -> list[Cell]:
@@ -36,7 +41,7 @@ def cells_of(conditions: Sequence[str], methods: Sequence[str], seeds: int, step
     return [cell for cell in chosen if cell.options is not None]
 
 
-def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Iterator[tuple[Cell, Outcome]]:
+def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Generator[tuple[Cell, Outcome]]:
     """Trains cells in processes of one thread each; yields them as they end. They end with this process: cells that are done
     have been written down."""
     count = min(workers or cores(), len(cells))
@@ -44,15 +49,21 @@ def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Iterator[
         check_memory("config", "workers", f"{count:,} processes", count * psutil.Process().memory_info().rss)
     context = multiprocessing.get_context("spawn")  # numba and torch's threads do not survive a fork
     with ProcessPoolExecutor(count, context, _prepare) as pool:
-        with _unheard():
-            pending = {pool.submit(run, cell, root): cell for cell in cells}
         try:
+            with _unheard(), held():
+                pending = {pool.submit(run, cell, root): cell for cell in cells}
             for done in as_completed(pending):
                 yield pending[done], done.result()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for child in multiprocessing.active_children():
-                child.terminate()
+            with held():
+                pool.shutdown(wait=False, cancel_futures=True)
+                children = multiprocessing.active_children()
+                for child in children:
+                    child.terminate()
+                end = time.monotonic() + GRACE
+                for child in children:  # one waits without end for what another held when that ended
+                    child.join(max(0.0, end - time.monotonic()))
+                    child.kill()
             raise
 
 
@@ -71,7 +82,16 @@ def _unheard() -> Iterator[None]:
 
 def _prepare() -> None:
     """One thread a process: more would wait for each other."""
+    Thread(target=_end_with_parent, daemon=True).start()
     os.environ["OMP_NUM_THREADS"] = "1"
     import torch
 
     torch.set_num_threads(1)
+
+
+def _end_with_parent() -> None:
+    """Where the parent was killed, nobody else ends its processes."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # the pool's
+    parent.join()
+    os._exit(1)
