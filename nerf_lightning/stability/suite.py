@@ -6,16 +6,18 @@ import signal
 import time
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
 
 import psutil
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.stability.cell import Cell, Outcome, run
 from nerf_lightning.stability.conditions import CONDITIONS
 from nerf_lightning.stability.methods import METHODS
-from nerf_lightning.utils.ending import held
+from nerf_lightning.utils.ending import AGAIN, held
 from nerf_lightning.utils.machine import cores
 from nerf_lightning.utils.memory import check_memory
 
@@ -43,7 +45,11 @@ def cells_of(conditions: Sequence[str], methods: Sequence[str], seeds: int, step
 
 def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Generator[tuple[Cell, Outcome]]:
     """Trains cells in processes of one thread each; yields them as they end. They end with this process: cells that are done
-    have been written down."""
+    have been written down.
+
+    Raises:
+        InputError: where memory does not do for the processes.
+    """
     count = min(workers or cores(), len(cells))
     if workers is not None:  # each is about as large as this process
         check_memory("config", "workers", f"{count:,} processes", count * psutil.Process().memory_info().rss)
@@ -54,17 +60,24 @@ def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Generator
                 pending = {pool.submit(run, cell, root): cell for cell in cells}
             for done in as_completed(pending):
                 yield pending[done], done.result()
-        except BaseException:
+        except BaseException as error:
             with held():
                 pool.shutdown(wait=False, cancel_futures=True)
-                children = multiprocessing.active_children()
-                for child in children:
-                    child.terminate()
-                end = time.monotonic() + GRACE
-                for child in children:  # one waits without end for what another held when that ended
-                    child.join(max(0.0, end - time.monotonic()))
-                    child.kill()
+                _end(multiprocessing.active_children())
+            if isinstance(error, BrokenProcessPool):
+                lost, enough = "a process that the system ended", f"memory for {count:,} of them"
+                raise InputError("config", "workers", lost, enough, f"give fewer; {AGAIN}") from error
             raise
+
+
+def _end(children: Sequence[multiprocessing.process.BaseProcess]) -> None:
+    """Asks processes to end, and ends those that do not: one may wait for what another held when that ended."""
+    for child in children:
+        child.terminate()
+    end = time.monotonic() + GRACE
+    for child in children:
+        child.join(max(0.0, end - time.monotonic()))
+        child.kill()
 
 
 @contextmanager

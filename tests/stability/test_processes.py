@@ -13,6 +13,7 @@ import psutil
 import pytest
 from commands import ROOT
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.stability.cell import Cell
 from nerf_lightning.stability.suite import run_all
 from nerf_lightning.utils.ending import Interrupted, listen
@@ -32,6 +33,14 @@ class Deaf(Cell):
 
 
 DEAF = Deaf("clean", "hashgrid", 0, 1)
+
+
+class Killed(Cell):
+    """Stands for a cell that needs more memory than there is."""
+
+    def folder(self, root: Path) -> Path:
+        os.kill(os.getpid(), signal.SIGKILL)
+        return root
 
 
 def begun(root: Path) -> int:
@@ -56,6 +65,11 @@ def test_asked_to_end_it_ends_also_those_that_do_not_hear(tmp_path: Path, monkey
         list(run_all([DEAF], tmp_path, 1))
     child = begun(tmp_path)
     wait_for(lambda: not psutil.pid_exists(child))
+
+
+def test_one_that_the_system_ends_is_told(tmp_path: Path):
+    with pytest.raises(InputError, match="workers: found a process that the system ended, expected memory for 1 of"):
+        list(run_all([Killed("clean", "hashgrid", 0, 1)], tmp_path, 1))
 
 
 PARENT = """
