@@ -62,6 +62,7 @@ class ViewBatch(RayBatch):
 
 def rays_through(views: Views, places: Int[Tensor, "R"]) -> tuple[Rays, Int[Tensor, "R"]]:
     """Rays through the pixels at these places in `Views.pixels`, and the photos they belong to."""
+    places = places.contiguous()  # of several processes each has every so many
     view = torch.searchsorted(views.starts, places, right=True) - 1
     pixel, width = places - views.starts[view], views.widths[view]
     return views.cameras.rays(view, pixel // width, pixel % width), view

@@ -15,8 +15,13 @@ def quiet() -> None:
     """Silences Lightning's remarks on hardware and settings that this package chooses itself."""
     for name in NOISY:
         logging.getLogger(name).setLevel(logging.WARNING)
-    for message in (".*does not have many workers.*", ".*GPU available but not used.*", ".*isinstance.treespec.*"):
-        warnings.filterwarnings("ignore", message)
+    for message in (
+        "does not have many workers",
+        "GPU available but not used",
+        "isinstance.treespec",
+        "all_gather is dep",
+    ):
+        warnings.filterwarnings("ignore", f".*{message}.*")
 
 
 class _Errors:
