@@ -6,6 +6,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from threading import Thread
 
@@ -39,8 +41,7 @@ class Killed(Cell):
     """Stands for a cell that needs more memory than there is."""
 
     def folder(self, root: Path) -> Path:
-        os.kill(os.getpid(), signal.SIGKILL)
-        return root
+        raise BrokenProcessPool
 
 
 def begun(root: Path) -> int:
@@ -67,7 +68,9 @@ def test_asked_to_end_it_ends_also_those_that_do_not_hear(tmp_path: Path, monkey
     wait_for(lambda: not psutil.pid_exists(child))
 
 
-def test_one_that_the_system_ends_is_told(tmp_path: Path):
+def test_one_that_the_system_ends_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    threads = "nerf_lightning.stability.suite.ProcessPoolExecutor", lambda count, *_: ThreadPoolExecutor(count)
+    monkeypatch.setattr(*threads)  # they begin at once
     with pytest.raises(InputError, match="workers: found a process that the system ended, expected memory for 1 of"):
         list(run_all([Killed("clean", "hashgrid", 0, 1)], tmp_path, 1))
 
