@@ -210,10 +210,18 @@ def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, sys
 
 
 def budget_options(cfg: DictConfig) -> dict[str, Any]:
-    """The user's limits, or the experiment's own if the user gives none."""
+    """The user's limits, or the experiment's own if the user gives none.
+
+    Raises:
+        InputError: where there is something else than limits.
+    """
+    if not isinstance(cfg.get("budget"), DictConfig):
+        raise InputError("config", "budget", repr(cfg.get("budget"))[:60], "steps and seconds")
     budget = resolved(cfg.budget)
-    default = budget.pop("default")
-    return budget if any(budget[key] is not None for key in default) else {**budget, **default}
+    default = budget.pop("default", {})
+    if not isinstance(default, Mapping):
+        raise InputError("config", "budget.default", repr(default)[:60], "steps and seconds")
+    return budget if any(budget.get(key) is not None for key in default) else {**budget, **default}
 
 
 def build_budget(cfg: DictConfig) -> Budget:
