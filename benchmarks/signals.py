@@ -136,7 +136,7 @@ def start(words: tuple[str, ...], after: float | None = None, number: int = 0) -
         text=True,
         start_new_session=True,
     )
-    code = None
+    hangs = False
     try:
         _, err = process.communicate(timeout=after)
     except subprocess.TimeoutExpired:  # it is still at work
@@ -146,8 +146,8 @@ def start(words: tuple[str, ...], after: float | None = None, number: int = 0) -
         except subprocess.TimeoutExpired:  # so is it, or a process that it has left behind
             os.killpg(process.pid, signal.SIGKILL)
             _, err = process.communicate()
-            code, err = HANGS, f"{err}still at work {LONGEST:.0f} s after the signal"
-    return Ended(process.returncode if code is None else code, err, time.monotonic() - began)
+            hangs, err = True, f"{err}still at work {LONGEST:.0f} s after the signal"
+    return Ended(HANGS if hangs else process.returncode, err, time.monotonic() - began)
 
 
 def wrong(job: Job, out: Path, wanted: list[str], after: float, number: int) -> tuple[str, str]:

@@ -94,7 +94,7 @@ def _unheard() -> Iterator[None]:
 
 
 def _prepare() -> None:
-    """One thread a process: more would wait for each other."""
+    """Of a process: it ends with its parent, and computes in one thread, since more would wait for each other."""
     Thread(target=_end_with_parent, daemon=True).start()
     os.environ["OMP_NUM_THREADS"] = "1"
     import torch

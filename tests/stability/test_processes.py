@@ -76,7 +76,7 @@ def test_one_that_the_system_ends_is_told(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 PARENT = """
-import multiprocessing, sys, time
+import multiprocessing, sys
 from pathlib import Path
 
 def work(root):
