@@ -18,6 +18,7 @@ from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU, synchronize
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.machine import Load, work_clocks
+from nerf_lightning.utils.untrusted import number
 
 LOOK_AT = 3
 """Held-out views rendered to look for a plateau."""
@@ -210,9 +211,11 @@ class Budget(L.Callback):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._before = float(state_dict["seconds"])
-        start, reached, slope = map(float, state_dict["line"])
-        self._line = start, reached, slope
-        self.stopped = state_dict["stopped"]
+        self._before = number(state_dict["seconds"])
+        start, reached, slope = map(number, state_dict["line"])
+        self._line, stopped = (start, reached, slope), state_dict["stopped"]
+        if stopped is not None:
+            seconds, rest = number(stopped["seconds"]), number(stopped["rest_db"])
+            self.stopped = {"seconds": seconds, "step": int(stopped["step"]), "rest_db": rest}
         if self.plateau is not None and state_dict["plateau"] is not None:
             self.plateau.load(state_dict["plateau"])

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+from nerf_lightning.utils.untrusted import number
+
 MEMORY = 0.96
 """Decay of the running mean of the loss: it looks back about 25 steps."""
 AS_PLAIN = 0.85
@@ -63,8 +65,9 @@ class Watch:
 
     def load(self, state: dict[str, Any]) -> None:
         """Restores what `state` returned."""
-        for key in self.state():
-            setattr(self, key, state[key])
+        self.began, self.risen, self.dead = (int(state[key]) for key in ("began", "risen", "dead"))
+        self.level = None if state["level"] is None else number(state["level"])
+        self.earlier, self.lowest = [number(level) for level in state["earlier"]], float(state["lowest"])
 
     def due(self, step: int) -> bool:
         """Whether to look at this step."""

@@ -18,6 +18,8 @@ WHOLE = 2.0**30
 """Errors are summed as whole numbers, of this to one: sums do not depend on their order then, on any device."""
 LOTS = 1 << 40
 """About how many lots all tiles have together, likewise whole."""
+KEPT = ("sums", "counts", "new_sums", "new_counts")
+"""What a checkpoint keeps of each tile."""
 
 
 class Focus:
@@ -113,12 +115,31 @@ class Focus:
 
     def state_dict(self) -> dict[str, Tensor]:
         """All that later draws depend on."""
-        of = {name: getattr(self, name) for name in ("sums", "counts", "new_sums", "new_counts")}
+        of = {name: getattr(self, name) for name in KEPT}
         return {**of, "noted": torch.tensor(self.noted)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Goes on from `state_dict`; the photos are the same."""
-        for name in ("sums", "counts", "new_sums", "new_counts"):
+        for name in KEPT:
             getattr(self, name).copy_(state[name])
         self.noted = int(state["noted"])
         self._set_chances()
+
+
+def checked_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """A `Focus.state_dict` from a file, or nothing.
+
+    Raises:
+        ArithmeticError, LookupError, RuntimeError, TypeError, ValueError: where it is something else.
+    """
+    if not len(state):
+        return {}
+    found = {name: torch.as_tensor(state[name]) for name in KEPT}
+    sums, counts, new_sums, new_counts = found.values()
+    noted = int(state["noted"])
+    errors = (sums >= 0) & (sums <= 1.01 * counts) & (counts < 2**31)  # none is more than 1
+    news = (new_sums >= 0) & (new_sums <= WHOLE * new_counts) & (new_counts < 2**31)
+    alike = sums.ndim == 1 and len({one.shape for one in found.values()}) == 1
+    if not (alike and bool((errors & news).all()) and 0 <= noted < 2**62):
+        raise ValueError("something else than the errors of tiles")
+    return {**found, "noted": torch.tensor(noted)}

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.dataset.focus import Focus
+from nerf_lightning.dataset.focus import Focus, checked_state
 from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
@@ -223,6 +223,7 @@ class RayDataModule(StepDataModule[Views]):
         return {"rays": self.rays, "batch": self.batch, "focus": focus}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._focus, self._focus_state = None, state_dict.get("focus", {})
-        before = state_dict.get("batch", 1)  # perhaps of another device
-        self.rays = max(1, state_dict["rays"] * self.batch // before)
+        self._focus, self._focus_state = None, checked_state(state_dict.get("focus", {}))
+        before = int(state_dict.get("batch", 1))  # perhaps of another device
+        rays = int(state_dict["rays"]) * self.batch // before
+        self.rays = max(1, min(self.first_rays * self.MOST_RAYS, rays))

@@ -1,6 +1,7 @@
 """The one reader of text files that come from outside, with limits on size, depth, aliases and numbers. Nothing is executed."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +142,18 @@ class _Limited(yaml.SafeLoader):
         self.values += more
         if self.values > YAML_VALUES:
             raise yaml.YAMLError(f"more than {YAML_VALUES} values, aliases written out")
+
+
+def number(value: Any) -> float:
+    """A number that was kept in a file.
+
+    Raises:
+        TypeError, ValueError, OverflowError: it is none, or no float can hold it.
+    """
+    found = float(value)
+    if not math.isfinite(found):
+        raise ValueError(f"{found}, where a finite number was kept")
+    return found
 
 
 def _whole_in_yaml(loader: _Limited, node: Any) -> int:
