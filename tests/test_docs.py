@@ -45,7 +45,6 @@ SMALLER: list[tuple[str, str]] = [
         "model=ball",
         "dataset.size=16 dataset.train_views=4 dataset.val_views=1 budget.steps=2 callbacks.orbit.frames=2",
     ),
-    ("nerf_lightning.stability", "methods=[tensorf] seeds=1 steps=2 workers=1"),
     ("capture calibration", f"tags.size={SIZE} resize=60"),
     ("nerf_lightning.render", "frames=2"),
     ("format=compact", "loss=100"),
@@ -53,7 +52,7 @@ SMALLER: list[tuple[str, str]] = [
     ("nerf_lightning.export", "threshold=1e-3 resolution=24"),
 ]
 """What is added to a command that holds some words; the first that fits counts."""
-COMPOSED = ("launcher=joblib", "trainer=ddp", "tune_picture", "suite=full", "target.psnr=28")
+COMPOSED = ("launcher=joblib", "trainer=ddp", "tune_picture", "nerf_lightning.stability", "target.psnr=28")
 """Commands that start processes of their own, are tested as such elsewhere, or take long: they are composed, no more."""
 
 

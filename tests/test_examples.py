@@ -68,6 +68,7 @@ def test_own_photos(example: Callable[..., None], made: tuple[Path, Truth], tmp_
     assert (tmp_path / "field.npz").is_file()
 
 
+@pytest.mark.long
 def test_tour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     notebook = nbformat.read(EXAMPLES / "tour.ipynb", as_version=4)
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook.cells), (

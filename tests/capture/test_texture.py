@@ -2,14 +2,16 @@
 
 import importlib.util
 import json
+import shutil
 from pathlib import Path
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from capture.views import SIX, SIZE, SMALL, camera
 
 from benchmarks.capture import home
-from benchmarks.synthetic.photos import Flaws, write_capture
+from benchmarks.synthetic.photos import Flaws, Truth, render_photo
 from nerf_lightning.capture.outcome import photo_outcomes
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, move
@@ -18,12 +20,18 @@ from nerf_lightning.capture.poses.tracks import linked, triangulated
 from nerf_lightning.capture.run import capture
 
 
-def test_photos_whose_tags_are_hidden_are_placed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    truth = write_capture(tmp_path, SIX, SMALL, 6, 9, Flaws(), seed=3, steps=27, samples=2, hide=3)
+def test_photos_whose_tags_are_hidden_are_placed(
+    made: tuple[Path, Truth], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    shown, truth = made
+    shutil.copytree(shown, tmp_path, dirs_exist_ok=True)
+    hidden = ["003.png", "005.png"]
+    for name in hidden:
+        photo = render_photo(SIX, SMALL, truth.photos[name], True, Flaws(), seed=0, samples=2, hidden=True)
+        imageio.imwrite(tmp_path / "photos" / name, photo)
     packing = Packing(tmp_path / "scene.npz", longest=100)
     found = capture(tmp_path / "calibration", tmp_path / "photos", SIZE, packing, "DICT_4X4_50")
     by_name = {photo.name: photo for photo in found.photos}
-    hidden = ["001.png", "004.png", "007.png"]
     assert [photo.name for photo in found.photos if photo.by == "texture"] == hidden
     for name in hidden:
         told, pose = home(found.solved, SIX) @ by_name[name].c2w, truth.photos[name]
@@ -32,15 +40,15 @@ def test_photos_whose_tags_are_hidden_are_placed(tmp_path: Path, monkeypatch: py
         assert 0 < by_name[name].reprojection_px < 2
     entries = {entry["name"]: entry for entry in json.loads((tmp_path / "cameras.json").read_text())["photos"]}
     assert [name for name, entry in entries.items() if entry.get("by") == "texture"] == hidden
-    assert entries["001.png"]["status"] == "placed"
+    assert entries["003.png"]["status"] == "placed"
     captions = [outcome.caption for outcome in photo_outcomes(found)]
-    assert "by its texture" in captions[1] and "texture" not in captions[0]
+    assert "by its texture" in captions[3] and "texture" not in captions[0]
 
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     without = capture(tmp_path / "calibration", tmp_path / "photos", SIZE, packing, "DICT_4X4_50")
     reasons = {photo.name: photo.reason for photo in without.photos if photo.reason}
     assert sorted(reasons) == hidden
-    assert reasons["001.png"].startswith("no tag found; pip install 'nerf_lightning[colmap]'")
+    assert reasons["003.png"].startswith("no tag found; pip install 'nerf_lightning[colmap]'")
 
 
 def test_tracks_join_matches_and_drop_contradictions():

@@ -40,7 +40,7 @@ def given(tmp_path: Path) -> list[str]:
         f"dataset.path={tmp_path}/scene.npz",
         "recipe=tensorf_medium",
         f"ladder={tmp_path}/ladder.yaml",
-        "budget.steps=120",
+        "budget.steps=60",
         "threads=1",
         "device=cpu",
         "callbacks.orbit=null",
@@ -75,7 +75,7 @@ def test_a_search_leaves_the_smallest_that_is_enough_and_an_experiment_to_train_
     assert {key: cfg.model[key] for key in RUNGS[choice]} == RUNGS[choice]
     sampler = dict(part.split("=") for part in found["chosen"]["overrides"] if part.startswith("sampler."))
     assert cfg.sampler.samples == int(sampler["sampler.samples"])
-    assert cfg.dataset.path == f"{tmp_path}/scene.npz" and cfg.budget.steps == 120
+    assert cfg.dataset.path == f"{tmp_path}/scene.npz" and cfg.budget.steps == 60
 
 
 def test_other_arguments_stay_as_they_are(tmp_path: Path):
