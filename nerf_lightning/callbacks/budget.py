@@ -213,9 +213,10 @@ class Budget(L.Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._before = number(state_dict["seconds"])
         start, reached, slope = map(number, state_dict["line"])
-        self._line, stopped = (start, reached, slope), state_dict["stopped"]
-        if stopped is not None:
+        self._line = start, reached, slope
+        if state_dict["stopped"] is not None:
+            stopped = dict(state_dict["stopped"])
             seconds, rest = number(stopped["seconds"]), number(stopped["rest_db"])
             self.stopped = {"seconds": seconds, "step": int(stopped["step"]), "rest_db": rest}
         if self.plateau is not None and state_dict["plateau"] is not None:
-            self.plateau.load(state_dict["plateau"])
+            self.plateau.load(dict(state_dict["plateau"]))

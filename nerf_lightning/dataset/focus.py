@@ -132,11 +132,12 @@ def checked_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Raises:
         ArithmeticError, LookupError, RuntimeError, TypeError, ValueError: where it is something else.
     """
-    if not len(state):
+    kept = dict(state)
+    if not kept:
         return {}
-    found = {name: torch.as_tensor(state[name]) for name in KEPT}
+    found = {name: torch.as_tensor(kept[name]) for name in KEPT}
     sums, counts, new_sums, new_counts = found.values()
-    noted = int(state["noted"])
+    noted = int(kept["noted"])
     errors = (sums >= 0) & (sums <= 1.01 * counts) & (counts < 2**31)  # none is more than 1
     news = (new_sums >= 0) & (new_sums <= WHOLE * new_counts) & (new_counts < 2**31)
     alike = sums.ndim == 1 and len({one.shape for one in found.values()}) == 1

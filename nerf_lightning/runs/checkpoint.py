@@ -59,6 +59,9 @@ def read_checkpoint(path: Path, needed: Mapping[str, type] = RENDERED) -> dict[s
             if not isinstance(state.get(key), kind):
                 raise InputError(path, key, f"a {type(state.get(key)).__name__}", f"a {kind.__name__}", todo)
         _check_weights(path, state["state_dict"])
+        for key, value in {**state, **state.get("callbacks", {})}.items():
+            if isinstance(value, Tensor):  # which would take a name for an index
+                raise InputError(path, str(key), "a tensor", "plain values by name", todo)
         if "loops" in needed and not _counts(state["loops"]):
             raise InputError(path, "loops", "something else", "counts of steps", todo)
     except InputError:

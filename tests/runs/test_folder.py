@@ -244,6 +244,12 @@ def test_a_checkpoint_to_go_on_from_holds_more_than_weights(small_run: Path, tmp
         torch.save(state, tmp_path / "b.ckpt")
         with pytest.raises(InputError, match=r"b\.ckpt: loops: found something else, expected counts of steps"):
             read_checkpoint(tmp_path / "b.ckpt", RESUMED)
+    for where, key in ((state["callbacks"], "Budget"), (state, "RayDataModule")):
+        right, where[key] = where[key], torch.zeros(2, 2)
+        torch.save(state, tmp_path / "c.ckpt")
+        with pytest.raises(InputError, match=rf"c\.ckpt: {key}: found a tensor, expected plain values by name"):
+            read_checkpoint(tmp_path / "c.ckpt")
+        where[key] = right
 
 
 def test_damaged_run_folders_are_told(small_run: Path, tmp_path: Path):
