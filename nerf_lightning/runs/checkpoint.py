@@ -64,6 +64,8 @@ def read_checkpoint(path: Path, needed: Mapping[str, type] = RENDERED) -> dict[s
                 raise InputError(path, str(key), "a tensor", "plain values by name", todo)
         if "loops" in needed and not _counts(state["loops"]):
             raise InputError(path, "loops", "something else", "counts of steps", todo)
+        if "optimizer_states" in needed and not all(map(_of_optimizer, state["optimizer_states"])):
+            raise InputError(path, "optimizer_states", "something else", "states of optimizers", todo)
     except InputError:
         raise
     except DAMAGED as error:
@@ -85,6 +87,14 @@ def _counts(value: Any, name: str = "") -> bool:
     if isinstance(value, dict):
         return name not in COUNTED and all(_counts(one, str(key)) for key, one in value.items())
     return isinstance(value, int) and value >= 0
+
+
+def _of_optimizer(value: Any) -> bool:
+    """Whether it is made as PyTorch keeps an optimizer's state: values of each parameter, and groups of options, by name."""
+    found = (value.get("state"), value.get("param_groups")) if isinstance(value, dict) else (None, None)
+    if not isinstance(found[0], dict) or not isinstance(found[1], list):
+        return False
+    return all(isinstance(one, dict) for one in [*found[0].values(), *found[1]])
 
 
 def check_optimizer(path: Path, optimizer: torch.optim.Optimizer) -> None:
@@ -114,7 +124,7 @@ def _alike(value: Any, built: Any) -> bool:
     if isinstance(built, tuple | list):
         return isinstance(value, tuple | list) and len(value) == len(built) and all(map(_alike, value, built))
     if built is None or isinstance(built, bool):
-        return value is None or isinstance(value, bool)
+        return value is None or value is False or value is built  # what is on asks for more of its state
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 

@@ -209,6 +209,8 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
         (total, "total", 1.0, "last.ckpt: loops: found something else"),
         (total, "total", 1, "last.ckpt: found TypeError"),
         (groups[0], "betas", True, "last.ckpt: optimizer_states.betas: found True"),
+        (groups[0], "amsgrad", True, "last.ckpt: optimizer_states.amsgrad: found True"),
+        (groups, 0, torch.zeros(2, 2), "last.ckpt: optimizer_states: found something else"),
         (groups[0], "initial_lr", ..., "last.ckpt: optimizer_states.initial_lr: found nothing"),
         (groups[0], "lr", float("nan"), "last.ckpt: optimizer_states.lr: found nan"),
         (moments, "exp_avg", torch.zeros(3), "last.ckpt: optimizer_states.exp_avg: found (3,)"),

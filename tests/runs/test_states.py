@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from nerf_lightning.callbacks import Budget, Guard
+from nerf_lightning.callbacks import Budget, Guard, HeldOut
 from nerf_lightning.callbacks.plateau import Plateau
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.refine import Corrections
@@ -38,6 +38,13 @@ def budget(learned: bool) -> tuple[Callable[[], dict], Callable[[dict], None]]:
     if learned:
         made.plateau.points = [(1.0, 20.0), (2.0, 21.0)]
         made.stopped = {"seconds": 2.0, "step": 5, "rest_db": 0.1}
+    return made.state_dict, made.load_state_dict
+
+
+def held_out(learned: bool) -> tuple[Callable[[], dict], Callable[[dict], None]]:
+    made = HeldOut([0.5])
+    if learned:
+        made.curve, made.view_seconds = [[1.0, 5, 20.0]], 0.1
     return made.state_dict, made.load_state_dict
 
 
@@ -74,7 +81,7 @@ def could_be(found: Any, right: Any) -> bool:
     return found is None or found == right
 
 
-@pytest.mark.parametrize("make", [data, guard, budget, corrections])
+@pytest.mark.parametrize("make", [data, guard, budget, held_out, corrections])
 def test_what_is_none_of_it_is_refused_or_becomes_what_it_must_be(make: Callable):
     state, _ = make(True)
     good = state()
