@@ -24,8 +24,10 @@ RESUMED: dict[str, type] = {
     **dict.fromkeys(("epoch", "global_step"), int),
 }
 """What training needs to go on, as Lightning writes it."""
-COUNTED = ("ready", "started", "processed", "completed")
+COUNTED = ("ready", "started", "processed", "completed", "_batches_that_stepped")
 """What Lightning counts of batches, steps and epochs."""
+MOST_COUNTED = 2**53
+"""More than any training has; a float holds every whole number up to it."""
 DAMAGED = (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, OSError, *NONSENSE)
 """What zipfile and PyTorch raise for a damaged file."""
 
@@ -86,7 +88,7 @@ def _counts(value: Any, name: str = "") -> bool:
         return bool(value) and all(isinstance(one, dict) and _counts(one) for one in value)
     if isinstance(value, dict):
         return name not in COUNTED and all(_counts(one, str(key)) for key, one in value.items())
-    return isinstance(value, int) and value >= 0
+    return isinstance(value, int) and 0 <= value <= MOST_COUNTED
 
 
 def _of_optimizer(value: Any) -> bool:

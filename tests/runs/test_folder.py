@@ -239,11 +239,17 @@ def test_a_checkpoint_to_go_on_from_holds_more_than_weights(small_run: Path, tmp
     with pytest.raises(InputError, match=r"a\.ckpt: callbacks: found a list, expected a dict"):
         read_checkpoint(tmp_path / "a.ckpt", RESUMED)
     state = torch.load(small_run / "checkpoints" / "last.ckpt", weights_only=True)
-    for nothing in (None, [], "1", -1, {"a": 1}):
-        state["loops"]["fit_loop"]["epoch_progress"]["total"]["ready"] = nothing
-        torch.save(state, tmp_path / "b.ckpt")
-        with pytest.raises(InputError, match=r"b\.ckpt: loops: found something else, expected counts of steps"):
-            read_checkpoint(tmp_path / "b.ckpt", RESUMED)
+    loop = state["loops"]["fit_loop"]
+    for where, key in (
+        (loop["epoch_progress"]["total"], "ready"),
+        (loop["epoch_loop.state_dict"], "_batches_that_stepped"),
+    ):
+        for nothing in (None, [], "1", -1, {"a": 1}, 10**400):
+            right, where[key] = where[key], nothing
+            torch.save(state, tmp_path / "b.ckpt")
+            where[key] = right
+            with pytest.raises(InputError, match=r"b\.ckpt: loops: found something else, expected counts of steps"):
+                read_checkpoint(tmp_path / "b.ckpt", RESUMED)
     for where, key in ((state["callbacks"], "Budget"), (state, "RayDataModule")):
         right, where[key] = where[key], torch.zeros(2, 2)
         torch.save(state, tmp_path / "c.ckpt")
