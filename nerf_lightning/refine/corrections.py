@@ -173,11 +173,8 @@ class Corrections(torch.nn.Module):
 
     def decide(self, decided: dict[str, Any]) -> None:
         """Goes on as decided before."""
-        worth = decided["worth"]
-        self.tried, self.worth = (
-            int(decided["tried"]),
-            {name: float(worth[name]) for name in self.rates if name in worth},
-        )
+        self.tried, worth = int(decided["tried"]), decided["worth"]
+        self.worth = {name: float(worth[name]) for name in self.rates if name in worth}
         if not (0 <= self.tried < 64 and decided["since"].keys() <= self.rates.keys()):
             raise ValueError("something else than what trials decide")
         for name, progress in decided["since"].items():
