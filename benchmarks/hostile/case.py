@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import psutil
 
@@ -174,8 +174,14 @@ def _limit(limits: Limits | None) -> None:
     signal.setitimer(signal.ITIMER_REAL, SHARED * limits.seconds)
     for what, most in ((resource.RLIMIT_DATA, _data() + limits.room), (resource.RLIMIT_FSIZE, limits.room)):
         resource.setrlimit(what, (most, resource.getrlimit(what)[1]))
-    machine = psutil.virtual_memory()._replace(total=limits.room, available=limits.room, free=limits.room)
-    psutil.virtual_memory = lambda: machine
+    machine, own = psutil.virtual_memory()._replace(total=limits.room), psutil.Process()
+    before = own.memory_info().rss
+
+    def memory() -> Any:
+        left = max(0, limits.room - (own.memory_info().rss - before))
+        return machine._replace(available=left, free=left)
+
+    psutil.virtual_memory = memory
 
 
 def _data() -> int:

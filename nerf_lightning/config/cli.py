@@ -166,10 +166,18 @@ def _untold(of: threading.ExceptHookArgs) -> None:
 
 
 def as_told(error: BaseException) -> BaseException:
-    """An error as it is; a full disk, wherever it showed, as bad input."""
-    if isinstance(error, InputError) or not full_disk(error):
+    """An error as it is; a full disk, or memory that ran out, wherever it showed, as bad input."""
+    told: BaseException | None = None
+    if isinstance(error, InputError):
         return error
-    told = no_room(getattr(error, "filename", None) or Path.cwd())
+    if full_disk(error):
+        told = no_room(getattr(error, "filename", None) or Path.cwd())
+    elif isinstance(error, MemoryError | RuntimeError):
+        from nerf_lightning.utils.memory import out_of_memory
+
+        told = out_of_memory(error)
+    if told is None:
+        return error
     told.__cause__ = error
     return told
 

@@ -44,7 +44,7 @@ from nerf_lightning.training.room import check_room
 from nerf_lightning.utils.allocator import keep_freed_memory
 from nerf_lightning.utils.listing import first_few
 from nerf_lightning.utils.machine import CROWDED, crowding
-from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.memory import check_memory, out_of_memory
 from nerf_lightning.utils.options import AtMost, Count, Seed, check_options
 from nerf_lightning.utils.progress import animates
 from nerf_lightning.utils.quiet import quiet
@@ -140,6 +140,8 @@ def train(
     try:
         trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
     except Exception as error:
+        if checkpoint is None and trainer.global_step == 0 and trainer.is_global_zero and out_of_memory(error):
+            clear(folder)  # nothing was trained
         if checkpoint is None or Budget.of(trainer).began or isinstance(error, InputError):
             raise
         # Nothing but the state has been at work yet.

@@ -2,6 +2,7 @@
 much is killed without a word."""
 
 import math
+import re
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -72,6 +73,19 @@ def check_memory(
     if not needed <= free:
         found, there = (f"{part / 2**30:,.1f} GiB" for part in (needed, free))
         raise InputError(where, key, f"{what} that take at least {found}", f"at most the {there} that are free", todo)
+
+
+def out_of_memory(error: BaseException) -> InputError | None:
+    """The error to tell where memory has run out; None for one of another kind.
+
+    Accelerators say so, and so does a CPU where a limit is set; otherwise the system ends the process.
+    """
+    if not isinstance(error, MemoryError | torch.OutOfMemoryError) and "allocate memory" not in str(error):
+        return None
+    asked = re.search(r"tried to allocate ([\d.]+ \w+)", str(error), re.IGNORECASE)
+    less = "dataset.rays, dataset.samples, dataset.pixels, limits.batch or limits.chunk"
+    found = f"no room for {asked[1] if asked else 'what was asked'}"
+    return InputError("memory", "", found, "what fits into it", f"give less of {less}, or a smaller model")
 
 
 class Frugal(TorchDispatchMode):

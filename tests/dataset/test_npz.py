@@ -166,6 +166,10 @@ DAMAGE = {
     "focal text": (_set(focal="10"), "focal: found shape (), <U2"),
     "K shape": (_set(K=np.eye(4)), "K: found shape (4, 4)"),
     "K transposed": (_set(K=[[9.0, 0, 0], [0, 9, 0], [4, 3, 1]]), "K: found [[9.0"),
+    "K with a number that rounding cannot hold": (
+        _set(K=[[9.0, 0, 4], [0, 9, 3], [0, 0, 1.7e308]]),
+        "K: found [[9.0, 0.0, 4.0], [0.0, 9.0, 3.0], [0.0, 0.0, 1.7e+308]]",
+    ),
     "near beyond far": (_set(near=3.0, far=2.0), "far: found 2, expected more than near, 3"),
     "near negative": (_set(near=-1.0), "near: found -1"),
     "box flipped": (_set(aabb=[[1.0, 1, 1], [0, 2, 2]]), "aabb: found [[1.0"),

@@ -141,6 +141,34 @@ def limit() -> Iterator[Callable[[int], None]]:
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+ALLOCATOR = (
+    "[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: you tried to allocate 5200 bytes."
+)
+OF_MEMORY = {
+    "5200 bytes": RuntimeError(ALLOCATOR),
+    "20.00 GiB": torch.OutOfMemoryError(
+        "CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of"
+    ),
+    "what was asked": MemoryError(),
+}
+
+
+@pytest.mark.parametrize("asked", OF_MEMORY)
+def test_without_room_in_memory_a_line_says_so(asked: str, inside, tmp_path: Path, monkeypatch):
+    def fail() -> None:
+        raise OF_MEMORY[asked]
+
+    with monkeypatch.context() as patch:
+        at_step(patch, Progress, "on_train_batch_start", fail, step=0)
+        code, _, err = inside(*SMALL)
+    assert code == 2 and err.startswith(f"nerf_lightning: memory: found no room for {asked}, ") and err.count("\n") == 1
+    assert not list(tmp_path.rglob("*")), "nothing was trained"
+    with monkeypatch.context() as patch:
+        at_step(patch, Progress, "on_train_batch_start", fail)
+        assert inside(*SMALL)[0] == 2
+    assert status(run_of("smoke_2d")) == "failed"
+
+
 @pytest.mark.parametrize("room", [0, 1500, 5000])
 def test_on_a_full_disk_nothing_is_lost(room: int, undisturbed: Path, whole: State, inside, limit, monkeypatch):
     """From where nothing fits, through results, pictures and curves, to where checkpoints alone do not."""

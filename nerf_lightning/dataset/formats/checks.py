@@ -134,7 +134,7 @@ def rigid_pose(where: object, key: str, pose: Float[np.ndarray, "4 4"]) -> Float
     if not np.isfinite(pose).all():
         found, todo = "nan or infinity", "leave out views without a pose"
     elif not np.allclose(pose[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE):
-        found, todo = f"bottom row {pose[3].round(4).tolist()}", "the matrix may be transposed"
+        found, todo = f"bottom row {rounded(pose[3])}", "the matrix may be transposed"
     elif (error := off_rotation(pose[:3, :3])) > RIGID_TOLERANCE:
         found = f"R^T R that is {error:.2g} away from the identity"
         todo = "the rotation may carry a scale: divide it out"
@@ -195,9 +195,9 @@ def similarity(where: object, key: str, matrix: Shaped[np.ndarray, "..."]) -> Fl
     if not NEAREST <= scale <= FARTHEST or np.abs(matrix[:3, 3]).max() > FARTHEST:
         found, expected = "a scale or a shift that no file's unit has", f"{expected} of at most {FARTHEST:g}"
     elif np.linalg.det(turn / scale) <= 0 or off_rotation(turn / scale) > RIGID_TOLERANCE:
-        found = str(turn.round(3).tolist())
+        found = rounded(turn)
     elif not np.allclose(matrix[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE):
-        found = f"bottom row {matrix[3].round(4).tolist()}"
+        found = f"bottom row {rounded(matrix[3])}"
     else:
         return matrix
     raise InputError(where, key, found, expected, "leave it out, and the frame is the file's own")
@@ -268,13 +268,18 @@ def split_size(where: object, key: str, count: int, poses: int | None = None) ->
         raise InputError(where, key, f"{count} images for {poses} poses", "one pose for each image")
 
 
+def rounded(found: np.ndarray) -> str:
+    """Numbers for a message, in four decimals. NumPy's own rounding multiplies, and makes infinities of large ones."""
+    return str(np.vectorize(lambda number: round(number, 4), otypes=[object])(found.astype(object)).tolist())
+
+
 def intrinsics(
     where: object, key: str, K: Shaped[np.ndarray, "..."], width: int, height: int
 ) -> Float[np.ndarray, "3 3"]:
     K = numeric(where, key, K, "3 3")
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
         expected = "[[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels with fx, fy > 0"
-        raise InputError(where, key, str(K.round(3).tolist()), expected)
+        raise InputError(where, key, rounded(K), expected)
     for side, (row, focal) in zip((width, height), ((0, K[0, 0]), (1, K[1, 1])), strict=True):
         focal_length(where, f"{key}[{row}][{row}]", float(focal), side)
         for column in range(row + 1, 3):
@@ -295,7 +300,7 @@ def box(where: object, key: str, aabb: Shaped[np.ndarray, "..."]) -> Float[np.nd
     if np.abs(aabb).max() > FARTHEST:
         raise InputError(where, key, f"a corner at {np.abs(aabb).max():.3g}", f"coordinates of at most {FARTHEST:g}")
     if not (aabb[1] - aabb[0] > np.abs(aabb).max(0) * STEP + NEAREST).all():
-        raise InputError(where, key, str(aabb.round(4).tolist()), "a lower corner below the upper one on each axis")
+        raise InputError(where, key, rounded(aabb), "a lower corner below the upper one on each axis")
     return aabb
 
 
