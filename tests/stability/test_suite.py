@@ -60,7 +60,7 @@ def test_cells():
 
 @pytest.mark.parametrize("method", [name for name, method in METHODS.items() if method.guard and name != "relu mlp"])
 def test_every_method_learns_something(method: str, tmp_path: Path):
-    outcome = run(Cell("2D: clean" if METHODS[method].flat else "black, small object", method, 0, 60), tmp_path)
+    outcome = run(Cell("2D: clean" if METHODS[method].flat else "black, small object", method, 0, 30), tmp_path)
     assert outcome.status == "finished", outcome
     assert outcome.psnr is not None and outcome.psnr > 10
 
