@@ -82,7 +82,7 @@ def out_of_memory(error: BaseException) -> InputError | None:
     """
     if not isinstance(error, MemoryError | torch.OutOfMemoryError) and "allocate memory" not in str(error):
         return None
-    asked = re.search(r"tried to allocate ([\d.]+ \w+)", str(error), re.IGNORECASE)
+    asked = re.search(r"allocate ([\d.]+ \w+)", str(error))
     less = "dataset.rays, dataset.samples, dataset.pixels, limits.batch or limits.chunk"
     found = f"no room for {asked[1] if asked else 'what was asked'}"
     return InputError("memory", "", found, "what fits into it", f"give less of {less}, or a smaller model")

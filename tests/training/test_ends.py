@@ -149,6 +149,7 @@ OF_MEMORY = {
     "20.00 GiB": torch.OutOfMemoryError(
         "CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of"
     ),
+    "7.45 GiB": MemoryError("Unable to allocate 7.45 GiB for an array with shape (1000000000,) and data type float64"),
     "what was asked": MemoryError(),
 }
 
