@@ -141,28 +141,16 @@ def limit() -> Iterator[Callable[[int], None]]:
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-ALLOCATOR = (
-    "[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: you tried to allocate 5200 bytes."
-)
-OF_MEMORY = {
-    "5200 bytes": RuntimeError(ALLOCATOR),
-    "20.00 GiB": torch.OutOfMemoryError(
-        "CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of"
-    ),
-    "7.45 GiB": MemoryError("Unable to allocate 7.45 GiB for an array with shape (1000000000,) and data type float64"),
-    "what was asked": MemoryError(),
-}
-
-
-@pytest.mark.parametrize("asked", OF_MEMORY)
-def test_without_room_in_memory_a_line_says_so(asked: str, inside, tmp_path: Path, monkeypatch):
+def test_without_room_in_memory_a_line_says_so(inside, tmp_path: Path, monkeypatch):
     def fail() -> None:
-        raise OF_MEMORY[asked]
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of")
 
     with monkeypatch.context() as patch:
         at_step(patch, Progress, "on_train_batch_start", fail, step=0)
         code, _, err = inside(*SMALL)
-    assert code == 2 and err.startswith(f"nerf_lightning: memory: found no room for {asked}, ") and err.count("\n") == 1
+    assert (
+        code == 2 and err.startswith("nerf_lightning: memory: found no room for 20.00 GiB, ") and err.count("\n") == 1
+    )
     assert not list(tmp_path.rglob("*")), "nothing was trained"
     with monkeypatch.context() as patch:
         at_step(patch, Progress, "on_train_batch_start", fail)

@@ -17,7 +17,7 @@ from nerf_lightning.system import NeRF2D, NeRF3D
 from nerf_lightning.training.room import check_room
 from nerf_lightning.training.train import prepare_process
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.memory import Frugal, free_memory
+from nerf_lightning.utils.memory import Frugal, free_memory, out_of_memory
 
 FREE = 64 * 2**20
 small = partial(HashGridField, BOX, log2_entries=10)
@@ -112,3 +112,12 @@ def test_pixels_that_do_not_fit_are_refused():
     check_room(system, PixelDataModule(Picture("nothing", "made", image)), CPU)
     with pytest.raises(InputError, match=r"config: dataset.pixels: found 10,000,000 pixels a step"):
         check_room(system, PixelDataModule(Picture("nothing", "made", image), 10**7), CPU)
+
+
+def test_memory_that_ran_out_is_known_by_what_libraries_say():
+    of_torch = "[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 5200 bytes."
+    of_numpy = "Unable to allocate 7.45 GiB for an array with shape (1000000000,) and data type float64"
+    found = {"5200 bytes": RuntimeError(of_torch), "7.45 GiB": MemoryError(of_numpy), "what was asked": MemoryError()}
+    for asked, error in found.items():
+        assert str(out_of_memory(error)).startswith(f"memory: found no room for {asked}, expected ")
+    assert out_of_memory(RuntimeError("shapes differ")) is None
