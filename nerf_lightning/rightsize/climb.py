@@ -23,6 +23,7 @@ from nerf_lightning.config.build import (
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.export.reach import confined_to, seen_cells
 from nerf_lightning.export.smallest import held_out_psnr, some_cameras
+from nerf_lightning.model import as_wide
 from nerf_lightning.rightsize.choose import Measured
 from nerf_lightning.rightsize.ladder import Options
 from nerf_lightning.runs.compact import encode
@@ -87,7 +88,7 @@ def bare(cfg: DictConfig) -> DictConfig:
 
 
 def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = None) -> tuple[System, float]:
-    """Trains a system, from what a smaller one has learned.
+    """Trains a system, from what a smaller one has learned if there is room for it.
 
     Returns:
         The system, on the device that trained it, and the seconds it took.
@@ -98,7 +99,7 @@ def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = No
     device = device_of(cfg)
     system = build_system(cfg, frame_of(data), device)
     check_room(system, data, device)
-    if start is not None:
+    if start is not None and as_wide(system.field, start.field):
         system.warm_start_from(start.cpu())  # where a new system is
         start.to(device)
     trainer = build_trainer(cfg, folder, device)
@@ -120,16 +121,26 @@ def compact_bytes(cfg: DictConfig, system: System, data: Data) -> int:
 
 
 def climb(cfg: DictConfig, data: Data, rungs: list[Options], folder: Path) -> Iterator[Rung]:
-    """Trains the smallest rung, then goes on with each next larger one, for as many steps each."""
+    """Trains the smallest rung, then goes on with each next larger one, for as many steps each.
+
+    A rung that is smaller than the last in something starts anew.
+    """
     start: System | None = None
-    part = for_a_rung(cfg, len(rungs))
+    part, before = for_a_rung(cfg, len(rungs)), Options()
     for options in rungs:
         with_options = set_options(part, "model", options)
-        system, seconds = trained(with_options, data, folder, start)
+        model = resolved(with_options.model)
+        system, seconds = trained(with_options, data, folder, start if grows(before, model) else None)
         parameters = sum(p.numel() for p in system.parameters() if p.requires_grad)
         psnr, size = quality(system, data), compact_bytes(with_options, system, data)
         yield Rung(psnr, size, options, system, parameters, seconds)
-        start = system
+        start, before = system, model
+
+
+def grows(before: Options, after: Options) -> bool:
+    """Whether no number among a model's options is less than in those before: only then there is room for what that learned."""
+    both = ((value, after.get(key)) for key, value in before.items())
+    return all(b >= a for a, b in both if isinstance(a, int | float) and isinstance(b, int | float))
 
 
 def spread(cfg: DictConfig, data: Data, rungs: list[Options], first: Rung, folder: Path) -> tuple[float, float]:

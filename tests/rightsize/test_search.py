@@ -14,7 +14,7 @@ from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.rightsize.__main__ import task
 from nerf_lightning.rightsize.choose import Target
-from nerf_lightning.rightsize.climb import coarsest_sampler
+from nerf_lightning.rightsize.climb import climb, coarsest_sampler
 from nerf_lightning.rightsize.ladder import Ladder
 from nerf_lightning.rightsize.start import begin
 from nerf_lightning.runs.compact import load_compact
@@ -132,6 +132,33 @@ def test_a_picture_has_a_ladder_too(tmp_path: Path):
     given += [f"callbacks.{one}" for one in quiet]
     found = search([*given, "target.within_db=100", f"output={tmp_path}/found"], tmp_path)
     assert found["chosen"]["rung"] == 0 and found["reached"], "a hundred dB below the best is anything"
+
+
+@pytest.mark.filterwarnings("ignore:.*LeafSpec.*:FutureWarning")  # Lightning's progress bar, with PyTorch as it is now
+@pytest.mark.parametrize(
+    ("recipe", "rungs"),
+    [
+        ("hashgrid_small", [{"width": 16, "levels": 3}, {"width": 8, "levels": 3}, {"width": 8, "levels": 2}]),
+        (
+            "tensorf_small",
+            [{**RUNGS[1], "width": None}, {**RUNGS[1], "width": 8}, {**RUNGS[1], "colour_components": 3}],
+        ),
+    ],
+)
+def test_a_rung_that_is_smaller_in_something_starts_anew(
+    recipe: str, rungs: list[dict], given: list[str], tmp_path: Path
+):
+    options = [one for one in given if not one.startswith(("recipe", "budget", "ladder"))]
+    options += [
+        f"recipe={recipe}",
+        "budget.steps=4",
+        "sampler.samples=32",
+        "sampler.resolution=16",
+        "dataset.samples=1000",
+    ]
+    cfg = composed(options, tmp_path, "rightsize")
+    climbed = list(climb(cfg, build_data(cfg), rungs, tmp_path))
+    assert [rung.options for rung in climbed] == rungs and all(rung.psnr > 3 for rung in climbed)
 
 
 def test_samplers_that_do_not_fit_are_refused(given: list[str], tmp_path: Path):

@@ -23,6 +23,17 @@ def widen(wide: torch.nn.Linear, narrow: torch.nn.Linear, columns: Int[Tensor, "
     wide.bias[:kept] = narrow.bias
 
 
+def as_wide(wide: torch.nn.Module, narrow: torch.nn.Module) -> bool:
+    """Whether no linear layer of a field is narrower than that of the same name in another."""
+    mine = dict(wide.named_modules())
+    both = ((mine.get(name), its) for name, its in narrow.named_modules())
+    return all(
+        one.out_features >= its.out_features
+        for one, its in both
+        if isinstance(one, torch.nn.Linear) and isinstance(its, torch.nn.Linear)
+    )
+
+
 def widen_all(wide: torch.nn.ModuleList, narrow: torch.nn.ModuleList, columns: Int[Tensor, "I"]) -> None:
     """The same for consecutive layers; `columns` are the first one's."""
     for mine, its in zip(wide, narrow, strict=True):
