@@ -31,7 +31,7 @@ test: $(VENV)/.test         ## install, check style and types, and run the tests
 suite: $(VENV)/.test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
 
-long: $(VENV)/.test         ## what a test run leaves out: launchers of sweeps, kernels of a compiler, whole runs on a pretended device
+long: $(VENV)/.test         ## what a test run leaves out: launchers of sweeps, kernels of a compiler, the notebook, whole runs on a pretended device
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m long
 
 QUICK := tests/test_rooms.py $(addprefix tests/, cameras dataset sampler model renderer system) \
