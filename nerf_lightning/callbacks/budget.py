@@ -213,7 +213,7 @@ class Budget(L.Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._before = number(state_dict["seconds"])
         start, reached, slope = map(number, state_dict["line"])
-        self._line = start, reached, slope
+        self._line, self.stopped = (start, reached, slope), None
         if state_dict["stopped"] is not None:
             stopped = dict(state_dict["stopped"])
             seconds, rest = number(stopped["seconds"]), number(stopped["rest_db"])

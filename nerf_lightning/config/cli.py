@@ -167,9 +167,9 @@ def _untold(of: threading.ExceptHookArgs) -> None:
 
 def as_told(error: BaseException) -> BaseException:
     """An error as it is; a full disk, or memory that ran out, wherever it showed, as bad input."""
-    told: BaseException | None = None
     if isinstance(error, InputError):
         return error
+    told: InputError | None = None
     if full_disk(error):
         told = no_room(getattr(error, "filename", None) or Path.cwd())
     elif isinstance(error, MemoryError | RuntimeError):

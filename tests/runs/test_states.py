@@ -81,6 +81,13 @@ def could_be(found: Any, right: Any) -> bool:
     return found is None or found == right
 
 
+def test_a_state_of_before_a_plateau_has_none():
+    stopped, running = Budget(steps=9, patience=0.1), Budget(steps=9, patience=0.1)
+    stopped.stopped = {"seconds": 2.0, "step": 5, "rest_db": 0.1}
+    stopped.load_state_dict(running.state_dict())
+    assert stopped.state_dict() == running.state_dict()
+
+
 @pytest.mark.parametrize("make", [data, guard, budget, held_out, corrections])
 def test_what_is_none_of_it_is_refused_or_becomes_what_it_must_be(make: Callable):
     state, _ = make(True)
