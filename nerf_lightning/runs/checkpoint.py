@@ -104,9 +104,10 @@ def check_optimizer(path: Path, optimizer: torch.optim.Optimizer) -> None:
 
     Raises:
         InputError: where an option is missing, of another kind than that which it was built with, or not finite; or where what
-            it keeps of a parameter is of another shape.
+            it keeps of a parameter is of another shape, or less than of another one.
     """
     todo = "start the run anew"
+    kept = {key for state in optimizer.state.values() for key in state}
     for group in optimizer.param_groups:
         if missing := sorted({*optimizer.defaults, "initial_lr"} - group.keys()):
             raise InputError(path, f"optimizer_states.{missing[0]}", "nothing", "what it was saved with", todo)
@@ -114,11 +115,19 @@ def check_optimizer(path: Path, optimizer: torch.optim.Optimizer) -> None:
             if key != "params" and not _alike(value, optimizer.defaults.get(key, 0.0)):
                 raise InputError(path, f"optimizer_states.{key}", repr(value)[:60], "what it was saved with", todo)
         for parameter in group["params"]:
-            for key, value in optimizer.state[parameter].items():
-                if not isinstance(value, Tensor) or (value.shape != parameter.shape and value.numel() != 1):
-                    found = f"{tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)[:60]
-                    expected = f"a tensor of shape {tuple(parameter.shape)}"
+            state = optimizer.state[parameter]
+            if state and (missing := sorted(kept - state.keys())):
+                raise InputError(path, f"optimizer_states.{missing[0]}", "nothing", "what is kept of the others", todo)
+            for key, value in state.items():
+                if not _dense(value) or (value.shape != parameter.shape and value.numel() != 1):
+                    found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)[:60]
+                    expected = f"a dense tensor of shape {tuple(parameter.shape)}"
                     raise InputError(path, f"optimizer_states.{key}", found, expected, todo)
+
+
+def _dense(value: Any) -> bool:
+    """Whether it is a tensor with a fraction in each place."""
+    return isinstance(value, Tensor) and value.layout is torch.strided and value.is_floating_point()
 
 
 def _alike(value: Any, built: Any) -> bool:
