@@ -18,7 +18,7 @@ from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU, synchronize
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.machine import Load, work_clocks
-from nerf_lightning.utils.untrusted import number
+from nerf_lightning.utils.untrusted import count, number
 
 LOOK_AT = 3
 """Held-out views rendered to look for a plateau."""
@@ -217,6 +217,6 @@ class Budget(L.Callback):
         if state_dict["stopped"] is not None:
             stopped = dict(state_dict["stopped"])
             seconds, rest = number(stopped["seconds"]), number(stopped["rest_db"])
-            self.stopped = {"seconds": seconds, "step": int(stopped["step"]), "rest_db": rest}
+            self.stopped = {"seconds": seconds, "step": count(stopped["step"]), "rest_db": rest}
         if self.plateau is not None and state_dict["plateau"] is not None:
             self.plateau.load(dict(state_dict["plateau"]))

@@ -12,7 +12,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.ending import leave_if_asked
 from nerf_lightning.utils.evenly import evenly
-from nerf_lightning.utils.untrusted import number
+from nerf_lightning.utils.untrusted import count, number
 
 LARGE = 1 << 21
 """Pixels of a view beyond which SSIM, which takes some ten times as long as rendering, is left to the test."""
@@ -112,6 +112,6 @@ class HeldOut(L.Callback):
         return {"curve": self.curve, "view_seconds": self.view_seconds}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.curve = [[number(spent), int(step), float(quality)] for spent, step, quality in state_dict["curve"]]
+        self.curve = [[number(spent), count(step), float(quality)] for spent, step, quality in state_dict["curve"]]
         seconds = state_dict["view_seconds"]
         self.view_seconds = None if seconds is None else number(seconds)

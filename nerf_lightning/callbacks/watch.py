@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from nerf_lightning.utils.untrusted import number
+from nerf_lightning.utils.untrusted import count, number
 
 MEMORY = 0.96
 """Decay of the running mean of the loss: it looks back about 25 steps."""
@@ -65,7 +65,7 @@ class Watch:
 
     def load(self, state: dict[str, Any]) -> None:
         """Restores what `state` returned."""
-        self.began, self.risen, self.dead = (int(state[key]) for key in ("began", "risen", "dead"))
+        self.began, self.risen, self.dead = (count(state[key]) for key in ("began", "risen", "dead"))
         self.level = None if state["level"] is None else number(state["level"])
         self.earlier, self.lowest = [number(level) for level in state["earlier"]], float(state["lowest"])
 

@@ -14,6 +14,7 @@ from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.seeding import Stream, step_generator
+from nerf_lightning.utils.untrusted import count
 
 RAYS, SAMPLES = 1024, 16384
 """Rays of the first step, and the samples per step that the number of rays then adapts to."""
@@ -224,6 +225,6 @@ class RayDataModule(StepDataModule[Views]):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._focus, self._focus_state = None, checked_state(state_dict.get("focus", {}))
-        before = int(state_dict.get("batch", 1))  # perhaps of another device
-        rays = int(state_dict["rays"]) * self.batch // before
+        before = count(state_dict.get("batch", 1))  # perhaps of another device
+        rays = count(state_dict["rays"]) * self.batch // before
         self.rays = max(1, min(self.first_rays * self.MOST_RAYS, rays))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.memory import check_memory
-from nerf_lightning.utils.untrusted import NONSENSE, existing_file
+from nerf_lightning.utils.untrusted import MOST_COUNTED, NONSENSE, existing_file
 
 EXPECTED = "a whole checkpoint of tensors and plain values"
 RENDERED: dict[str, type] = {"state_dict": dict}
@@ -26,8 +26,6 @@ RESUMED: dict[str, type] = {
 """What training needs to go on, as Lightning writes it."""
 COUNTED = ("ready", "started", "processed", "completed", "_batches_that_stepped")
 """What Lightning counts of batches, steps and epochs."""
-MOST_COUNTED = 2**53
-"""More than any training has; a float holds every whole number up to it."""
 DAMAGED = (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, OSError, *NONSENSE)
 """What zipfile and PyTorch raise for a damaged file."""
 

@@ -22,6 +22,8 @@ YAML_VALUES = YAML_SIZE // 8
 """Most values in a YAML file, aliases written out: as many as a file of the most bytes holds without any, 8 bytes each."""
 DIGITS = 308
 """Most digits of a whole number: with more, no float can hold it."""
+MOST_COUNTED = 2**53
+"""More than any training has of steps or rays; a float holds every whole number up to it."""
 NONSENSE = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 """What Python and its libraries say to values that cannot be, where a file's content goes through code that trusts it."""
 
@@ -154,6 +156,17 @@ def number(value: Any) -> float:
     if not math.isfinite(found):
         raise ValueError(f"{found}, where a finite number was kept")
     return found
+
+
+def count(value: Any) -> int:
+    """How many of something, as it was kept in a file.
+
+    Raises:
+        TypeError, ValueError: it is no number, below zero, or above `MOST_COUNTED`.
+    """
+    if not 0 <= value <= MOST_COUNTED:
+        raise ValueError(f"{str(value)[:20]}, where a count was kept")
+    return int(value)
 
 
 def _whole_in_yaml(loader: _Limited, node: Any) -> int:

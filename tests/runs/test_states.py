@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from nerf_lightning.callbacks import Budget, Guard, HeldOut
+from nerf_lightning.callbacks import Budget, Guard, HeldOut, Throughput
 from nerf_lightning.callbacks.plateau import Plateau
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.refine import Corrections
@@ -48,6 +48,12 @@ def held_out(learned: bool) -> tuple[Callable[[], dict], Callable[[dict], None]]
     return made.state_dict, made.load_state_dict
 
 
+def throughput(learned: bool) -> tuple[Callable[[], dict], Callable[[dict], None]]:
+    made = Throughput()
+    made.rays = 4096 if learned else 0
+    return made.state_dict, made.load_state_dict
+
+
 def corrections(learned: bool) -> tuple[Callable[[], dict], Callable[[dict], None]]:
     scene = toy(MARBLE, size=16, views=3, held_out=1)
     made = Corrections(scene.train.cameras, scene.bounds, auto=True)
@@ -69,7 +75,9 @@ def kinds(value: Any) -> Any:
         return {key: kinds(one) for key, one in value.items()}
     if isinstance(value, list):
         return [kinds(one) for one in value]
-    return "a tensor" if isinstance(value, torch.Tensor) else "a number" if isinstance(value, int | float) else value
+    if isinstance(value, int | float):
+        return type(float(value))  # which fails where no float can hold it
+    return "a tensor" if isinstance(value, torch.Tensor) else value
 
 
 def could_be(found: Any, right: Any) -> bool:
@@ -88,7 +96,7 @@ def test_a_state_of_before_a_plateau_has_none():
     assert stopped.state_dict() == running.state_dict()
 
 
-@pytest.mark.parametrize("make", [data, guard, budget, held_out, corrections])
+@pytest.mark.parametrize("make", [data, guard, budget, held_out, throughput, corrections])
 def test_what_is_none_of_it_is_refused_or_becomes_what_it_must_be(make: Callable):
     state, _ = make(True)
     good = state()
