@@ -102,15 +102,24 @@ def test_a_held_out_photo_of_which_nothing_is_known_does_not_count(folder: Path,
     assert len(run.results["curve"]) == 2
 
 
-def test_pictures_that_are_no_numbers_are_told(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """As where weights are finite and what they add up to is not."""
+@pytest.mark.parametrize("cameras_too", [False, True])
+def test_pictures_that_are_no_numbers_are_told(
+    cameras_too: bool, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """As where weights are finite and what they add up to is not; or where corrections of cameras are not either."""
     render_well = NeRF3D.render
 
     def render_badly(self: NeRF3D, *given: Any) -> Rendered:
         rendered = render_well(self, *given)
+        if cameras_too and self.corrections is not None:
+            self.corrections.motions.data.fill_(torch.nan)
         return replace(rendered, rgb=rendered.rgb * torch.nan)
 
     monkeypatch.setattr(NeRF3D, "render", render_badly)
-    run = nl.train(nl.load_scene(folder), steps=4, seed=1, device="cpu", folder=tmp_path / "run", options=QUICK)
-    assert run.results["status"] == "collapsed" and "not finite" in run.results["diagnosis"]
-    assert run.results["psnr"] is None and run.results["curve"] == []
+    options = [*QUICK, "refine=both"] if cameras_too else QUICK
+    run = nl.train(nl.load_scene(folder), steps=4, seed=1, device="cpu", folder=tmp_path / "run", options=options)
+    found = run.results
+    told = "corrections.motions is no longer finite" if cameras_too else "what is rendered is not finite"
+    assert found["status"] == "collapsed" and told in found["diagnosis"]
+    assert found["psnr"] is None and found["psnr_aligned"] is None and found["curve"] == []
+    assert found["corrections"] is None

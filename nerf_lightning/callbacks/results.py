@@ -178,7 +178,7 @@ class Results(L.Callback):
             curve = [*curve, [round(budget.seconds, 3), trainer.global_step, quality]]
         state = pl_module.state_dict().values()
         corrections = pl_module.corrections if isinstance(pl_module, NeRF3D) else None
-        self.summary = {
+        found = {
             "scene": scene.describe(),
             "background": pl_module.background,
             "method": self.method,
@@ -210,10 +210,20 @@ class Results(L.Callback):
             "warnings": self.warnings,
             "plateau": budget.stopped,
             "misfits": self.misfits,
-            "corrections": None if corrections is None else summary(corrections),
+            "corrections": summary(corrections) if corrections is not None and corrections.finite else None,
             "recoveries": [asdict(one) for one in guard.recoveries] if guard is not None else [],
             "status": status,
             "diagnosis": diagnosis,
         }
+        self.summary = known(found)
         if trainer.is_global_zero:
             write_json(Path(trainer.default_root_dir) / self.path, self.summary)
+
+
+def known(value: Any) -> Any:
+    """Plain values, with null for what no finite number is: figures of a field that has broken down."""
+    if isinstance(value, dict):
+        return {key: known(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [known(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

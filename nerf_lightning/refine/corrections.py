@@ -181,6 +181,11 @@ class Corrections(torch.nn.Module):
             self.begin(number(progress), name)
 
     @property
+    def finite(self) -> bool:
+        """Whether all of it are finite numbers: some are not any more where training has broken down."""
+        return all(bool(tensor.isfinite().all()) for tensor in self.state_dict().values())
+
+    @property
     def groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups: what is or may be corrected, each with its learning rate."""
         return [{"params": self._of(name), "lr": rate} for name, rate in self.rates.items()]

@@ -149,7 +149,7 @@ def train(
         raise InputError(checkpoint, "", found, "a state of this run to go on from", "start the run anew") from error
     trainer.test(system, data, verbose=False)
     if trainer.is_global_zero:
-        if isinstance(system, NeRF3D) and system.corrections is not None:
+        if isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.finite:
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
             if "poses" in system.corrections.since:
                 cameras = system.corrections.cameras(data.scene.train.cameras)
