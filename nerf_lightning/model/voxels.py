@@ -212,6 +212,8 @@ class VoxelField(Field):
     @torch.no_grad()
     def import_state(self, state: dict[str, Tensor]) -> None:
         keep, tables = state["kept"], [state[name] for name in TABLES]
+        if keep.dtype != torch.bool or not of_grid(keep):
+            raise RuntimeError("vertices that are none of a cubic grid")
         if any(len(table) != int(keep.sum()) + 1 for table in tables):
             raise RuntimeError("tables of another length than there are vertices")
         self.hold(keep, tables)
@@ -238,8 +240,33 @@ class VoxelField(Field):
         for name, dtype in COUNTS.items():
             destination[prefix + name] = torch.tensor(getattr(self, name), dtype=dtype)
 
+    def _check(self, prefix: str, state: dict[str, Tensor]) -> None:
+        """Refuses a state whose index, tables and counts do not belong together: what it has, as a part may be missing."""
+        found = {name: state[prefix + name] for name in ("index", "seen", *TABLES, *COUNTS) if prefix + name in state}
+        if any(name in found and found[name].numel() != 1 for name in COUNTS):
+            raise RuntimeError("counts of another shape than one number has")
+        if "stage" in found and not 0 <= int(found["stage"]) < len(self.resolutions):
+            raise RuntimeError(f"stage {int(found['stage'])} of {len(self.resolutions)}")
+        if "index" not in found:
+            return
+        index = found["index"]
+        kept = index[index > 0]
+        rising = torch.equal(kept, torch.arange(1, len(kept) + 1).to(kept))
+        if index.dtype != torch.int32 or not of_grid(index) or int(index.min()) < 0 or not rising:
+            raise RuntimeError("an index that is none of a cubic grid")
+        rows = len(kept) + 1
+        shapes = {"seen": (rows,), "log_density": (rows,), "colours": (rows, 3), "views": (rows, 3 * self.terms)}
+        for name, shape in shapes.items():
+            if name in found and found[name].shape != shape:
+                raise RuntimeError(f"{name} of shape {tuple(found[name].shape)}, where the index asks for {shape}")
+
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        """Takes the sizes of the loaded state: a grid of another stage has other shapes."""
+        """Takes the sizes of the loaded state: a grid of another stage has other shapes.
+
+        Raises:
+            RuntimeError: where they are none of such a grid.
+        """
+        self._check(prefix, state_dict)
         for name in COUNTS:
             if prefix + name in state_dict:
                 setattr(self, name, int(state_dict.pop(prefix + name)))
@@ -251,3 +278,8 @@ class VoxelField(Field):
                 replace_data(getattr(self, name), torch.empty_like(state_dict[prefix + name], device=self.aabb.device))
         super()._load_from_state_dict(state_dict, prefix, *rest)
         self.find_vertices()
+
+
+def of_grid(vertices: Tensor) -> bool:
+    """Whether there is one for each vertex of a cubic grid, in a row."""
+    return vertices.ndim == 1 and len(vertices) > 0 and round(len(vertices) ** (1 / 3)) ** 3 == len(vertices)

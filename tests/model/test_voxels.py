@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import pytest
 import torch
 
@@ -126,6 +128,40 @@ def test_a_state_goes_on_in_a_fresh_field_as_in_its_own(grown: bool):
         assert torch.equal(ours, theirs)
     assert len(fresh.grow(1.0)) == len(voxels.grow(1.0)) == (0 if grown else 3)
     assert torch.equal(fresh.index, voxels.index) and torch.equal(fresh.log_density, voxels.log_density)
+
+
+@pytest.mark.parametrize(
+    "name, change",
+    [
+        ("index", lambda index: index[None]),
+        ("index", lambda index: index[:-1]),
+        ("index", lambda index: index + 2**30),
+        ("index", lambda index: -index),
+        ("index", lambda index: index.flip(0)),
+        ("index", lambda index: index.long()),
+        ("seen", lambda seen: seen[:9]),
+        ("log_density", lambda table: table[None]),
+        ("colours", lambda table: table.T),
+        ("views", lambda table: table.flatten()[: len(table)]),
+        ("stage", lambda stage: stage + 2),
+        ("steps", lambda steps: steps.expand(2)),
+    ],
+)
+def test_a_state_whose_parts_do_not_belong_together_is_refused(
+    name: str, change: Callable[[torch.Tensor], torch.Tensor]
+):
+    voxels = field()
+    state = voxels.state_dict()
+    state[name] = change(state[name])
+    with pytest.raises(RuntimeError):
+        VoxelField(BOX, coarsest=8, finest=16, stages=2).load_state_dict(state)
+
+
+@pytest.mark.parametrize("change", [lambda kept: kept[:-1], lambda kept: kept[None], lambda kept: kept.int()])
+def test_kept_vertices_of_no_grid_are_refused(change: Callable[[torch.Tensor], torch.Tensor]):
+    exported = field().export_state()
+    with pytest.raises(RuntimeError, match="none of a cubic grid"):
+        field().import_state({**exported, "kept": change(exported["kept"])})
 
 
 def test_the_empty_row_does_not_learn():
