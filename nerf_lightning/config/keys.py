@@ -57,7 +57,7 @@ def check_keys(cfg: DictConfig, config: str, choices: Mapping[str, str | None]) 
         choices: what was chosen of each group, as Hydra keeps it.
 
     Raises:
-        InputError: for a key that does not stand in conf/, and a whole number that no float can hold.
+        InputError: for a key that does not stand in conf/, a value where keys belong, and a whole number that no float can hold.
     """
     with open_dict(cfg):
         for group in OPTIONAL:
@@ -91,8 +91,10 @@ def _check(found: Any, known: Mapping[str, Any], where: str, text: str) -> None:
             raise InputError(
                 "config", f"{where}{key}", "an unknown option", names, f"did you mean {near[0]}?" if near else ""
             )
-        if isinstance(value, dict) and isinstance(known.get(key), dict):
-            _check(value, known[key], f"{where}{key}.", text)
+        if isinstance(of_key := known.get(key), dict):
+            if not isinstance(value, dict):
+                raise InputError("config", f"{where}{key}", repr(value)[:60], f"{', '.join(of_key)}, each by its name")
+            _check(value, of_key, f"{where}{key}.", text)
 
 
 def _known(config: str) -> dict[str, Any]:

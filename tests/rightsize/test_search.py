@@ -93,6 +93,7 @@ def test_a_target_out_of_reach_is_told(given: list[str], tmp_path: Path):
     ("extra", "message"),
     [
         (["target.psnr=high"], "target.psnr: found 'high', expected a number or null"),
+        (["target=28"], "config: target: found 28, expected psnr, within_db, each by its name"),
         (["target.psnr=3", "target.within_db=1"], "one of the two"),
         (["ladder=none_such"], "ladder: found 'none_such'"),
         (["output=."], "something in it already"),
