@@ -57,7 +57,8 @@ def check_keys(cfg: DictConfig, config: str, choices: Mapping[str, str | None]) 
         choices: what was chosen of each group, as Hydra keeps it.
 
     Raises:
-        InputError: for a key that does not stand in conf/, a value where keys belong, and a whole number that no float can hold.
+        InputError: for a key that does not stand in conf/, a value where keys belong, and a whole number that no float
+            can hold.
     """
     with open_dict(cfg):
         for group in OPTIONAL:
