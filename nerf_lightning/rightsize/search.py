@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.config.build import build_data, corrects_poses, device_of
+from nerf_lightning.config.build import build_data, build_system, build_trainer, corrects_poses, device_of, frame_of
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.dataset.plausible import check_scene
@@ -89,6 +89,8 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     use_kernels(cfg.kernels)
     data = build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)
+    build_system(set_options(cfg, "model", ladder.rungs[0]), frame_of(data), device)
+    build_trainer(cfg, output, device)  # what is wrong with an option is told before anything is written
     begin(output, cfg, target, ladder)
     for doubt in check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []:
         print(f"{data.scene.name}: {doubt.text}", flush=True)

@@ -26,7 +26,7 @@ def begin(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None
         InputError: where the folder holds anything else, or a search that is done.
     """
     plan = {"target": asdict(target), "ladder": asdict(ladder), "config": plain_config(cfg)}
-    plan = json.loads(json.dumps(plan))  # as it is read
+    plan = json.loads(json.dumps(plan), parse_constant=str)  # as it is read, without nan and infinity
     if output.exists() and (not output.is_dir() or any(one.name != LOCK for one in output.iterdir())):
         try:
             found: dict[str, Any] | None = read_json(output / PLAN, "what a search is for")

@@ -1,6 +1,7 @@
 """The verb as a user meets it, on small scenes."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -97,15 +98,21 @@ def test_a_target_out_of_reach_is_told(given: list[str], tmp_path: Path):
         (["target.psnr=3", "target.within_db=1"], "one of the two"),
         (["ladder=none_such"], "ladder: found 'none_such'"),
         (["output=."], "something in it already"),
+        (["budget.steps={}"], "budget.steps: found {}"),
+        (["callbacks.heldout.views=nan"], "callbacks.heldout.views: found nan"),
+        (["sampler.samples=-1"], "sampler.samples: found -1"),
     ],
 )
-def test_bad_input_is_told_in_one_line(extra: list[str], message: str, given: list[str], verb):
+def test_bad_input_is_told_in_one_line_and_leaves_nothing(extra: list[str], message: str, given: list[str], verb):
+    before = set(Path.cwd().iterdir())
     code, _, err = verb(lambda: cli.run("rightsize", task), *given, *extra)
     assert code == 2 and err.count("\n") == 1 and message in err
+    assert set(Path.cwd().iterdir()) <= before
 
 
 def test_a_search_goes_on_where_the_same_one_was_interrupted(given: list[str], tmp_path: Path):
     cfg, ladder, output = composed(given, tmp_path, "rightsize"), Ladder(RUNGS, []), tmp_path / "found"
+    cfg.name = math.nan  # no JSON number
     begin(output, cfg, Target(psnr=14), ladder)
     begin(output, cfg, Target(psnr=14), ladder)
     for target, sizes in ((Target(psnr=15), RUNGS), (Target(psnr=14), RUNGS[:2])):
