@@ -31,7 +31,7 @@ from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.room import check_room
-from nerf_lightning.training.train import prepare_process, warm_up
+from nerf_lightning.training.train import prepare, warm_up
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.seeding import Stream, step_generator
 
@@ -93,7 +93,7 @@ def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = No
     Returns:
         The system, on the device that trained it, and the seconds it took.
     """
-    prepare_process(cfg.seed, cfg.threads, cfg.kernels)
+    prepare(cfg)
     if isinstance(data, RayDataModule):
         data.start_again()
     device = device_of(cfg)

@@ -14,7 +14,6 @@ from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.export.smallest import Compact, smallest
-from nerf_lightning.kernels import use_kernels
 from nerf_lightning.rightsize.choose import (
     Measured,
     Target,
@@ -31,7 +30,7 @@ from nerf_lightning.rightsize.start import begin
 from nerf_lightning.runs.folder import load_run, plain_config
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.training.before import left_of
-from nerf_lightning.training.train import train
+from nerf_lightning.training.train import prepare, train
 from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.quiet import quiet
 
@@ -86,7 +85,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     began = time.perf_counter()
     device = device_of(cfg)
     quiet()
-    use_kernels(cfg.kernels)
+    prepare(cfg)
     data = build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)
     build_system(set_options(cfg, "model", ladder.rungs[0]), frame_of(data), device)

@@ -99,9 +99,7 @@ def train(
     device = device_of(cfg)
     quiet()
     check_options("", labels, {"name": cfg.name, "method": cfg.method, "recipe": cfg.get("recipe")})
-    settings = {"seed": cfg.seed, "threads": cfg.threads, "kernels": cfg.kernels, "compile": cfg.compile}
-    check_options("", prepare_process, settings)
-    prepare_process(**settings)
+    prepare(cfg, cfg.compile)
     if cfg.compile:
         check_compiler(device, BACKEND)
     if resumed:
@@ -187,6 +185,17 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
 
 def labels(name: str, method: str, recipe: str | None) -> None:
     """What a run is called by, for checking."""
+
+
+def prepare(cfg: DictConfig, compile: bool = False) -> None:
+    """Checks and sets what applies to the whole process.
+
+    Raises:
+        InputError: for a seed, threads or kernels that cannot be.
+    """
+    settings = {"seed": cfg.seed, "threads": cfg.threads, "kernels": cfg.kernels, "compile": compile}
+    check_options("", prepare_process, settings)
+    prepare_process(**settings)
 
 
 def prepare_process(seed: Seed, threads: Threads | None, kernels: str, compile: bool = False) -> None:

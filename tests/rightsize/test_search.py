@@ -98,6 +98,7 @@ def test_a_target_out_of_reach_is_told(given: list[str], tmp_path: Path):
         (["target.psnr=3", "target.within_db=1"], "one of the two"),
         (["ladder=none_such"], "ladder: found 'none_such'"),
         (["output=."], "something in it already"),
+        (["threads=0"], "threads: found 0"),
         (["budget.steps={}"], "budget.steps: found {}"),
         (["callbacks.heldout.views=nan"], "callbacks.heldout.views: found nan"),
         (["sampler.samples=-1"], "sampler.samples: found -1"),
