@@ -1,6 +1,7 @@
 """What a command line may set: the keys that stand in conf/, and groups, of which some can be left out with null."""
 
 import difflib
+import math
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -57,8 +58,8 @@ def check_keys(cfg: DictConfig, config: str, choices: Mapping[str, str | None]) 
         choices: what was chosen of each group, as Hydra keeps it.
 
     Raises:
-        InputError: for a key that does not stand in conf/, a value where keys belong, and a whole number that no float
-            can hold.
+        InputError: for a key that does not stand in conf/, a value where keys belong, nan and infinity, and a whole number
+            that no float can hold.
     """
     with open_dict(cfg):
         for group in OPTIONAL:
@@ -82,6 +83,8 @@ def _check_numbers(found: Any, where: str) -> None:
     if isinstance(found, int) and abs(found) > sys.float_info.max:
         digits, most = len(str(abs(found))), sys.float_info.max_10_exp
         raise InputError("config", where, f"a whole number of {digits} digits", f"at most {most}")
+    if isinstance(found, float) and not math.isfinite(found):
+        raise InputError("config", where, str(found), "a finite number")
 
 
 def _check(found: Any, known: Mapping[str, Any], where: str, text: str) -> None:
