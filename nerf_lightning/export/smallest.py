@@ -1,5 +1,6 @@
 """The smallest compact file of a run that still shows what the run shows."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -41,10 +42,11 @@ class Compact:
 
 
 def held_out_psnr(system: System, data: RayDataModule | PixelDataModule, views: Sequence[int] | None = None) -> float:
-    """Mean dB over held-out views; over all of them for None."""
+    """Mean dB over held-out views that have a figure, nan where none has; over all of them for None."""
     chosen = range(data.held_out_views) if views is None else views
     results = system.evaluate_held_out(data, tracked(chosen, len(chosen), "held-out views"))
-    return fmean(result.psnr for result in results)
+    finite = [result.psnr for result in results if math.isfinite(result.psnr)]  # of some, no pixel may be known
+    return fmean(finite) if finite else math.nan
 
 
 def some_cameras(data: RayDataModule, most: int = MOST_VIEWS) -> Cameras:

@@ -69,8 +69,11 @@ def make_film(plan: dict[str, Any], draw: Callable[[int], Picture], count: int, 
     prepare(folder, plan, own=bool(output.suffix))
     left = [index for index in range(count) if not files[index].exists()]
     for index in tracked(left, len(left), "frames"):
+        picture = draw(index)
+        if index == left[0]:  # nothing is left of a film of which not even a frame can be drawn
+            write_json(folder / PLAN, plan)
         with atomic(files[index]) as temporary:
-            imageio.imwrite(temporary, draw(index), compress_level=1)
+            imageio.imwrite(temporary, picture, compress_level=1)
     if output.suffix:
         with atomic(output) as temporary:
             join(files, temporary, fps)
@@ -79,7 +82,11 @@ def make_film(plan: dict[str, Any], draw: Callable[[int], Picture], count: int, 
 
 
 def prepare(folder: Path, plan: dict[str, Any], own: bool) -> None:
-    """Prepares a folder for the frames of a plan; frames of another plan are deleted if the folder is our own."""
+    """Makes way for the frames of a plan: those of another plan are deleted if the folder is our own.
+
+    Raises:
+        InputError: where the folder is not, and holds something else.
+    """
     try:
         found = read_json(folder / PLAN, "a plan of frames")
     except InputError:  # none there, or none whole
@@ -89,7 +96,6 @@ def prepare(folder: Path, plan: dict[str, Any], own: bool) -> None:
             shutil.rmtree(folder)
         elif any(folder.iterdir()):
             raise InputError(folder, "", "something else in it", "a folder for these frames alone", "give output=DIR")
-    write_json(folder / PLAN, plan)
 
 
 def framed(files: list[Path]) -> Iterator[UInt8[ndarray, "H W C"]]:

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from nerf_lightning.config.build import (
     target_of,
 )
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.errors import InputError
 from nerf_lightning.export.reach import confined_to, seen_cells
 from nerf_lightning.export.smallest import held_out_psnr, some_cameras
 from nerf_lightning.model import as_wide
@@ -109,8 +111,15 @@ def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = No
 
 
 def quality(system: System, data: Data) -> float:
-    """Mean dB over a few held-out views."""
-    return held_out_psnr(system, data, evenly(data.held_out_views, VIEWS))
+    """Mean dB over a few held-out views.
+
+    Raises:
+        InputError: where what it shows is not finite.
+    """
+    found = held_out_psnr(system, data, evenly(data.held_out_views, VIEWS))
+    if not math.isfinite(found):
+        raise InputError("rightsize", "", "pictures that are not finite", "a field that learns", "lower optimizer.lr")
+    return found
 
 
 def compact_bytes(cfg: DictConfig, system: System, data: Data) -> int:

@@ -56,6 +56,13 @@ def test_an_interrupted_film_goes_on_and_another_one_starts_anew(tmp_path: Path)
     assert make_film({"what": 2}, plain, 3, output, fps=10) == 0, "frames of something else do not count"
 
 
+@pytest.mark.parametrize("name", ["film.gif", "frames"])
+def test_a_film_without_a_single_frame_leaves_nothing(name: str, tmp_path: Path):
+    with pytest.raises(ZeroDivisionError):
+        make_film({"what": 1}, lambda index: plain(1 // index), 3, tmp_path / name, fps=10)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_keeps_its_frames(tmp_path: Path):
     assert make_film({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 0
     names = sorted(path.name for path in (tmp_path / "frames").iterdir())

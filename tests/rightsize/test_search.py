@@ -3,7 +3,9 @@
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -15,13 +17,14 @@ from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.rightsize.__main__ import task
 from nerf_lightning.rightsize.choose import Target
-from nerf_lightning.rightsize.climb import climb, coarsest_sampler
+from nerf_lightning.rightsize.climb import climb, coarsest_sampler, quality
 from nerf_lightning.rightsize.ladder import Ladder
 from nerf_lightning.rightsize.start import begin
 from nerf_lightning.runs.compact import load_compact
 from nerf_lightning.runs.folder import load_config
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.stability.toys import PILE, toy
+from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.before import left_of
 
 RUNGS = [
@@ -168,6 +171,27 @@ def test_a_rung_that_is_smaller_in_something_starts_anew(
     cfg = composed(options, tmp_path, "rightsize")
     climbed = list(climb(cfg, build_data(cfg), rungs, tmp_path))
     assert [rung.options for rung in climbed] == rungs and all(rung.psnr > 3 for rung in climbed)
+
+
+def test_views_without_a_figure_do_not_count_and_a_field_without_any_is_refused(
+    given: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    cfg = composed(given, tmp_path, "rightsize")
+    data = build_data(cfg)
+    system = build_system(cfg, frame_of(data))
+    whole = [result.psnr for result in system.evaluate_held_out(data, range(2))]
+    evaluate = NeRF3D.evaluate_held_out
+
+    def unknown(self: NeRF3D, *given: Any) -> list:
+        first, *others = evaluate(self, *given)
+        return [replace(first, psnr=math.nan), *others]
+
+    monkeypatch.setattr(NeRF3D, "evaluate_held_out", unknown)
+    assert quality(system, data) == pytest.approx(whole[1])
+    for parameter in system.parameters():
+        parameter.data.fill_(math.nan)
+    with pytest.raises(InputError, match="found pictures that are not finite"):
+        quality(system, data)
 
 
 def test_samplers_that_do_not_fit_are_refused(given: list[str], tmp_path: Path):
