@@ -136,7 +136,7 @@ class OccupancySampler(Sampler):
     @property
     def rays_at_once(self) -> int:
         """On a CPU more than elsewhere: it goes some steps at a time along rays, front first."""
-        return self.chunk // 2 if self.thickness.device.type == "cpu" else super().rays_at_once
+        return max(1, self.chunk // 2) if self.thickness.device.type == "cpu" else super().rays_at_once
 
     @property
     def first_samples(self) -> int:

@@ -147,6 +147,7 @@ def test_asking_fewer_positions_together_changes_nothing(chunk: int, box: Bounds
     whole, together = sampler(rays, counted, seeded()), list(asked)
     asked.clear()
     sampler.chunk = chunk
+    assert sampler.rays_at_once >= 1
     parts = sampler(rays, counted, seeded())
     assert same(whole, parts) and sum(asked) == sum(together) > 500
     assert max(asked) == min(ASKED * chunk, max(together))
