@@ -15,6 +15,23 @@ GRIDS = ("HashGridField", "TensoRFField", "VoxelField")
 """Models whose runs without `size` were made with a fixed size; runs on photos without `undistort` resampled these, those
 without `focus` drew all rays alike, and those of pictures without `share` held half as many numbers."""
 
+LEFT_OUT = {
+    **dict.fromkeys(GRIDS, ("model", "size", "auto")),
+    "HashGrid2DField": ("model", "share", 1.0),
+    "from_photos": ("dataset", "undistort", False),
+}
+"""By what a group names: options without which a run is taken for one of those, and what they are today if left out."""
+
+
+def with_what_was_left_out(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A new run's configuration (plain values), which says also what `~model.size` leaves to the model."""
+    found = dict(config)
+    for name, (group, option, default) in LEFT_OUT.items():
+        options = found.get(group)
+        if isinstance(options, dict) and str(options.get("_target_")).rpartition(".")[2] == name:
+            found[group] = {option: default, **options}
+    return found
+
 
 def with_new_names(config: Mapping[str, Any]) -> dict[str, Any]:
     """A run's configuration (plain values) with each option under its present name; no warning, as runs cannot be edited."""

@@ -1,12 +1,15 @@
 """Old option names go on to work: on the command line, in a user's experiment, in runs made before."""
 
+import inspect
 from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
 
+from nerf_lightning.config.build import target_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.renames import RENAMED, rename_given
+from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.trusted import check_config
 
 
@@ -37,6 +40,18 @@ def test_grids_of_runs_that_say_no_size_are_as_fine_as_asked_for():
         assert check_config({"model": {"_target_": target}}, "config.yaml")["model"].get("size") == size
     model = {"_target_": "nerf_lightning.model.VoxelField", "size": "auto"}
     assert check_config({"model": model}, "config.yaml")["model"] == model
+
+
+@pytest.mark.parametrize("method", ["hashgrid", "tensorf", "voxels", "hashgrid2d"])
+def test_what_a_run_leaves_out_of_these_is_kept_as_it_is_today(method: str, tmp_path: Path):
+    option = "share" if method == "hashgrid2d" else "size"
+    cfg = composed(
+        ["dataset=photos", "dataset.path=x", f"model={method}", f"~model.{option}", "~dataset.undistort"], tmp_path
+    )
+    kept = check_config(plain_config(cfg), "config.yaml")
+    made, read = (inspect.signature(target_of(cfg, group)).parameters for group in ("model", "dataset"))
+    assert kept["model"][option] == made[option].default
+    assert kept["dataset"]["undistort"] == read["undistort"].default
 
 
 def test_new_names_are_options(tmp_path: Path):
