@@ -99,7 +99,7 @@ def train(
     device = device_of(cfg)
     quiet()
     check_options("", labels, {"name": cfg.name, "method": cfg.method, "recipe": cfg.get("recipe")})
-    prepare(cfg, cfg.compile)
+    prepare(cfg, may_compile=True)
     if cfg.compile:
         check_compiler(device, BACKEND)
     if resumed:
@@ -187,13 +187,18 @@ def labels(name: str, method: str, recipe: str | None) -> None:
     """What a run is called by, for checking."""
 
 
-def prepare(cfg: DictConfig, compile: bool = False) -> None:
-    """Checks and sets what applies to the whole process.
+def prepare(cfg: DictConfig, may_compile: bool = False) -> None:
+    """Checks and sets what applies to the whole process, with its `compile` where that may be.
 
     Raises:
         InputError: for a seed, threads or kernels that cannot be.
     """
-    settings = {"seed": cfg.seed, "threads": cfg.threads, "kernels": cfg.kernels, "compile": compile}
+    settings = {
+        "seed": cfg.seed,
+        "threads": cfg.threads,
+        "kernels": cfg.kernels,
+        "compile": may_compile and cfg.compile,
+    }
     check_options("", prepare_process, settings)
     prepare_process(**settings)
 
