@@ -10,7 +10,7 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.training.train import prepare_process
+from nerf_lightning.training.train import prepare
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.quiet import quiet
 
@@ -27,7 +27,7 @@ def built(overrides: list[str], folder: Path, device: torch.device = CPU) -> tup
     """Configuration, data and system of a 3D run, the process prepared as for training on a device, the system there."""
     cfg = composed(overrides, folder)
     quiet()
-    prepare_process(cfg.seed, cfg.threads, cfg.kernels)
+    prepare(cfg)
     data = build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)
     system = build_system(cfg, frame_of(data), device).to(device)

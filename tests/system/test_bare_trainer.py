@@ -11,7 +11,7 @@ from nerf_lightning.config.build import build_data, build_system, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.training.train import prepare_process, train
+from nerf_lightning.training.train import prepare, train
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.quiet import quiet
 
@@ -39,7 +39,7 @@ def test_a_trainer_with_steps_alone_gives_the_weights_of_a_budget_of_as_many(tmp
     train(cfg)
     expected = load_run(tmp_path).system.state_dict()
 
-    prepare_process(cfg.seed, cfg.threads, cfg.kernels)
+    prepare(cfg)
     data = build_data(cfg)
     system = build_system(cfg, frame_of(data), CPU)
     trainer = bare(STEPS)
