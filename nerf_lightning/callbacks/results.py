@@ -25,7 +25,7 @@ from nerf_lightning.errors import NoRoom
 from nerf_lightning.refine import summary
 from nerf_lightning.system import NeRF2D, NeRF3D, System, aligned_psnr, misfits, mse_to_psnr, psnr_of_photos
 from nerf_lightning.utils.ending import Interrupted
-from nerf_lightning.utils.files import write_json
+from nerf_lightning.utils.files import known, write_json
 from nerf_lightning.utils.machine import describe_machine
 
 try:
@@ -218,12 +218,3 @@ class Results(L.Callback):
         self.summary = known(found)
         if trainer.is_global_zero:
             write_json(Path(trainer.default_root_dir) / self.path, self.summary)
-
-
-def known(value: Any) -> Any:
-    """Plain values, with null for what no finite number is: figures of a field that has broken down."""
-    if isinstance(value, dict):
-        return {key: known(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [known(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,6 +1,5 @@
 """The evaluate verb: every held-out view rendered and measured, a table, and pictures of the worst."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -15,7 +14,7 @@ from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.open import beside, open_run
 from nerf_lightning.system import ViewResult
 from nerf_lightning.utils.device import the_device
-from nerf_lightning.utils.files import output_path, user_path, write_json
+from nerf_lightning.utils.files import known, output_path, user_path, write_json
 from nerf_lightning.utils.machine import describe_machine, device_in_words
 from nerf_lightning.utils.progress import tracked
 
@@ -89,7 +88,7 @@ def table(metrics: list[ViewMetrics]) -> Table:
 
 def _row(name: str, figures: dict[str, float | None], mark: str = "") -> tuple[str, ...]:
     digits = {"psnr": 2, "ssim": 4, "lpips": 4, "seconds": 3}
-    *cells, seconds = ("-" if _finite(figures[key]) is None else f"{figures[key]:.{n}f}" for key, n in digits.items())
+    *cells, seconds = ("-" if known(figures[key]) is None else f"{figures[key]:.{n}f}" for key, n in digits.items())
     return name, *cells, seconds + mark
 
 
@@ -97,7 +96,7 @@ def averages(metrics: list[ViewMetrics]) -> dict[str, float | None]:
     """The mean of each figure over the views; None where a view lacks it."""
     means: dict[str, float | None] = {}
     for name in ("psnr", "ssim", "lpips", "seconds"):
-        values = [value for one in metrics if (value := _finite(getattr(one, name))) is not None]
+        values = [value for one in metrics if (value := known(getattr(one, name))) is not None]
         means[name] = fmean(values) if len(values) == len(metrics) else None
     return means
 
@@ -106,10 +105,6 @@ def as_json(
     metrics: list[ViewMetrics], source: Path, scene: dict[str, object], device: torch.device
 ) -> dict[str, object]:
     """The evaluation as plain values."""
-    views = [{key: _finite(value) for key, value in vars(one).items()} for one in metrics]
+    views = [known(vars(one)) for one in metrics]
     machine = {"device": str(device), "machine": describe_machine(device)}
     return {"run": str(source), "scene": scene, **machine, "mean": averages(metrics), "views": views}
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else value

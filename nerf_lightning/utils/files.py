@@ -2,12 +2,14 @@
 
 import errno
 import json
+import math
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from nerf_lightning.errors import InputError, NoRoom, Unwritable
 from nerf_lightning.utils.ending import held
@@ -128,6 +130,15 @@ def write_json(path: Path, content: object) -> None:
     """Writes strict JSON (no NaN), atomically."""
     with atomic(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def known(value: Any) -> Any:
+    """Plain values, with null for what no finite number is, as JSON has none: figures of a field that has broken down."""
+    if isinstance(value, dict):
+        return {key: known(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [known(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def user_path(text: str | os.PathLike[str]) -> Path:
