@@ -21,7 +21,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.config.cli import given_of, quoted
 from nerf_lightning.config.compose import composed
-from nerf_lightning.dataset import Scene, open_scene
+from nerf_lightning.dataset import Reading, Scene, open_scene
 from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.export.verb import export
 from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
@@ -101,7 +101,7 @@ def load_scene(path: str | Path, resize: int | None = None) -> Scene:
     Raises:
         InputError: if there is none, or it is damaged.
     """
-    return open_scene(os.path.abspath(user_path(path)), resize=resize)
+    return open_scene(os.path.abspath(user_path(path)), reading=Reading(resize))
 
 
 def load_run(path: str | Path, device: str = "auto") -> Run:

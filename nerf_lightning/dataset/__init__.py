@@ -1,14 +1,14 @@
 """Stage 2, dataset: photos and poses become a Scene, whatever format they come in."""
 
 from nerf_lightning.dataset.extent import estimate_bounds
-from nerf_lightning.dataset.formats.blender import load_blender
-from nerf_lightning.dataset.formats.nerfstudio import load_nerfstudio
 from nerf_lightning.dataset.formats.npz import load_npz, save_npz
+from nerf_lightning.dataset.formats.transforms import load_blender, load_transforms
 from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PictureBatch, PixelBatch, PixelDataModule, pixel_grid
 from nerf_lightning.dataset.rays import RayBatch, RayDataModule, ViewBatch, draw_rays
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
+from nerf_lightning.dataset.shots import Reading
 from nerf_lightning.dataset.sources import from_bricks, from_download, from_photos, from_picture
 from nerf_lightning.dataset.views import Views
 
@@ -19,6 +19,7 @@ __all__ = [
     "PixelBatch",
     "PixelDataModule",
     "RayBatch",
+    "Reading",
     "RayDataModule",
     "ViewBatch",
     "from_bricks",
@@ -31,7 +32,7 @@ __all__ = [
     "draw_rays",
     "estimate_bounds",
     "load_blender",
-    "load_nerfstudio",
+    "load_transforms",
     "load_npz",
     "load_picture",
     "pixel_grid",

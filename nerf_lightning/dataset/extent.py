@@ -19,8 +19,8 @@ MAX_VIEWS = 32
 ALPHA_FLOOR = 0.02
 COLOUR_FLOOR = 3
 """In 1/255: JPEG-free renders are exact, resampled ones wobble by one or two."""
-FLAT = 0.9
-"""Share of the border's pixels that must have one colour to be the background: the rest is content that leaves the picture."""
+FLAT = 0.75
+"""Least share of the borders' pixels that have the background's colour; the rest is content that leaves the picture."""
 AGREEMENT = 0.95
 """Share of the views seeing a voxel that must find it in the silhouette; the rest forgives dark-on-dark pixels."""
 
@@ -65,11 +65,11 @@ def silhouettes(views: Views, background: tuple[float, float, float]) -> list[Bo
         masks = [(np.abs(image - colour) > COLOUR_FLOOR).any(-1) for image in images]
     if views.known is not None:
         masks = [mask | ~views.mask_of(view).numpy() for view, mask in enumerate(masks)]
-    flat = [around(mask).mean() < 0.2 for mask in masks]
+    flat = [take_border(mask).mean() < 0.2 for mask in masks]
     return masks if views.channels == 4 or np.mean(flat) > 0.5 else None
 
 
-def around(image: Shaped[np.ndarray, "H W *C"]) -> Shaped[np.ndarray, "B *C"]:
+def take_border(image: Shaped[np.ndarray, "H W *C"]) -> Shaped[np.ndarray, "B *C"]:
     """The pixels along the border of a picture."""
     return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
 
@@ -80,8 +80,8 @@ def border_colour(views: Views) -> tuple[float, float, float] | None:
         return None
     borders = []
     for view in range(len(views)):
-        border = around(views.image(view).numpy())
-        borders.append(border if views.known is None else border[around(views.mask_of(view).numpy())])
+        border = take_border(views.image(view).numpy())
+        borders.append(border if views.known is None else border[take_border(views.mask_of(view).numpy())])
     edges = torch.from_numpy(np.concatenate(borders)).int()
     if not len(edges):
         return None

@@ -1,6 +1,7 @@
 """Masks beside photos: which file belongs to which photo, and what is masked."""
 
 import logging
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,12 +9,13 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from nerf_lightning.dataset.extent import around
-from nerf_lightning.dataset.formats.decode import EXTENSIONS, read_pixels
+from nerf_lightning.dataset.extent import take_border
+from nerf_lightning.dataset.formats.decode import read_pixels
+from nerf_lightning.dataset.formats.names import MASK_FOLDERS, fold_name, walk_images
+from nerf_lightning.errors import InputError
 
 log = logging.getLogger(__name__)
 
-FOLDERS = ("masks", "mask", "images_mask", "images_masks")
 KEPT = 128
 """Brightness, or alpha, from which a mask keeps a pixel: white is kept, as nerfstudio and COLMAP have it."""
 SURE = 250
@@ -25,43 +27,81 @@ FLAT = 12
 
 
 def find_masks(photos: Sequence[Path], root: Path) -> list[Path | None]:
-    """The mask of each photo: in a folder `masks`, `mask`, `images_mask` or `images_masks` beside the photos' own.
+    """Finds the mask of each photo in a folder `masks`, `mask`, `images_mask` or `images_masks` beside the photos' own.
 
-    A mask has the photo's name, perhaps with more at its end or another extension. Where some photos have a mask and others
-    none, those count whole; a line says so.
+    A mask has the photo's path below its folder, or its name alone, perhaps with more at its end or another extension. Where
+    some photos have a mask and others none, those count whole; a line says so.
 
     Args:
         photos: their files.
         root: the scene's folder.
+
+    Raises:
+        InputError: several masks may be meant, or one of several photos.
     """
-    for folder in (parent / name for parent in _beside(photos, root) for name in FOLDERS):
+    for folder in (parent / name for parent in _mask_parents(photos, root) for name in MASK_FOLDERS):
         if folder.is_dir():
             break
     else:
         return [None] * len(photos)
-    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in {e.lower() for e in EXTENSIONS})
-    found = [_mask_of(photo, files) for photo in photos]
-    without = [photo.name for photo, mask in zip(photos, found, strict=True) if mask is None]
-    if len(without) == len(photos):
+    masks = [(fold_mask(file.relative_to(folder)), file) for file in walk_images(folder)]
+    common = Path(os.path.commonpath([photo.parent for photo in photos]))
+    found = [match_mask(folder, fold_name(str(photo.relative_to(common))), photo, masks) for photo in photos]
+    owners: dict[Path, Path] = {}
+    for photo, mask in zip(photos, found, strict=True):
+        if mask is not None and (other := owners.setdefault(mask, photo)) != photo:
+            text = f"one mask for {other.relative_to(common)} and {photo.relative_to(common)}"
+            raise InputError(mask, "", text, "a mask for each photo", "put masks into folders named as the photos'")
+    missing = [photo.name for photo, mask in zip(photos, found, strict=True) if mask is None]
+    if len(missing) == len(photos):
         log.warning("%s: no mask has the name of a photo, such as %s: masks left out", folder, photos[0].stem + ".png")
-    elif without:
-        log.warning("%s: no mask for %d of %d photos, %s first", folder, len(without), len(photos), without[0])
+    elif missing:
+        log.warning("%s: no mask for %d of %d photos, %s first", folder, len(missing), len(photos), missing[0])
     return found
 
 
-def _beside(photos: Sequence[Path], root: Path) -> list[Path]:
-    """Where a folder of masks may stand: beside the folder of the photos, in it, or in the scene's folder."""
-    own = photos[0].parent
-    return list(dict.fromkeys([own.parent, own, root]))
+def _mask_parents(photos: Sequence[Path], root: Path) -> list[Path]:
+    """Folders that may contain one of masks: above or in that of the photos, or the scene's."""
+    common = Path(os.path.commonpath([photo.parent for photo in photos]))
+    return list(dict.fromkeys([common.parent, common, photos[0].parent.parent, photos[0].parent, root]))
 
 
-def _mask_of(photo: Path, files: Sequence[Path]) -> Path | None:
-    """The one file that is named after a photo."""
-    exact = [file for file in files if file.stem in (photo.stem, photo.name)]
-    if exact:
-        return exact[0]
-    longer = [f for f in files if f.stem.startswith(photo.stem) and not f.stem[len(photo.stem)].isalnum()]
-    return longer[0] if len(longer) == 1 else None
+def fold_mask(path: Path) -> tuple[str, ...]:
+    """The folded parts of a mask's path; COLMAP appends an extension to the photo's: `a.jpg.png` becomes `a`."""
+    return fold_name("/".join(fold_name(path.as_posix())))
+
+
+def match_mask(
+    folder: Path, photo: tuple[str, ...], file: Path, masks: Sequence[tuple[tuple[str, ...], Path]]
+) -> Path | None:
+    """Finds the one mask whose path, from its end on, is the photo's as far as both go.
+
+    Args:
+        folder: of the masks, for messages.
+        photo: folded path below the folder that all photos share.
+        file: the photo.
+        masks: folded paths below their folder, and files.
+
+    Raises:
+        InputError: several fit equally well.
+    """
+
+    def fits(mask: tuple[str, ...], exact: bool) -> bool:
+        name, base = mask[-1], photo[-1]
+        longer = name.startswith(base) and len(name) > len(base) and not name[len(base)].isalnum()
+        shared = min(len(mask), len(photo)) - 1
+        return (name == base if exact else longer) and mask[-1 - shared : -1] == photo[-1 - shared : -1]
+
+    for exact in (True, False):
+        fitting = [one for one in masks if fits(one[0], exact)]
+        overlaps = [min(len(mask), len(photo)) for mask, _ in fitting]
+        best = [path for (_, path), overlap in zip(fitting, overlaps, strict=True) if overlap == max(overlaps)]
+        if len(best) > 1 and exact:
+            shown = ", ".join(path.relative_to(folder).as_posix() for path in best[:4])
+            raise InputError(folder, "", f"{len(best)} masks for {file.name}: {shown}", "one mask for each photo")
+        if len(best) == 1:
+            return best[0]
+    return None
 
 
 def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.ndarray, "H W"]:
@@ -79,7 +119,7 @@ def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.nda
 
 def cut_out(image: UInt8[np.ndarray, "H W C"], kept: Bool[np.ndarray, "H W"]) -> bool:
     """Whether what a mask leaves out is most of the photo's border, and of one colour: its subject is cut out already."""
-    if around(kept).mean() > 0.5:
+    if take_border(kept).mean() > 0.5:
         return False
     masked = image[..., :3][~kept]
     middle = np.median(masked, axis=0)
@@ -91,4 +131,4 @@ def seem_inverted(masks: Sequence[Bool[np.ndarray, "_ _"]]) -> bool:
     small = [cv2.resize(kept.astype(np.float32), (CELLS, CELLS), interpolation=cv2.INTER_AREA) for kept in masks]
     kept = np.mean(small, axis=0)
     quarter = CELLS // 4
-    return bool(kept[quarter:-quarter, quarter:-quarter].min() < 0.3 and around(kept).mean() > 0.7)
+    return bool(kept[quarter:-quarter, quarter:-quarter].min() < 0.3 and take_border(kept).mean() > 0.7)

@@ -4,18 +4,16 @@ from dataclasses import replace
 from pathlib import Path
 
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.formats.blender import load_blender
 from nerf_lightning.dataset.formats.colmap import MODEL_FOLDERS, PHOTO_FOLDERS, find_models, load_colmap
 from nerf_lightning.dataset.formats.llff import POSES, load_llff
-from nerf_lightning.dataset.formats.nerfstudio import load_nerfstudio
 from nerf_lightning.dataset.formats.npz import load_npz
+from nerf_lightning.dataset.formats.transforms import load_blender, load_transforms
 from nerf_lightning.dataset.placing.frames import kept_frames
 from nerf_lightning.dataset.placing.photos import has_photos
 from nerf_lightning.dataset.placing.place import place as place_photos
 from nerf_lightning.dataset.placing.video import VIDEOS
-from nerf_lightning.dataset.resize import resize_scene
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import Reading
+from nerf_lightning.dataset.shots import AS_IT_IS, Reading
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import user_path
 
@@ -26,15 +24,7 @@ SUPPORTED = (
 
 
 def open_scene(
-    path: str,
-    name: str | None = None,
-    resize: int | None = None,
-    holdout: int = 8,
-    near: float | None = None,
-    far: float | None = None,
-    masked: str = "auto",
-    invert_masks: bool = False,
-    undistort: bool = False,
+    path: str, name: str | None = None, reading: Reading = AS_IT_IS, near: float | None = None, far: float | None = None
 ) -> Scene:
     """Reads a scene of any supported format, told apart by what is inside.
 
@@ -44,14 +34,12 @@ def open_scene(
             of photos, or a video, which COLMAP places once.
         name: what to call it; defaults to the file's or folder's name.
         near, far: distances along the rays, in the scene's unit, that override the bounds'.
-        resize, holdout, masked, invert_masks, undistort: see `Reading`; of an .npz file and a Blender folder only `resize`
-            counts.
+        reading: see there.
 
     Raises:
         InputError: nothing readable at `path`, or what is there is damaged.
     """
     place = user_path(path)
-    reading = Reading(resize, holdout, masked, invert_masks, undistort)
     try:
         scene = _open(place, name, reading)
     except OSError as error:  # a loop of links, a folder that may not be read
@@ -67,11 +55,11 @@ def open_scene(
 
 def _open(place: Path, name: str | None, reading: Reading) -> Scene:
     if place.suffix.lower() == ".npz" and not place.is_dir():
-        return resize_scene(load_npz(place, name), reading.resize)
+        return load_npz(place, name, reading)
     if (place / "transforms_train.json").is_file():
-        return load_blender(place, name, reading.resize)
+        return load_blender(place, name, reading)
     if (place / "transforms.json").is_file() or (place.suffix.lower() == ".json" and place.is_file()):
-        return load_nerfstudio(place, name, reading)
+        return load_transforms(place, name, reading)
     if find_models(place):
         return load_colmap(place, name, reading)
     if (place / POSES).is_file():

@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +11,20 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, axes_meet, focus_point, held, orbit_like, transform, turn_upright
-from nerf_lightning.dataset.extent import border_colour, estimate_bounds, viewing_distance
+from nerf_lightning.cameras import (
+    Bounds,
+    Cameras,
+    axes_meet,
+    focus_point,
+    held,
+    in_other_frame,
+    orbit_like,
+    transform,
+    turn_upright,
+)
+from nerf_lightning.dataset.extent import estimate_bounds, viewing_distance
 from nerf_lightning.dataset.formats import checks
+from nerf_lightning.dataset.kind import apply_alpha, check_visible, decide_kind
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import Reading, Shot, read_shots
 from nerf_lightning.dataset.views import Views
@@ -29,70 +40,170 @@ POINTS, STRAY = 4096, 0.01
 """Points that are looked at, and the share of a view's that may be wrong."""
 
 
-def scene_of(
+@dataclass(frozen=True)
+class Split:
+    """Indices of photos."""
+
+    train: list[int]
+    val: list[int]
+    """Held out: measured on while training and at its end."""
+    test: list[int] = field(default_factory=list)
+    """Held out and measured on at the end alone, where a format has both."""
+
+
+@dataclass(frozen=True)
+class PosedViews:
+    """Photos as they are read, and their poses in the file's frame."""
+
+    views: Views
+    """The poses of its cameras do not count."""
+    c2w: Float[np.ndarray, "V 4 4"]
+    """OpenCV camera to world, the file's frame and unit."""
+
+
+@dataclass(frozen=True)
+class Hints:
+    """What a file says about its scene beside photos and poses."""
+
+    alpha_background: tuple[float, float, float] = BLACK
+    """What photos with alpha are composited on."""
+    keep_frame: bool = False
+    """Whether the scene of a bounded subject keeps the file's frame and unit."""
+    path: Cameras | None = None
+    """Cameras to show the result along, in the file's frame."""
+    nearest: float | None = None
+    """Distance of the nearest content to a camera, in the file's unit."""
+    points: Float[np.ndarray, "P 3"] | None = None
+    """On surfaces, in the file's frame."""
+    background: tuple[float, float, float] | None = None
+    """Colour behind the subject, where the file states it."""
+    bounds: Bounds | None = None
+    """The box that the file states, in its frame: a scene with one stays there."""
+    near: float | None = None
+    far: float | None = None
+    """Distances along the rays, in the file's unit."""
+    to_source: Float[np.ndarray, "4 4"] | None = None
+    """Similarity from the file's frame to that of its own original."""
+
+
+def split_shots(source: Path, count: int, holdout: int) -> Split:
+    """Every `holdout`-th photo is held out."""
+    checks.split_size(source, "train split", count - len(range(0, count, holdout)))
+    return Split([i for i in range(count) if i % holdout], list(range(0, count, holdout)))
+
+
+def build_scene(
     source: Path,
     name: str,
     shots: Sequence[Shot],
     reading: Reading,
-    split: tuple[list[int], list[int]] | None = None,
-    nearest: float | None = None,
-    points: Float[np.ndarray, "P 3"] | None = None,
+    split: Split | None = None,
+    hints: Hints = Hints(),  # noqa: B008  (frozen)
 ) -> Scene:
-    """Posed photos in some frame become a scene.
-
-    The world is moved to what the training cameras look at, turned so that z points up (see `cameras.held`), and scaled so
-    that their median distance to that place is 1; `to_source` leads back. Photos with alpha, and photos whose borders have
-    one colour, give a bounded scene, all others an unbounded one around the cube [-1, 1]^3.
+    """Reads posed photos and builds their scene, see `assemble_scene`.
 
     Args:
         source: what the user named, for messages.
         name: of the scene.
-        shots: sorted by name.
+        shots: in the order of the format.
         reading: see there.
-        split: indices of training and held-out photos; None holds out every `reading.holdout`-th.
-        nearest: distance of the nearest content to a camera, in the file's unit, where the file tells.
-        points: on surfaces, in the file's frame; they tell it too.
+        split: None holds out every `reading.holdout`-th.
+        hints: what else the file says.
 
     Raises:
         InputError: nothing to train on or to hold out, or photos that cannot be read.
     """
     if split is None:
-        everything = range(len(shots))
-        split = [i for i in everything if i % reading.holdout], list(everything[:: reading.holdout])
-    train, val = (torch.tensor(part, dtype=torch.long) for part in split)
-    checks.split_size(source, "train split", len(train))
-    checks.split_size(source, "val split", len(val))
+        split = split_shots(source, len(shots), reading.holdout)
+    checks.split_size(source, "train split", len(split.train))
+    checks.split_size(source, "val split", len(split.val))
     poses = np.stack([shot.c2w for shot in shots])
-    checks.told_apart(source, poses[train.numpy()])  # a tensor of one number would be one photo, not a list of it
-    c2w, to_source = framed(torch.from_numpy(poses), train)
-    moved = [replace(shot, c2w=pose) for shot, pose in zip(shots, c2w.numpy(), strict=True)]
-    views = read_shots(source, moved, reading)
-    train_views, val_views = views[train], views[seen(views, val, shots)]
-    background = BLACK
-    known = [] if nearest is None else [nearest * float(torch.linalg.det(to_source[:3, :3])) ** (-1 / 3)]
-    if points is not None and len(points):
-        known.append(
-            nearest_point(transform(torch.linalg.inv(to_source), torch.from_numpy(points).float()), train_views)
-        )
-    starts = [CLEAR * distance for distance in known]
-    if axes_meet(train_views.cameras.c2w):
-        starts.append(NEAR * nearest_camera(train_views))
-    near = min(starts, default=None)
-    bounds = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), unbounded=True, near=near)
-    if views.channels == 4:
-        bounds = estimate_bounds(train_views, BLACK)
-    elif (colour := border_colour(train_views)) is not None:
-        background, bounds = colour, estimate_bounds(train_views, colour)
+    views = read_shots(source, shots, reading)
+
+    def take(part: list[int]) -> PosedViews:
+        return PosedViews(views[torch.tensor(part, dtype=torch.long)], poses[part])
+
+    train, val = take(split.train), take(select_known(views, split.val, shots))
+    test = take(split.test) if split.test else None
+    return assemble_scene(source, name, train, val, test, reading, hints)
+
+
+def assemble_scene(
+    source: Path,
+    name: str,
+    train: PosedViews,
+    val: PosedViews,
+    test: PosedViews | None,
+    reading: Reading,
+    hints: Hints = Hints(),  # noqa: B008  (frozen)
+) -> Scene:
+    """Places read photos in one frame and decides what kind of scene they show, the same for every format.
+
+    The world is moved to what the training cameras look at, turned so that z points up (see `cameras.held`), and scaled so
+    that their median distance to that place is 1; `to_source` leads back. A bounded scene with `hints.keep_frame` stays where
+    it is instead. Unbounded scenes have the cube [-1, 1]^3 for a box.
+    """
+    check_visible(source, train.views)
+    checks.told_apart(source, train.c2w)
+    kind = decide_kind(train.views, reading.bounded, reading.masked, hints.alpha_background)
+    if hints.bounds is not None and reading.bounded == "auto":
+        kind = replace(kind, bounded=not hints.bounds.unbounded, reason="the file states a box")
+    if hints.background is not None:
+        kind = replace(kind, background=hints.background)
+    text = "%s: taken as %s, since %s (dataset.bounded overrides)"
+    log.info(text, name, "bounded" if kind.bounded else "unbounded", kind.reason)
+    splits = {"train": train, "val": val} | ({} if test is None else {"test": test})
+    focal = train.views.cameras.K[:, 0, 0].double().numpy()
+    if hints.bounds is not None or (hints.keep_frame and kind.bounded and checks.is_precise(train.c2w, focal)):
+        to_source = torch.eye(4, dtype=torch.float64)
+    else:
+        _, to_source = framed(torch.from_numpy(train.c2w), torch.arange(len(train.c2w)))
+    from_source = torch.linalg.inv(to_source.double())
+
+    def move(cameras: Cameras, c2w: Float[np.ndarray, "V 4 4"]) -> Cameras:
+        return replace(cameras, c2w=in_other_frame(torch.from_numpy(c2w), from_source).float())
+
+    def place(posed: PosedViews) -> Views:
+        views = apply_alpha(posed.views, kind.alpha)
+        return replace(views, cameras=move(views.cameras, posed.c2w))
+
+    placed = {key: place(posed) for key, posed in splits.items()}
+    views = placed["train"]
+    scale = float(torch.linalg.det(from_source[:3, :3])) ** (1 / 3)
+    near, far = (None if x is None else x * scale for x in (hints.near, hints.far))
+    if hints.bounds is not None:
+        bounds = replace(hints.bounds, near=near, far=far)
+    elif kind.bounded:
+        bounds = estimate_bounds(views, kind.background, near, far)
+    else:
+        bounds = replace(unbounded_box(views, to_source, hints), far=far)
+        bounds = bounds if near is None else replace(bounds, near=near)
+    path = None if hints.path is None else move(hints.path, hints.path.c2w.double().numpy())
     return Scene(
         name=name.lower(),
         source=str(source),
-        train=train_views,
-        val=val_views,
-        orbit=orbit_like(train_views.cameras),
+        train=views,
+        val=placed["val"],
+        test=placed.get("test"),
+        orbit=orbit_like(views.cameras) if path is None else path,
         bounds=bounds,
-        background=background,
-        to_source=to_source,
+        background=kind.background,
+        to_source=(to_source if hints.to_source is None else torch.from_numpy(hints.to_source) @ to_source).float(),
+        kind=kind.reason,
     )
+
+
+def unbounded_box(views: Views, to_source: Float[Tensor, "4 4"], hints: Hints) -> Bounds:
+    """The cube [-1, 1]^3, and where sampling starts: before the nearest content that is known, or what cameras look at."""
+    known = [] if hints.nearest is None else [hints.nearest * float(torch.linalg.det(to_source[:3, :3])) ** (-1 / 3)]
+    if hints.points is not None and len(hints.points):
+        points = transform(torch.linalg.inv(to_source.double()), torch.from_numpy(hints.points)).float()
+        known.append(nearest_point(points, views))
+    starts = [CLEAR * distance for distance in known]
+    if axes_meet(views.cameras.c2w):
+        starts.append(NEAR * nearest_camera(views))
+    near = min(starts, default=None)
+    return Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), unbounded=True, near=near)
 
 
 def nearest_camera(views: Views) -> float:
@@ -111,17 +222,15 @@ def nearest_point(points: Float[Tensor, "P 3"], views: Views) -> float:
     return min(found)
 
 
-def seen(views: Views, val: Tensor, shots: Sequence[Shot]) -> Tensor:
-    """Held-out views of which something is known; a line names the others."""
+def select_known(views: Views, val: list[int], shots: Sequence[Shot]) -> list[int]:
+    """Held-out photos of which something is known; a line names the others."""
     if views.known is None:
         return val
-    counts = {view: int(views.mask_of(view).sum()) for view in val.tolist()}
-    kept = [view for view, count in counts.items() if count]
-    lost = [shots[view].name for view, count in counts.items() if not count]
-    if lost:
+    kept = [view for view in val if bool(views.mask_of(view).any())]
+    if lost := [shots[view].name for view in val if view not in kept]:
         log.warning("%d held-out photos are masked entirely, %s first: left out", len(lost), lost[0])
     checks.split_size(shots[0].photo.parent, "val split", len(kept))
-    return torch.tensor(kept, dtype=torch.long)
+    return kept
 
 
 def framed(c2w: Float[Tensor, "V 4 4"], train: Int[Tensor, "T"]) -> tuple[Float[Tensor, "V 4 4"], Float[Tensor, "4 4"]]:

@@ -32,6 +32,10 @@ class Scene:
     """The colour behind the content: baked into images without alpha, the convention for images with it."""
     to_source: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
     """Similarity from this scene's frame to the file's own, so that exports keep the original place and scale."""
+    test: Views | None = None
+    """Held out, and measured on at the end alone, where a format has both."""
+    kind: str = ""
+    """Why the scene is bounded or unbounded, in a few words."""
 
     @property
     def resolution(self) -> tuple[int, int]:
@@ -62,4 +66,6 @@ class Scene:
             "sha256": self.sha256(),
             "views": {"train": len(self.train), "val": len(self.val)},
             "resolution": list(self.resolution),
+            "bounded": not self.bounds.unbounded,
+            "kind": self.kind,
         }

@@ -28,6 +28,8 @@ from nerf_lightning.utils.progress import tracked
 log = logging.getLogger(__name__)
 
 MASKED = ("auto", "unknown", "empty")
+BOUNDED = ("auto", "true", "false")
+ORIENTATIONS = ("auto", "stored", "exif")
 ROOM = 0.8
 """Share of the free memory that photos may take."""
 SMALLEST = 16
@@ -47,6 +49,8 @@ class Reading:
             cut out); "auto" takes alpha as empty, and masks as empty where what they leave out is of one colour.
         invert_masks: masks are black where the photo is kept.
         undistort: resample photos to those of a pinhole camera, cropped; otherwise rays follow the lens.
+        bounded: "true", "false", or "auto", which decides by what the photos show, see `dataset.kind`.
+        orientation: "stored", "exif", or "auto", see `dataset.orientation`.
     """
 
     resize: int | None = None
@@ -54,12 +58,18 @@ class Reading:
     masked: str = "auto"
     invert_masks: bool = False
     undistort: bool = False
+    bounded: str = "auto"
+    orientation: str = "auto"
 
     def __post_init__(self) -> None:
         if self.holdout < 2:
             raise InputError("holdout", "", str(self.holdout), "2 or more: every N-th photo is held out")
         if self.masked not in MASKED:
             raise InputError("dataset.masked", "", repr(self.masked), "auto, unknown or empty")
+        if self.bounded not in BOUNDED:
+            raise InputError("dataset.bounded", "", repr(self.bounded), "auto, true or false")
+        if self.orientation not in ORIENTATIONS:
+            raise InputError("dataset.orientation", "", repr(self.orientation), "auto, stored or exif")
 
 
 AS_IT_IS = Reading()

@@ -19,6 +19,7 @@ from nerf_lightning.dataset.pixels import Picture, PixelDataModule
 from nerf_lightning.dataset.rays import FOCUS, RAYS, SAMPLES, RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
+from nerf_lightning.dataset.shots import Reading
 from nerf_lightning.utils.files import atomic, user_path
 from nerf_lightning.utils.options import AtLeast, Count
 
@@ -36,6 +37,8 @@ def from_photos(
     masked: str = "auto",
     invert_masks: bool = False,
     undistort: bool = False,
+    bounded: str | bool = "auto",
+    orientation: str = "auto",
     near: float | None = None,
     far: float | None = None,
     rays: Count = RAYS,
@@ -44,7 +47,8 @@ def from_photos(
     focus: float = FOCUS,
 ) -> RayDataModule:
     """Posed photos in any supported format, see `open_scene` and `RayDataModule`."""
-    scene = open_scene(path, name, resize, holdout, near, far, masked, invert_masks, undistort)
+    reading = Reading(resize, holdout, masked, invert_masks, undistort, str(bounded).lower(), orientation)
+    scene = open_scene(path, name, reading, near, far)
     return RayDataModule(scene, rays, samples, seed, focus)
 
 
@@ -67,6 +71,7 @@ def from_download(
     download: bool = True,
     path: str | None = None,
     resize: Count | None = None,
+    bounded: str | bool = "auto",
     near: float | None = None,
     far: float | None = None,
     rays: Count = RAYS,
@@ -81,7 +86,7 @@ def from_download(
         folder: where downloads are kept.
         download: whether to use the network.
         path: a local copy, which must exist.
-        resize, near, far: see `open_scene`.
+        resize, bounded, near, far: see `from_photos`.
         rays, samples, seed, focus: see `RayDataModule`.
     """
     if path is None:
@@ -97,7 +102,9 @@ def from_download(
             log.warning("%s: the built-in scene 'bricks' stands in for it", problem)
             return from_bricks(size=resize or 200, rays=rays, samples=samples, seed=seed, focus=focus)
         path = str(local)
-    return from_photos(path, resize=resize, near=near, far=far, rays=rays, samples=samples, seed=seed, focus=focus)
+    return from_photos(
+        path, None, resize, bounded=bounded, near=near, far=far, rays=rays, samples=samples, seed=seed, focus=focus
+    )
 
 
 def _download(url: str, target: Path) -> None:

@@ -4,7 +4,7 @@ import logging
 
 import numpy as np
 
-from nerf_lightning.dataset import Scene, open_scene
+from nerf_lightning.dataset import Reading, Scene, open_scene
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.drawing.camera_map import camera_map
 from nerf_lightning.drawing.ink import pixels_of
@@ -41,7 +41,7 @@ def inspect(
     log = logging.getLogger("nerf_lightning")
     log.addHandler(heard)
     try:
-        found = open_scene(scene, None, resize, holdout, None, None, masked, invert_masks, undistort)
+        found = open_scene(scene, reading=Reading(resize, holdout, masked, invert_masks, undistort))
         doubts = doubts_about(found)
     finally:
         log.removeHandler(heard)

@@ -61,7 +61,7 @@ def read_content(path: Path, expected: str = "a file that can be read", cost: fl
 
 
 def read_json(path: Path, expected: str, todo: str = "export it again") -> Any:
-    """What a JSON file holds, in UTF-8.
+    """What a JSON file holds, in UTF-8, UTF-16 or UTF-32.
 
     Args:
         path: the file.
@@ -80,7 +80,7 @@ def parsed_json(content: bytes, where: object, expected: str, todo: str = "") ->
         InputError: it is no JSON, or breaks a limit.
     """
     try:
-        found = json.loads(content.decode("utf-8-sig"), parse_int=_whole)
+        found = json.loads(content.decode(json.detect_encoding(content)), parse_int=_whole)
         _check_depth(found)
     except json.JSONDecodeError as error:
         broken = f"broken JSON at line {error.lineno}, column {error.colno} ({error.msg})"

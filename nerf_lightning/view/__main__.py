@@ -64,13 +64,13 @@ def task(cfg: "DictConfig") -> None:
 
 def page_of_scene(given: dict[str, Any], port: int) -> "Page":
     """The page about a scene."""
-    from nerf_lightning.dataset import open_scene
+    from nerf_lightning.dataset import Reading, open_scene
     from nerf_lightning.utils.memory import check_memory
     from nerf_lightning.view.scene_page import ScenePage
 
     points = given["rays"] * given["samples"]
     check_memory("config", "rays, samples", f"{points:,} samples to show", POINT * points)
-    scene = open_scene(given["scene"], resize=given["resize"], holdout=given["holdout"])
+    scene = open_scene(given["scene"], reading=Reading(given["resize"], given["holdout"]))
     return ScenePage(scene, given["host"], port, given["photo_side"], given["rays"], given["samples"])
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerf_lightning.cameras import Distortion
-from nerf_lightning.dataset import Scene, Views, open_scene
+from nerf_lightning.dataset import Reading, Scene, Views, open_scene
 from nerf_lightning.dataset.formats.colmap_cameras import MODELS, NUMBERS, optics_of
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.errors import InputError
@@ -85,7 +85,7 @@ def test_reduced_photos_are_used_where_they_are_large_enough(views: Views, tmp_p
     (folder / "images_2").mkdir()
     for file in (folder / "images").iterdir():
         imageio.imwrite(folder / "images_2" / file.name, np.full((20, 24, 3), 77, np.uint8))
-    large, small = (open_scene(str(folder), resize=side) for side in (25, 24))
+    large, small = (open_scene(str(folder), reading=Reading(resize=side)) for side in (25, 24))
     assert large.train.channels == 4 and (small.train.pixels == 77).all()
     assert small.train.cameras.size(0) == (24, 20)
     torch.testing.assert_close(small.train.cameras.K[0], views.cameras.resized((24, 20)).K[0], atol=1e-4, rtol=0)
@@ -160,7 +160,7 @@ def test_a_lens_that_folds_the_photo_is_refused():
 def test_distances_of_llff_and_of_reduced_photos(views: Views, tmp_path: Path):
     names = photos(tmp_path / "images", views)
     write_llff(tmp_path / "poses_bounds.npy", views)
-    whole = open_scene(str(tmp_path), resize=24)
+    whole = open_scene(str(tmp_path), reading=Reading(resize=24))
     for name in names:
         image = imageio.imread(tmp_path / "images" / name)
         (tmp_path / "images" / name).unlink()
@@ -172,10 +172,10 @@ def test_distances_of_llff_and_of_reduced_photos(views: Views, tmp_path: Path):
 
 @pytest.mark.real_data
 def test_a_real_capture_is_the_same_in_both_formats(real_data: Path, tmp_path: Path):
-    a = open_scene(str(real_data / "cup"), resize=40)
+    a = open_scene(str(real_data / "cup"), reading=Reading(resize=40))
     (tmp_path / "images").symlink_to(real_data / "cup" / "images")
     (tmp_path / "poses_bounds.npy").symlink_to(real_data / "cup" / "poses_bounds.npy")
-    b = open_scene(str(tmp_path), resize=40)
+    b = open_scene(str(tmp_path), reading=Reading(resize=40))
     torch.testing.assert_close(a.train.cameras.c2w, b.train.cameras.c2w, atol=1e-5, rtol=0)
     assert a.bounds.unbounded and len(a.train) == 67
 

@@ -105,15 +105,6 @@ def frame(**entry: object) -> Spoil:
     return apply
 
 
-def elsewhere(folder: Path) -> None:
-    """All photos where another machine had them."""
-    path = folder / "transforms.json"
-    content = json.loads(path.read_text())
-    for one in content["frames"]:
-        one["file_path"] = "/home/somebody/" + one["file_path"]
-    path.write_text(json.dumps(content))
-
-
 MODEL = "sparse/0"
 BINARY: dict[str, tuple[Spoil, str]] = {
     "cameras cut": (cut(f"{MODEL}/cameras.bin", 30), "cameras.bin: found 30 bytes where at least"),
@@ -147,7 +138,6 @@ BINARY: dict[str, tuple[Spoil, str]] = {
     "no images": (lambda f: (f / MODEL / "images.bin").write_bytes(struct.pack("<Q", 0)), "images: found 0 photos"),
     "name that is no text": (put(f"{MODEL}/images.bin", 72, "B", 0xFF), "found a photo's name that is no UTF-8"),
     "no photos": (without_photos, "found '0000.png' not in"),
-    "photos elsewhere": (lambda f: (f / "images").rename(f / "pictures"), "a photo for at least half of the images"),
     "loop of links": (loop, "a photo for at least half of the images"),
     "1-pixel photo": (picture("images/0003.png", 1, 1, 3), "0003.png: found 1x1 pixels"),
     "thumbnail": (picture("images/0003.png", 2, 2, 3), "0003.png: found 2x2 pixels, expected 48x40"),
@@ -168,9 +158,6 @@ TEXT: dict[str, tuple[Spoil, str]] = {
     "image line": (text(f"{MODEL}/images.txt", "1 1 0 0 0\n\n"), "images.txt: found 1 1 0 0 0"),
     "image words": (text(f"{MODEL}/images.txt", "1 a b c d e f g 1 0.png\n\n"), "images.txt: found 1 a b c"),
     "duplicate names": (replaced(f"{MODEL}/images.txt", "0001.png", "0000.png"), "two photos named 0000.png"),
-    "absolute names": (replaced(f"{MODEL}/images.txt", "0000.png", "/etc/0000.png"), "found '/etc/0000.png'"),
-    "names that lead out": (replaced(f"{MODEL}/images.txt", "0000.png", "../0000.png"), "found '../0000.png'"),
-    "names of Windows": (replaced(f"{MODEL}/images.txt", "0000.png", "C:\\me\\0000.png"), "found 'C:"),
     "points": (text(f"{MODEL}/points3D.txt", "1 2\n"), "points3D.txt: found 1 2"),
     "binary in a text file": (put(f"{MODEL}/images.txt", 0, "4B", 255, 254, 0, 1), "found something that is no text"),
     "no images": (text(f"{MODEL}/images.txt", "# none\n"), "images: found 0 photos"),
@@ -191,7 +178,7 @@ LLFF: dict[str, tuple[Spoil, str]] = {
     "another shape of photo": (picture("images/0003.png", 48, 40, 3), "0003.png: found 40x48 pixels, expected 48x40"),
 }
 TRANSFORMS: dict[str, tuple[Spoil, str]] = {
-    "another machine": (elsewhere, "which is not there (nor are 11 more)"),
+    "no photos": (without_photos, "which is not there (nor are 11 more)"),
     "pose nan": (frame(transform_matrix=[[math.nan] * 4] * 4), "frames[3].transform_matrix: found nan"),
     "applied transform": (
         lambda f: replaced("transforms.json", '{"frames"', '{"applied_transform": [[1, 0], [0, 1]], "frames"')(f),

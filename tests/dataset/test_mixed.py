@@ -110,14 +110,14 @@ def test_masks_of_another_size_and_inverted_ones(views: Views, tmp_path: Path, c
     with caplog.at_level(logging.INFO):
         straight = open_scene(str(folder))
     assert "96x80" in caplog.text and "dataset.invert_masks=true takes them so" in caplog.text
-    turned = open_scene(str(folder), invert_masks=True)
+    turned = open_scene(str(folder), reading=Reading(invert_masks=True))
     assert torch.equal(turned.train.mask, ~straight.train.mask)
 
 
 def test_what_is_masked_may_be_empty(views: Views, tmp_path: Path):
     folder = capture(tmp_path / "a", views)
     write_masks(folder / "masks", views)
-    scene = open_scene(str(folder), masked="empty")
+    scene = open_scene(str(folder), reading=Reading(masked="empty"))
     assert scene.train.channels == 4 and scene.train.known is None and not scene.bounds.unbounded
     assert torch.equal(scene.train.image(0)[..., 3], ((views.image(1)[..., 3] > 127) * 255).to(torch.uint8))
 
@@ -127,13 +127,13 @@ def test_what_is_masked_may_be_empty(views: Views, tmp_path: Path):
     cut = capture(tmp_path / "b", views, white)
     write_masks(cut / "images_mask", views)
     assert open_scene(str(cut)).train.channels == 4, "these photos are cut out already"
-    assert open_scene(str(cut), masked="unknown").train.channels == 3
+    assert open_scene(str(cut), reading=Reading(masked="unknown")).train.channels == 3
 
 
 def test_alpha_may_be_unknown(views: Views, tmp_path: Path):
     names = photos(tmp_path / "images", views)
     write_colmap(tmp_path / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
-    scene = open_scene(str(tmp_path), masked="unknown")
+    scene = open_scene(str(tmp_path), reading=Reading(masked="unknown"))
     assert scene.train.channels == 3 and scene.bounds.unbounded
     assert torch.equal(scene.train.mask_of(0), views.image(1)[..., 3] >= 250)
 
@@ -141,7 +141,7 @@ def test_alpha_may_be_unknown(views: Views, tmp_path: Path):
 def test_masks_follow_resizing(views: Views, tmp_path: Path):
     folder = capture(tmp_path, views)
     write_masks(folder / "masks", views)
-    small = open_scene(str(folder), resize=24).train
+    small = open_scene(str(folder), reading=Reading(resize=24)).train
     whole = (views.image(1)[..., 3] > 127).view(20, 2, 24, 2).permute(0, 2, 1, 3).reshape(20, 24, 4).all(2)
     assert torch.equal(small.mask_of(0), whole), "known where all of a pixel is"
 
@@ -185,7 +185,7 @@ def test_too_many_photos_are_told_before_they_are_read(views: Views, tmp_path: P
     monkeypatch.setattr("psutil.virtual_memory", Memory)
     with pytest.raises(InputError, match="dataset.resize=42 would fit"):
         open_scene(str(folder))
-    assert open_scene(str(folder), resize=42).train.cameras.size(0) == (42, 35)
+    assert open_scene(str(folder), reading=Reading(resize=42)).train.cameras.size(0) == (42, 35)
 
 
 def test_words_for_masks():

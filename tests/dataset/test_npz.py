@@ -14,6 +14,12 @@ from nerf_lightning.errors import InputError
 Arrays = dict[str, np.ndarray]
 
 
+def on_black(images: np.ndarray) -> np.ndarray:
+    """Images with a black border."""
+    images[:, [0, -1]] = images[:, :, [0, -1]] = 0
+    return images
+
+
 @pytest.fixture
 def arrays() -> Arrays:
     """A valid file: two training views, one held out. The camera stands at (0, 0, 5) and looks along -z, y up."""
@@ -21,9 +27,9 @@ def arrays() -> Arrays:
     c2w = np.diag([1.0, -1.0, -1.0, 1.0])
     c2w[2, 3] = 5.0
     return {
-        "images_train": rng.integers(0, 256, (2, 6, 8, 3), dtype=np.uint8),
+        "images_train": on_black(rng.integers(0, 256, (2, 6, 8, 3), dtype=np.uint8)),
         "c2ws_train": np.stack([c2w, c2w]),
-        "images_val": rng.integers(0, 256, (1, 6, 8, 3), dtype=np.uint8),
+        "images_val": on_black(rng.integers(0, 256, (1, 6, 8, 3), dtype=np.uint8)),
         "c2ws_val": c2w[None],
         "focal": np.array(10.0),
     }
@@ -141,7 +147,7 @@ def _held_out(edit: Callable[[np.ndarray], object]) -> Callable[[Arrays], Arrays
 
 BOX = [[0, 0, 0], [1, 1, 1]]
 DAMAGE = {
-    "images missing": (_set(images_val=None), "images_val: found no such key among [c2ws_train, c2ws_val"),
+    "images missing": (_set(images_train=None), "images_train: found no such key among [c2ws_train, c2ws_val"),
     "focal missing": (_set(focal=None), "focal: found no such key"),
     "images rank": (_train(lambda x: x[0]), "images_train: found shape (6, 8, 3)"),
     "images channels": (_train(lambda x: x[..., :2]), "images_train: found shape (2, 6, 8, 2)"),
@@ -156,7 +162,7 @@ DAMAGE = {
     "pose shape": (_set(c2ws_train=np.zeros((2, 3, 4))), "c2ws_train: found shape (2, 3, 4)"),
     "pose dtype": (_set(c2ws_train=np.zeros((2, 4, 4)).astype(str)), "c2ws_train: found shape (2, 4, 4), <U"),
     "nan pose": (_pose(lambda p: p * np.nan), "c2ws_train[1]: found nan"),
-    "scaled pose": (_pose(lambda p: p * [2, 2, 2, 1]), "c2ws_train[1]: found R^T R"),
+    "scaled pose": (_pose(lambda p: p * [2, 2, 3, 1]), "c2ws_train[1]: found R^T R"),
     "mirrored pose": (_pose(lambda p: p * [-1, 1, 1, 1]), "c2ws_train[1]: found a mirror"),
     "transposed pose": (_pose(lambda p: p.T), "c2ws_train[1]: found bottom row"),
     "object array": (_set(focal=[{}]), "focal: found something unreadable (ValueError: Object arrays"),
@@ -276,27 +282,19 @@ def test_a_scene_in_any_unit_gets_the_same_box(unit: float, ball: Scene, path: P
 
 
 @pytest.mark.parametrize(
-    ("unit", "shift", "words"),
+    ("unit", "words"),
     [
-        (1e-13, 0, "e-13 from what they look at, expected a distance of 1e-12 to 1e+12; take another unit"),
-        (1e-300, 0, "from what they look at, expected a distance"),
-        (1, 1e7, "found cameras 1e+07 from the origin, whose pixels show 0.0"),
-        (
-            1,
-            1e11,
-            "expected places that single precision, of seven digits, tells apart; move the origin to the subject",
-        ),
+        (1e-13, "e-13 from what they look at, expected a distance of 1e-12 to 1e+12; take another unit"),
+        (1e-300, "from what they look at, expected a distance"),
     ],
 )
-def test_cameras_that_single_precision_cannot_tell_apart(
-    unit: float, shift: float, words: str, ball: Scene, path: Path
-):
+def test_cameras_that_single_precision_cannot_tell_apart(unit: float, words: str, ball: Scene, path: Path):
     save_npz(ball, path)
     with np.load(path) as file:
         arrays = dict(file)
     for key in ("c2ws_train", "c2ws_val", "c2ws_test"):
         arrays[key] = arrays[key].astype(np.float64)
-        arrays[key][:, :3, 3] = arrays[key][:, :3, 3] * unit + shift
+        arrays[key][:, :3, 3] = arrays[key][:, :3, 3] * unit
     np.savez(path, **arrays)
     with pytest.raises(InputError) as caught:
         load_npz(path)

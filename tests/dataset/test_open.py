@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.dataset import Scene, Views, open_scene, save_npz
+from nerf_lightning.dataset import Reading, Scene, Views, open_scene, save_npz
 from nerf_lightning.errors import InputError
 
 
@@ -59,7 +59,7 @@ def test_every_format_gives_the_same_scene(format: str, name: str, formats: dict
 
 @pytest.mark.parametrize("format", ["npz", "blender", "studio"])
 def test_name_resize_and_distances(format: str, formats: dict[str, Path]):
-    scene = open_scene(str(formats[format]), name="mine", resize=24, near=0.5, far=2.0)
+    scene = open_scene(str(formats[format]), reading=Reading(resize=24), name="mine", near=0.5, far=2.0)
     assert scene.name == "mine" and scene.resolution == (24, 20)
     assert scene.train.images.shape[1:3] == scene.val.images.shape[1:3] == (20, 24)
     assert (scene.orbit.width, scene.orbit.height) == (24, 20)
@@ -70,7 +70,7 @@ def test_name_resize_and_distances(format: str, formats: dict[str, Path]):
 
 
 def test_resized_npz_and_blender_agree(formats: dict[str, Path]):
-    a, b = (open_scene(str(formats[format]), resize=30) for format in ("npz", "blender"))
+    a, b = (open_scene(str(formats[format]), reading=Reading(resize=30)) for format in ("npz", "blender"))
     assert a.sha256() == b.sha256()
 
 
@@ -84,7 +84,7 @@ def test_holdout_reaches_the_capture(formats: dict[str, Path]):
     content = json.loads(path.read_text())
     del content["val_filenames"]
     path.write_text(json.dumps(content))
-    assert len(open_scene(str(path), holdout=3).val) == 4
+    assert len(open_scene(str(path), reading=Reading(holdout=3)).val) == 4
 
 
 WRONG = {
@@ -123,4 +123,4 @@ def test_impossible_distances(near: float, far: float | None, words: str, format
 
 def test_resize_below_one_pixel(formats: dict[str, Path]):
     with pytest.raises(InputError, match="resize: found 0"):
-        open_scene(str(formats["npz"]), resize=0)
+        open_scene(str(formats["npz"]), reading=Reading(resize=0))

@@ -9,7 +9,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from nerf_lightning.cameras import Cameras, focus_point, orbit_around
-from nerf_lightning.dataset import Views, open_scene
+from nerf_lightning.dataset import Reading, Views, open_scene
 from nerf_lightning.dataset.formats.exif import stated_exposure
 from nerf_lightning.dataset.posed import framed
 from tests.dataset.colmap_files import photos, write_transforms
@@ -67,7 +67,7 @@ def test_photos_state_the_light_that_they_gathered_or_none_does(silent: int | No
         exif = tags(seconds=2.0**-i, aperture=2.0, speed=0 if i == silent else 100)
         Image.new("RGB", (16, 12)).save(tmp_path / name, exif=exif)
     write_transforms(tmp_path / "transforms.json", views, names, w=16, h=12)
-    scene = open_scene(str(tmp_path), holdout=4)
+    scene = open_scene(str(tmp_path), reading=Reading(holdout=4))
     stated = {name: 25 * 2.0**-i for i, name in enumerate(names)} if silent is None else {}
     for part in (scene.train, scene.val):
         assert part.exposures == pytest.approx(tuple(stated[name] for name in part.names if stated))

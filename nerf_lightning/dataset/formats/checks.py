@@ -3,8 +3,10 @@
 Files come from strangers: nothing here unpickles or evaluates anything.
 """
 
+import logging
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,8 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.arrays import Header
 from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.untrusted import read_json
+
+log = logging.getLogger(__name__)
 
 PIXEL_BYTES = 20
 """Memory for a pixel of a rendered view: colour, depth and opacity as floats."""
@@ -53,6 +57,9 @@ def number(where: object, key: str, value: object) -> float:
     """A finite real number; 0-d arrays and arrays of one element count."""
     if isinstance(value, np.ndarray) and value.size == 1 and value.dtype.kind in "iuf":
         value = value.item()
+    if isinstance(value, str):  # some exporters write numbers as text
+        with suppress(ValueError):
+            value = float(value)
     # JSON may hold integers too large for a float: the comparison catches them, and nan and infinity.
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= 1e300:
         found = f"shape {value.shape}, {value.dtype}" if isinstance(value, np.ndarray) else repr(value)[:60]
@@ -97,6 +104,18 @@ def sensor(where: object, key: str, place: float) -> float:
     return place
 
 
+def principal_point(where: object, key: str, cx: float, cy: float, width: float, height: float) -> None:
+    """Refuses a principal point that is the middle of photos of another size.
+
+    Raises:
+        InputError: it lies as many times farther than the middle along both axes.
+    """
+    across, down = 2 * cx / width, 2 * cy / height
+    if min(across, down) > 1.8 and abs(across / down - 1) < 0.1:
+        found = f"{cx:g}, {cy:g}, the middle of photos {across:.3g} times as large as these, of {width:g}x{height:g}"
+        raise InputError(where, key, found, "intrinsics of these photos", "give w and h of the photos they belong to")
+
+
 def numeric(where: object, key: str, array: Shaped[np.ndarray, "..."], shape: str) -> Float[np.ndarray, "..."]:
     """The array as float64; `shape` is what it must have, like "4 4"."""
     wanted = f"numbers of shape ({', '.join(shape.split())})"
@@ -118,26 +137,41 @@ def pose_array(where: object, key: str, array: Header | np.ndarray) -> None:
 
 
 def rigid_poses(where: object, label: str, poses: Shaped[np.ndarray, "V ..."]) -> Float[np.ndarray, "V 4 4"]:
-    """Camera-to-world matrices [R t; 0 1] with R a rotation. `label` names pose i in messages: "c2ws_train[{}]"."""
+    """Camera-to-world matrices [R t; 0 1] with R a rotation. `label` names pose i in messages: "c2ws_train[{}]".
+
+    A uniform scale in the rotations is divided out; a line says so.
+    """
     pose_array(where, label.replace("[{}]", ""), poses)
-    poses = poses.astype(np.float64)
-    for i, pose in enumerate(poses):
-        rigid_pose(where, label.format(i), pose)
-    return poses
+    scales = [uniform_scale(pose) for pose in poses.astype(np.float64)]
+    if scaled := [scale for scale in scales if abs(scale - 1) > RIGID_TOLERANCE]:
+        text = "%s: %d of %d rotations carry a uniform scale, such as %.4g: divided out, camera positions stay"
+        log.warning(text, where, len(scaled), len(scales), scaled[0])
+    return np.stack([rigid_pose(where, label.format(i), pose) for i, pose in enumerate(poses.astype(np.float64))])
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def uniform_scale(pose: Float[np.ndarray, "4 4"]) -> float:
+    """The factor by which all columns of a pose's rotation are longer than 1; 1 where they are not of one length."""
+    lengths = np.linalg.norm(pose[:3, :3], axis=0)
+    mean = float(lengths.mean())
+    is_uniform = math.isfinite(mean) and NEAREST < mean < FARTHEST and np.ptp(lengths) <= RIGID_TOLERANCE * mean
+    return mean if is_uniform else 1.0
 
 
 @np.errstate(over="ignore")
 def rigid_pose(where: object, key: str, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """One camera-to-world matrix, likewise."""
+    """One camera-to-world matrix, likewise; without a line."""
     expected = "a finite camera-to-world matrix [R t; 0 0 0 1] with R a rotation"
     found = todo = ""
+    if np.isfinite(pose).all() and abs((scale := uniform_scale(pose)) - 1) > RIGID_TOLERANCE:
+        pose = np.concatenate([pose[:, :3] / scale, pose[:, 3:]], axis=1)
     if not np.isfinite(pose).all():
         found, todo = "nan or infinity", "leave out views without a pose"
     elif not np.allclose(pose[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE):
         found, todo = f"bottom row {rounded(pose[3])}", "the matrix may be transposed"
     elif (error := off_rotation(pose[:3, :3])) > RIGID_TOLERANCE:
         found = f"R^T R that is {error:.2g} away from the identity"
-        todo = "the rotation may carry a scale: divide it out"
+        todo = "the rotation may carry a shear or a scale of its own for each axis: export poses without it"
     elif np.linalg.det(pose[:3, :3]) < 0:
         found, todo = "a mirror (det R = -1)", "the handedness of the axes may be wrong"
     elif (far := np.abs(pose[:3, 3]).max()) > FARTHEST:
@@ -154,36 +188,41 @@ def off_rotation(matrix: Float[np.ndarray, "3 3"]) -> float:
     return float(longest if longest > 1e6 else np.abs(matrix.T @ matrix - np.eye(3)).max())
 
 
-def told_apart(
-    where: object, c2w: Float[np.ndarray, "V 4 4"], focal: Float[np.ndarray, "#V"] | None = None
-) -> Float[np.ndarray, "V 4 4"]:
-    """Cameras whose places differ from each other, and from what they look at, in single precision too.
+def told_apart(where: object, c2w: Float[np.ndarray, "V 4 4"]) -> None:
+    """Checks that cameras' distance from what they look at is one that single precision can hold.
 
     Args:
         where: the file.
         c2w: of cameras, in its frame.
-        focal: their focal lengths, pixels, where the frame is kept; None where the origin moves to the subject.
 
     Raises:
-        InputError: where single precision could not tell what a pixel shows.
+        InputError: it is not; in any frame whose origin is the subject.
     """
+    distance = measure_distance(c2w)
+    if distance is not None and not NEAREST <= distance <= FARTHEST:
+        found, expected = f"cameras {distance:.3g} from what they look at", f"a distance of {NEAREST:g} to {FARTHEST:g}"
+        raise InputError(where, "poses", found, expected, "take another unit")
+
+
+def is_precise(c2w: Float[np.ndarray, "V 4 4"], focal: Float[np.ndarray, "V"]) -> bool:
+    """Whether single precision tells apart what pixels show in the file's own frame, far from whose origin the subject may be.
+
+    Args:
+        c2w: of cameras, in the file's frame.
+        focal: their focal lengths, pixels.
+    """
+    distance, far = measure_distance(c2w), float(np.abs(c2w[:, :3, 3]).max())
+    return distance is None or (NEAREST <= distance <= FARTHEST and far * STEP <= distance / float(np.median(focal)))
+
+
+def measure_distance(c2w: Float[np.ndarray, "V 4 4"]) -> float | None:
+    """Median distance of cameras from where their axes meet; None where nothing says how far the subject is."""
     if len(c2w) < 3:
-        return c2w
+        return None
     poses, places = torch.from_numpy(c2w), c2w[:, :3, 3]
-    far = float(np.abs(places).max())
-    if np.ptp(places, axis=0).max() <= ROUNDING * far or not axes_meet(poses):
-        return c2w  # a fly-through or a panorama: nothing says how far the subject is
-    distance = float((poses[:, :3, 3] - focus_point(poses)).abs().amax(1).median())
-    if not NEAREST <= distance <= FARTHEST:
-        expected = f"a distance of {NEAREST:g} to {FARTHEST:g}"
-        raise InputError(
-            where, "poses", f"cameras {distance:.3g} from what they look at", expected, "take another unit"
-        )
-    if focal is not None and far * STEP > (pixel := distance / float(np.median(focal))):
-        found = f"cameras {far:.3g} from the origin, whose pixels show {pixel:.3g}"
-        expected = "places that single precision, of seven digits, tells apart"
-        raise InputError(where, "poses", found, expected, "move the origin to the subject")
-    return c2w
+    if np.ptp(places, axis=0).max() <= ROUNDING * np.abs(places).max() or not axes_meet(poses):
+        return None  # a fly-through or a panorama
+    return float((poses[:, :3, 3] - focus_point(poses)).abs().amax(1).median())
 
 
 def similarity(where: object, key: str, matrix: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "4 4"]:
@@ -221,9 +260,9 @@ def json_frames(path: Path, content: dict) -> tuple[list[str], Float[np.ndarray,
             pose = np.array(frame["transform_matrix"], dtype=np.float64)
         except (ValueError, TypeError, OverflowError) as error:
             raise InputError(path, key, f"no matrix ({error})", "4 rows of 4 numbers") from error
-        if pose.shape != (4, 4):
+        if pose.shape not in ((4, 4), (3, 4)):
             raise InputError(path, key, f"shape {pose.shape}", "4 rows of 4 numbers")
-        poses.append(pose)
+        poses.append(pose if len(pose) == 4 else np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]]))
     return [frame["file_path"] for frame in frames], rigid_poses(path, "frames[{}].transform_matrix", np.stack(poses))
 
 

@@ -1,16 +1,20 @@
 """COLMAP folders: a sparse model, and the photos that it places."""
 
 import logging
-from pathlib import Path, PurePosixPath
+import os
+import re
+from pathlib import Path
 
 import numpy as np
 
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.colmap_model import FILES, Image, Model, count_images, holds_model, read_model
-from nerf_lightning.dataset.formats.decode import EXTENSIONS, image_header
+from nerf_lightning.dataset.formats.decode import image_header
+from nerf_lightning.dataset.formats.names import ImageFinder, list_images, walk_images
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.optics import Optics
-from nerf_lightning.dataset.posed import scene_of
+from nerf_lightning.dataset.orientation import OrientationChooser
+from nerf_lightning.dataset.posed import Hints, build_scene
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
@@ -22,20 +26,37 @@ MODEL_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse", "")
 PHOTO_FOLDERS = ("images", "input", "")
 REDUCED = (8, 4, 2)
 """Folders `images_8`, `images_4`, `images_2` hold the same photos at these fractions of their size."""
+REDUCED_NAME = re.compile(r"(images|input)_\d+$")
+PLACED_FOLDER = "placed"
+"""Beside plain photos: the model that this package has made of them."""
+MAX_MODEL_DEPTH = 4
+"""Folders below a scene's in which a model is looked for where it is in none of the usual ones."""
 SHOWN = 5
 """Names in a message."""
 
 
 def find_models(place: Path) -> list[Path]:
     """Folders of sparse models that a path means, the one with most photos first: itself, or those below it where COLMAP and
-    the programs around it put them."""
+    the programs around it put them, such as `sparse/0`; else all down to `MAX_MODEL_DEPTH`."""
     for base in (place / name for name in MODEL_FOLDERS):
         if base.is_dir():
             below = sorted(folder for folder in base.iterdir() if folder.name.isdigit() and folder.is_dir())
             models = [folder for folder in (base, *below) if holds_model(folder)]
             if models:
                 return sorted(models, key=count_images, reverse=True)
-    return []
+    found = []
+    for name, folders, _ in os.walk(place):
+        folder = Path(name)
+        deepest = len(folder.relative_to(place).parts) >= MAX_MODEL_DEPTH
+        folders[:] = (
+            [] if deepest else sorted(one for one in folders if one != PLACED_FOLDER and not one.startswith("."))
+        )
+        if holds_model(folder):
+            found.append(folder)
+    if len({folder.parent if folder.name.isdigit() else folder for folder in found}) > 1:
+        shown = ", ".join(folder.relative_to(place).as_posix() for folder in sorted(found)[:SHOWN])
+        raise InputError(place, "", f"several COLMAP models: {shown}", "one", "give the path of one of them")
+    return sorted(found, key=count_images, reverse=True)
 
 
 def load_colmap(
@@ -67,35 +88,35 @@ def load_colmap(
     model = read_model(folder)
     _check(folder, model)
     images = sorted(model.images, key=lambda image: image.name)
-    root = _photo_folder(folder, place, images) if photos is None else photos
-    files = [_inside(folder, root, image.name) for image in images]
-    there = [file.is_file() for file in files]
-    missing = [image.name for image, has in zip(images, there, strict=True) if not has]
+    root = find_photo_folder(folder, place, images) if photos is None else photos
+    finder = ImageFinder(root)
+    files = [finder.find(image.name, folder, "images") for image in images]
+    missing = [image.name for image, file in zip(images, files, strict=True) if file is None]
     if 2 * len(missing) > len(images):
         found = f"{missing[0]!r} not in {root} (nor {len(missing) - 1} more)"
         raise InputError(
             folder, "", found, "a photo for at least half of the images", "is the folder of photos in place?"
         )
+    finder.report(folder)
     if missing:
         log.warning("%s: %d of %d photos are not there, %s: left out", root, len(missing), len(images), _named(missing))
-    kept = [image for image, has in zip(images, there, strict=True) if has]
-    _tell_unplaced(root, {image.name for image in images})
-    small = _reduced(root, [model.cameras[image.camera] for image in kept], reading.resize)
-    paths = [_inside(folder, small if (small / image.name).is_file() else root, image.name) for image in kept]
-    scene_folder = root.parent if root.name in PHOTO_FOLDERS else root
-    masks = find_masks([root / image.name for image in kept], scene_folder)
-    shots = [
-        Shot(
-            image.name,
-            path,
-            checks.rigid_pose(folder, image.name, np.linalg.inv(image.w2c)),
-            model.cameras[image.camera],
-            mask,
-            upright,
-        )
-        for image, path, mask in zip(kept, paths, masks, strict=True)
-    ]
-    return scene_of(place, name or scene_folder.resolve().name, shots, reading, points=model.points)
+    found_files = [(image, file) for image, file in zip(images, files, strict=True) if file is not None]
+    report_unplaced(root, [file for _, file in found_files])
+    small = _reduced(root, [model.cameras[image.camera] for image, _ in found_files], reading.resize)
+    scene_folder = root.parent if root.name in PHOTO_FOLDERS or REDUCED_NAME.match(root.name) else root
+    masks = find_masks([file for _, file in found_files], scene_folder)
+    orientation = OrientationChooser(reading.orientation)
+    shots = []
+    for (image, file), mask in zip(found_files, masks, strict=True):
+        reduced = small / file.relative_to(root)
+        optics = model.cameras[image.camera]
+        path = reduced if _is_file(reduced) else file
+        turned = upright or orientation.choose(path, (optics.width, optics.height))[2]
+        c2w = checks.rigid_pose(folder, image.name, np.linalg.inv(image.w2c))
+        shots.append(Shot(image.name, path, c2w, optics, mask, turned))
+    orientation.report(folder)
+    named = place if scene_folder.resolve().is_relative_to(place.resolve()) else scene_folder
+    return build_scene(place, name or named.resolve().name, shots, reading, hints=Hints(points=model.points))
 
 
 def _check(folder: Path, model: Model) -> None:
@@ -112,15 +133,21 @@ def _check(folder: Path, model: Model) -> None:
         names.add(image.name)
 
 
-def _photo_folder(model: Path, place: Path, images: list[Image]) -> Path:
-    """The folder that holds a model's photos, or else the likeliest."""
+def find_photo_folder(model: Path, place: Path, images: list[Image]) -> Path:
+    """The folder that holds a model's photos: `images`, `input`, itself or `images_2` to `images_8`, from the model's up."""
     order = ("input", "images", "") if "distorted" in model.parts else PHOTO_FOLDERS
     above = [model, *list(model.resolve().parents)[:4]]
-    tried = [parent / name for parent in above for name in order]
+    reduced = [f"{name}_{factor}" for name in ("images", "input") for factor in reversed(REDUCED)]
+    tried = [parent / name for names in (order, reduced) for parent in above for name in names]
     for folder in tried:
-        if any(_is_file(folder / image.name) for image in images[:SHOWN]):
+        if any(ImageFinder(folder).find_exact(image.name) for image in images[:SHOWN]):
             return folder
-    return next((folder for folder in tried if folder.name and folder.is_dir() and folder.name in order), place)
+    return next((folder for folder in tried if folder.name in (*order, *reduced) and has_images(folder)), place)
+
+
+def has_images(folder: Path) -> bool:
+    """Whether there is an image file in a folder or below it."""
+    return folder.is_dir() and next(walk_images(folder), None) is not None
 
 
 def _is_file(path: Path) -> bool:
@@ -131,27 +158,13 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _inside(model: Path, root: Path, name: str) -> Path:
-    """The photo of this name, which may not lead out of its folder."""
-    parts = PurePosixPath(name.replace("\\", "/"))
-    if parts.is_absolute() or ".." in parts.parts or not parts.parts or ":" in parts.parts[0]:
-        raise InputError(
-            model, "images", repr(name), "names relative to the folder of photos", "place the photos again"
-        )
-    return root / name
-
-
-def _tell_unplaced(root: Path, placed: set[str]) -> None:
-    """Names photos in the folder that the model does not place."""
-    try:
-        files = [file.relative_to(root).as_posix() for file in root.rglob("*") if file.suffix in EXTENSIONS]
-    except OSError as error:
-        log.warning("%s: %s", root, error)
-        return
-    folders = {name.rpartition("/")[0] for name in placed}
-    left = sorted(name for name in files if name not in placed and name.rpartition("/")[0] in folders)
+def report_unplaced(root: Path, placed: list[Path]) -> None:
+    """Names photos beside the placed ones that the model does not place."""
+    folders = {file.parent for file in placed}
+    left = sorted({file for folder in folders for file in list_images(folder)} - set(placed))
     if left:
-        log.warning("%s: %d photos have no place in the model, %s: left out", root, len(left), _named(left))
+        names = [file.relative_to(root).as_posix() for file in left]
+        log.warning("%s: %d photos have no place in the model, %s: left out", root, len(left), _named(names))
 
 
 def _named(names: list[str]) -> str:

@@ -159,20 +159,20 @@ def _points_bin(path: Path) -> Float[np.ndarray, "P 3"]:
     return np.array(points).reshape(-1, 3)
 
 
-def _lines(path: Path) -> Iterator[list[str]]:
-    """The words of each line but comments; empty lines too."""
+def _lines(path: Path, splits: int = -1) -> Iterator[list[str]]:
+    """The words of each line but comments, the rest of a line after that many splits whole; empty lines too."""
     try:
         text = read_content(path).decode()
     except UnicodeDecodeError as error:
         raise InputError(path, "", "something that is no text", "COLMAP's text format") from error
     for line in text.splitlines():
         if not line.startswith("#"):
-            yield line.split()
+            yield line.split(None, splits)
 
 
 def _image_lines(path: Path) -> Iterator[list[str]]:
     """Every second line: those between hold the features, and may be empty."""
-    lines = _lines(path)
+    lines = _lines(path, splits=9)  # names may contain spaces
     for words in lines:
         if words:
             yield words
@@ -217,7 +217,7 @@ def _images_txt(path: Path) -> list[Image]:
         number, *pose, camera = _numbers(path, words[:9])
         if not (math.isfinite(number) and math.isfinite(camera)):
             raise InputError(path, "", " ".join(words)[:60], "whole numbers of the photo and its camera")
-        name = " ".join(words[9:])
+        name = words[9].rstrip()
         images.append(Image(int(number), name, int(camera), _pose(path, name, tuple(pose))))
     return images
 

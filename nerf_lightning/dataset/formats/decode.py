@@ -18,7 +18,6 @@ from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.quiet import native_errors_hidden
 from nerf_lightning.utils.untrusted import existing_file
 
-EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 THREADS = 4
 ORIENTATION, QUARTER_TURNS = 0x0112, (5, 6, 7, 8)
 """EXIF's tag for how the camera was held, and its values for photos that lie on their side."""
@@ -29,14 +28,6 @@ PNG_SIDE, MOST_PIXELS = 10**6, 2**30
 """Most pixels along a side that libpng reads, and in all that OpenCV does, as far as they are not told otherwise."""
 HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 """Brands after `ftyp` in photos of phones (ISO 23008-12); the last two stand for any codec."""
-
-
-def find_image(folder: Path, file_path: str) -> Path | None:
-    """The file that `file_path` means; its extension may be missing, as Blender exports leave it."""
-    for extension in ("", *EXTENSIONS):
-        if (candidate := folder / (file_path + extension)).is_file():
-            return candidate
-    return None
 
 
 def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]:

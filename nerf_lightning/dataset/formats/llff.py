@@ -6,10 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.formats.decode import EXTENSIONS, image_header
+from nerf_lightning.dataset.formats.names import list_images
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.optics import Optics
-from nerf_lightning.dataset.posed import scene_of
+from nerf_lightning.dataset.orientation import OrientationChooser, has_shape
+from nerf_lightning.dataset.posed import Hints, build_scene
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
 from nerf_lightning.errors import InputError
@@ -36,16 +37,18 @@ def load_llff(folder: Path, name: str | None = None, reading: Reading = AS_IT_IS
     c2w, sizes, nearest = _rows(path)
     photos = _photos(folder, len(c2w))
     masks = find_masks(photos, folder)
+    orientation = OrientationChooser(reading.orientation)
     shots = []
     for photo, mask, pose, (height, width, focal) in zip(photos, masks, c2w, sizes.tolist(), strict=True):
-        wide, high, _ = image_header(photo)
-        focal *= wide / width
-        if abs(high * width / wide - height) > 1.5 * max(1, width / wide):
+        wide, high, upright = orientation.choose(photo, (width, height))
+        if not has_shape((wide, high), (width, height)):
             found = f"{wide}x{high} pixels"
             raise InputError(photo, "", found, f"{width:g}x{height:g} as in {POSES}, or the same reduced")
+        focal *= wide / width
         optics = Optics(wide, high, focal, focal, wide / 2, high / 2)
-        shots.append(Shot(photo.name, photo, pose, optics, mask))
-    return scene_of(folder, name or folder.resolve().name, shots, reading, nearest=nearest)
+        shots.append(Shot(photo.name, photo, pose, optics, mask, upright))
+    orientation.report(folder)
+    return build_scene(folder, name or folder.resolve().name, shots, reading, hints=Hints(nearest=nearest))
 
 
 def _rows(path: Path) -> tuple[Float[np.ndarray, "V 4 4"], Float[np.ndarray, "V 3"], float | None]:
@@ -79,7 +82,7 @@ def _photos(folder: Path, count: int) -> list[Path]:
     found = {}
     for name in names:
         below = folder / name
-        files = sorted(file for file in below.iterdir() if file.suffix in EXTENSIONS) if below.is_dir() else []
+        files = list_images(below) if below.is_dir() else []
         if len(files) == count:
             return files
         if files:

@@ -1,118 +1,140 @@
 """The course format: one .npz file with images, OpenCV camera-to-world poses and a focal length."""
 
+import logging
 import re
+import zipfile
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, orbit_like
-from nerf_lightning.dataset.extent import border_colour, estimate_bounds
+from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset.formats import checks
+from nerf_lightning.dataset.posed import Hints, PosedViews, assemble_scene, split_shots
+from nerf_lightning.dataset.resize import fit_size, resize_views
 from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.shots import AS_IT_IS, Reading
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.arrays import Headers, read_npz
 from nerf_lightning.utils.files import atomic
 
-NEEDED = ("images_train", "c2ws_train", "images_val", "c2ws_val")
-MOST_NUMBERS = 16
+log = logging.getLogger(__name__)
+
+NEEDED = ("images_train", "c2ws_train")
+PAIRS = {"images_train": "c2ws_train", "images_val": "c2ws_val", "images_test": "c2ws_test"}
+"""Images of each split, and their poses."""
+MAX_NUMBERS = 16
 """In what is neither images nor poses of views: `to_source`, a 4 x 4 matrix, has most."""
-OPTIONAL = ("c2ws_test", "focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
+SCALARS = ("focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
 
 
-def load_npz(path: Path, name: str | None = None) -> Scene:
+def load_npz(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -> Scene:
     """Reads the course format. Poses are OpenCV camera to world already: nothing is converted.
 
     Entries, with V views a split:
-        images_train, images_val: (V, H, W, 3 or 4), uint8 or floats in [0, 1].
-        c2ws_train, c2ws_val, c2ws_test: (V, 4, 4); the last is the orbit, made up like the training cameras if absent.
+        images_train, images_val, images_test: (V, H, W, 3 or 4), uint8 or floats in [0, 1]; without val, test is held out, or
+            every `reading.holdout`-th of train.
+        c2ws_train, c2ws_val, c2ws_test: (V, 4, 4); the last without images is the orbit, made up like the training cameras if
+            absent.
         focal: pixels, with the principal point in the middle; or K: (3, 3), for all views, which then rules.
-        near, far: distances along the rays, and aabb: (2, 3), world units; optional, the box is estimated if absent.
+        near, far: distances along the rays, and aabb: (2, 3), world units, with unbounded: whether content lies outside aabb
+            too; without aabb the photos decide, see `decide_kind`.
         background: (3,), sRGB; if absent the one colour along the photos' borders, or black.
-        unbounded: whether content lies outside aabb too, false if absent.
-        to_source: (4, 4), similarity to the frame of the original, identity if absent. `save_npz` writes these three
-        only where they say something.
+        to_source: (4, 4), similarity to the frame of the original, identity if absent.
 
     Raises:
         InputError: anything missing, malformed or contradictory.
     """
-    data = read_npz(path, NEEDED + OPTIONAL, partial(_compare, path))
-    images = {key: checks.uint8_images(path, key, data[key]) for key in ("images_train", "images_val")}
+    data = read_npz(path, (*PAIRS, *PAIRS.values(), *SCALARS), partial(_compare, path))
+    with zipfile.ZipFile(path) as archive:
+        names = {member.removesuffix(".npy") for member in archive.namelist()}
+    if unused := sorted(names - {*PAIRS, *PAIRS.values(), *SCALARS}):
+        log.info("%s: keys that are not used: %s", path, ", ".join(unused))
+    images = {key: checks.uint8_images(path, key, data[key]) for key in PAIRS if key in data}
     height, width = images["images_train"].shape[1:3]
+    K = _intrinsics(path, data, width, height)
+
+    def cameras(c2w: Float[np.ndarray, "V 4 4"]) -> Cameras:
+        return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w).float(), width, height)
+
+    poses = {key: checks.rigid_poses(path, key + "[{}]", data[key]) for key in PAIRS.values() if key in data}
+    posed = {
+        key: PosedViews(Views.of(torch.from_numpy(images[key]), cameras(poses[PAIRS[key]])), poses[PAIRS[key]])
+        for key in images
+    }
+    train, val, test = (posed.get(key) for key in PAIRS)
+    if val is None:
+        val, test = test, None
+    assert train is not None  # as was checked
+    if val is None:
+        log.warning("%s: no held-out photos: every %d-th training photo is held out", path, reading.holdout)
+        split = split_shots(path, len(train.c2w), reading.holdout)
+        train, val = (PosedViews(train.views[torch.tensor(part)], train.c2w[part]) for part in (split.train, split.val))
+    if reading.resize is not None:
+        train, val, test = (None if one is None else _resize(one, reading.resize) for one in (train, val, test))
+        assert train is not None and val is not None
+    path_poses = poses.get("c2ws_test") if "images_test" not in data else None
+    hints = Hints(
+        keep_frame=True,
+        path=None if path_poses is None else cameras(path_poses).resized(fit_size(width, height, reading.resize)),
+        background=checks.colour(path, "background", data["background"]) if "background" in data else None,
+        bounds=_bounds(path, data, reading),
+        to_source=checks.similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,
+        near=checks.number(path, "near", data["near"]) if "near" in data else None,
+        far=checks.number(path, "far", data["far"]) if "far" in data else None,
+    )
+    checks.near_far(path, hints.near, hints.far)
+    return assemble_scene(path, name or re.sub(r"_\d+x\d+$", "", path.stem).lower(), train, val, test, reading, hints)
+
+
+def _resize(posed: PosedViews, longest: int) -> PosedViews:
+    return replace(posed, views=resize_views(posed.views, longest))
+
+
+def _intrinsics(path: Path, data: dict[str, np.ndarray], width: int, height: int) -> Float[Tensor, "3 3"]:
+    """Of all views, pixels."""
     if "K" in data:
         K = checks.intrinsics(path, "K", data["K"], width, height)
-    else:
-        checks.require_keys(path, data, ["focal"])
-        focal = checks.positive(path, "focal", data["focal"])
-        checks.focal_length(path, "focal", focal, max(width, height))
-        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-
-    def cameras(key: str) -> Cameras:
-        poses = checks.told_apart(path, checks.rigid_poses(path, key + "[{}]", data[key]), K[:1, 0])
-        c2w = torch.from_numpy(poses).float()
-        return Cameras.of_size(torch.from_numpy(K).float().repeat(len(c2w), 1, 1), c2w, width, height)
-
-    def views(split: str) -> Views:
-        return Views.of(torch.from_numpy(images[f"images_{split}"]), cameras(f"c2ws_{split}"))
-
-    train, val = views("train"), views("val")
-    orbit = orbit_like(train.cameras)
-    if "c2ws_test" in data:
-        orbit = cameras("c2ws_test")
-
-    background = border_colour(train) or (0.0, 0.0, 0.0)
-    if "background" in data:
-        background = checks.colour(path, "background", data["background"])
-    to_source = torch.eye(4)
-    if "to_source" in data:
-        to_source = torch.from_numpy(checks.similarity(path, "to_source", data["to_source"])).float()
-    return Scene(
-        name=name or re.sub(r"_\d+x\d+$", "", path.stem).lower(),
-        source=str(path),
-        train=train,
-        val=val,
-        orbit=orbit,
-        bounds=_bounds(path, data, train, background),
-        background=background,
-        to_source=to_source,
-    )
+        checks.principal_point(path, "K", K[0, 2], K[1, 2], width, height)
+        return torch.from_numpy(K).float()
+    checks.require_keys(path, data, ["focal"])
+    focal = checks.positive(path, "focal", data["focal"])
+    checks.focal_length(path, "focal", focal, max(width, height))
+    return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
 
 def _compare(path: Path, headers: Headers) -> None:
     """Compares shapes, before anything is unpacked."""
     checks.require_keys(path, headers, NEEDED)
-    for key in ("images_train", "images_val"):
-        checks.image_array(path, key, headers[key])
-    for split in ("train", "val"):
-        key, poses = f"images_{split}", f"c2ws_{split}"
-        checks.pose_array(path, poses, headers[poses])
-        checks.split_size(path, key, headers[key].shape[0], headers[poses].shape[0])
-        checks.image_size(path, key, headers[key].shape[1:], headers["images_train"].shape[1:])
-    if "c2ws_test" in headers:
-        checks.pose_array(path, "c2ws_test", headers["c2ws_test"])
-        checks.split_size(path, "c2ws_test", headers["c2ws_test"].shape[0])
-    for key in set(headers) & set(OPTIONAL) - {"c2ws_test"}:
-        if headers[key].size > MOST_NUMBERS:
-            raise InputError(path, key, f"shape {headers[key].shape}", f"at most {MOST_NUMBERS} numbers")
+    for key, pose_key in PAIRS.items():
+        if pose_key in headers:
+            checks.pose_array(path, pose_key, headers[pose_key])
+            checks.split_size(path, pose_key, headers[pose_key].shape[0])
+        if key in headers:
+            checks.require_keys(path, headers, [pose_key])
+            checks.image_array(path, key, headers[key])
+            checks.split_size(path, key, headers[key].shape[0], headers[pose_key].shape[0])
+            checks.image_size(path, key, headers[key].shape[1:], headers["images_train"].shape[1:])
+    for key in set(headers) & set(SCALARS):
+        if headers[key].size > MAX_NUMBERS:
+            raise InputError(path, key, f"shape {headers[key].shape}", f"at most {MAX_NUMBERS} numbers")
 
 
-def _bounds(path: Path, data: dict[str, np.ndarray], train: Views, background: tuple[float, float, float]) -> Bounds:
-    near, far = (checks.number(path, key, data[key]) if key in data else None for key in ("near", "far"))
-    checks.near_far(path, near, far)
+def _bounds(path: Path, data: dict[str, np.ndarray], reading: Reading) -> Bounds | None:
+    """The box that a file states."""
     if "aabb" not in data:
-        return estimate_bounds(train, background, near, far)
+        return None
     aabb = torch.from_numpy(checks.box(path, "aabb", data["aabb"])).float()
-    unbounded = False
-    if "unbounded" in data:
-        flag = data["unbounded"]
-        if flag.shape != () or flag.dtype != bool:
-            raise InputError(path, "unbounded", f"{flag.dtype}", "one true or false")
-        unbounded = bool(flag)
-    return Bounds(aabb, unbounded, near, far)
+    flag = data.get("unbounded", np.array(False))
+    if flag.shape != () or flag.dtype != bool:
+        raise InputError(path, "unbounded", f"{flag.dtype}", "one true or false")
+    return Bounds(aabb, bool(flag) if reading.bounded == "auto" else reading.bounded == "false")
 
 
 def save_npz(scene: Scene, path: Path) -> None:

@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from nerf_lightning.dataset.formats.colmap import PLACED_FOLDER
 from nerf_lightning.dataset.placing.choose import FEWEST
 from nerf_lightning.dataset.placing.kept import find_kept, keep, made_of
 from nerf_lightning.dataset.placing.photos import find_photos
@@ -15,8 +16,8 @@ from nerf_lightning.utils.listing import first_few
 
 log = logging.getLogger(__name__)
 
-KEPT, MODEL = "placed", Path("sparse") / "0"
-"""The folder beside the photos, and the model in it."""
+MODEL = Path("sparse") / "0"
+"""The model in the folder beside the photos."""
 FILES = ("cameras.bin", "images.bin", "points3D.bin")
 SHOWN = 5
 """Names that a line tells at most."""
@@ -40,7 +41,9 @@ def place(folder: Path) -> Path:
     """
     photos = find_photos(folder, "dataset.path")
     sources = made_of(photos)
-    kept = find_kept(folder / KEPT, sources, lambda kept: all((kept / MODEL / file).is_file() for file in FILES))
+    kept = find_kept(
+        folder / PLACED_FOLDER, sources, lambda kept: all((kept / MODEL / file).is_file() for file in FILES)
+    )
     if kept is not None:
         log.info("%s: cameras as an earlier run placed them, in %s", folder, kept)
         return kept / MODEL
@@ -57,7 +60,7 @@ def place(folder: Path) -> Path:
         (empty / MODEL).mkdir(parents=True)
         model.write_binary(empty / MODEL)
 
-    target = keep(folder / KEPT, sources, fill)
+    target = keep(folder / PLACED_FOLDER, sources, fill)
     log.info("%s", _told(target, len(photos), [photo.name for photo in photos if photo.name not in placed]))
     return target / MODEL
 

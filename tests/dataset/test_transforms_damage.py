@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from nerf_lightning.dataset import load_nerfstudio
+from nerf_lightning.dataset import load_transforms
 from nerf_lightning.errors import InputError
-from tests.dataset.test_nerfstudio import INTRINSICS, H, W, change, opengl_pose, write
+from tests.dataset.test_transforms import INTRINSICS, H, W, change, opengl_pose, write
 
 
 @pytest.fixture
@@ -66,14 +66,14 @@ DAMAGE = {
     ),
     "folded over": (_top(k1=-3.0), "k1, k2, k3, p1, p2: found a distortion that folds the photo over"),
     "mask missing": (_first(mask_path="no.png"), "frames[0].mask_path: found 'no.png', which is not there"),
-    "width": (_top(w=161), "w: found 161, expected 160, the size of 0000.png"),
-    "height of a frame": (_first(h=1), "frames[0].h: found 1, expected 120"),
+    "width": (_top(w=181), "0000.png: found 160x120 pixels, expected 181x120, the size of its camera"),
+    "height of a frame": (_first(h=1), "0000.png: found 160x120 pixels, expected 160x1"),
     "image size": (
         lambda c: cv2.imwrite(str(c / "images/0004.png"), np.zeros((H, W + 9, 3), np.uint8)),
-        "w: found 160, expected 169, the size of 0004.png",
+        "0004.png: found 169x120 pixels, expected 160x120",
     ),
     "scaled pose": (
-        _first(transform_matrix=(opengl_pose(0) * [2, 2, 2, 1]).tolist()),
+        _first(transform_matrix=(opengl_pose(0) * [2, 1, 1, 1]).tolist()),
         "frames[0].transform_matrix: found R^T R that is 3 away from the identity",
     ),
     "unknown name": (_top(val_filenames=["images/x.png"]), "val_filenames: found 'images/x.png', which is no frame"),
@@ -82,7 +82,6 @@ DAMAGE = {
         _top(train_filenames=ALL, val_filenames=ALL[:1]),
         "val_filenames: found 'images/0000.png', which is in train_filenames too",
     ),
-    "nothing held out": (_top(val_filenames=[]), "val split: found 0 views"),
     "nothing to train on": (_top(val_filenames=ALL), "train split: found 0 views"),
     "one photo": (lambda c: change(c, lambda j: j.update(frames=j["frames"][:1])), "train split: found 0 views"),
 }
@@ -93,5 +92,5 @@ def test_damage(damage: str, capture: Path, says: Callable):
     spoil, words = DAMAGE[damage]
     spoil(capture)
     with pytest.raises(InputError) as caught:
-        load_nerfstudio(capture)
+        load_transforms(capture)
     says(caught.value, capture, words, ", expected ")

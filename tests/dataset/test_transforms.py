@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerf_lightning.cameras import focus_point, transform
-from nerf_lightning.dataset import Scene, load_nerfstudio
+from nerf_lightning.dataset import Scene, load_transforms
 from nerf_lightning.dataset.lens import Lens, rectify
 from nerf_lightning.dataset.shots import Reading
 from nerf_lightning.errors import InputError
@@ -77,7 +77,7 @@ def dot_error(scene: Scene) -> float:
 
 
 def test_plain_capture(capture: Path):
-    scene = load_nerfstudio(capture)
+    scene = load_transforms(capture)
     assert scene.name == "garden" and scene.resolution == (W, H)
     assert (len(scene.train), len(scene.val), len(scene.orbit)) == (10, 2, 60)
     first = cv2.imread(str(capture / "images/0000.png"))
@@ -94,17 +94,17 @@ def test_photos_without_a_plain_background_are_unbounded(capture: Path):
         cv2.imwrite(
             str(capture / f"images/{i:04d}.png"), np.random.default_rng(i).integers(0, 255, (H, W, 3), np.uint8)
         )
-    bounds = load_nerfstudio(capture).bounds
+    bounds = load_transforms(capture).bounds
     assert bounds.unbounded and bounds.aabb.tolist() == [[-1.0] * 3, [1.0] * 3]
 
 
 def test_file_or_folder_is_the_same(capture: Path):
-    by_file = load_nerfstudio(capture / "transforms.json")
-    assert by_file.name == "garden" and by_file.sha256() == load_nerfstudio(capture).sha256()
+    by_file = load_transforms(capture / "transforms.json")
+    assert by_file.name == "garden" and by_file.sha256() == load_transforms(capture).sha256()
 
 
 def test_scene_is_normalised_and_to_source_leads_back(capture: Path):
-    scene = load_nerfstudio(capture)
+    scene = load_transforms(capture)
     train = scene.train.cameras
     torch.testing.assert_close(focus_point(train.c2w), torch.zeros(3), atol=1e-5, rtol=0)
     torch.testing.assert_close(train.centres.norm(dim=-1).median(), torch.tensor(1.0))
@@ -114,11 +114,11 @@ def test_scene_is_normalised_and_to_source_leads_back(capture: Path):
 
 
 def test_a_known_point_is_seen_at_its_dot(capture: Path):
-    assert dot_error(load_nerfstudio(capture)) < 0.02
+    assert dot_error(load_transforms(capture)) < 0.02
 
 
 def test_resize(capture: Path):
-    scene = load_nerfstudio(capture, reading=Reading(resize=80))
+    scene = load_transforms(capture, reading=Reading(resize=80))
     assert scene.resolution == (80, 60) and dot_error(scene) < 0.02
 
 
@@ -127,7 +127,7 @@ def test_resize(capture: Path):
 def test_distortion_is_followed_or_undone(sign: int, undistort: bool, tmp_path: Path):
     lens = {key: sign * value for key, value in LENS.items()}
     folder = write(tmp_path / "capture", {**INTRINSICS, **lens})
-    scene = load_nerfstudio(folder, reading=Reading(undistort=undistort))
+    scene = load_transforms(folder, reading=Reading(undistort=undistort))
     assert dot_error(scene) < 0.05 and (scene.train.cameras.lenses is None) == undistort
 
 
@@ -150,7 +150,7 @@ def test_frames_may_have_lenses_of_their_own(tmp_path: Path):
     def own(i: int) -> dict:
         return {"fl_x": 130.0 + i, "cx": 80.0 + i, "k1": 0.02 * i}
 
-    scene = load_nerfstudio(write(tmp_path / "capture", INTRINSICS, per_frame=own))
+    scene = load_transforms(write(tmp_path / "capture", INTRINSICS, per_frame=own))
     assert len(set(scene.train.cameras.K[:, 0, 0].tolist())) == 10
     assert dot_error(scene) < 0.05
 
@@ -159,7 +159,7 @@ def test_field_of_view_instead_of_focal(capture: Path):
     intrinsics = {"camera_angle_x": 2 * np.arctan(0.5 * W / 140)}
     content = json.loads((capture / "transforms.json").read_text())
     (capture / "transforms.json").write_text(json.dumps({**intrinsics, "frames": content["frames"]}))
-    K = load_nerfstudio(capture).train.cameras.K[0]
+    K = load_transforms(capture).train.cameras.K[0]
     torch.testing.assert_close(K, torch.tensor([[140.0, 0, W / 2], [0, 140, H / 2], [0, 0, 1]]))
 
 
@@ -174,13 +174,13 @@ def change(capture: Path, edit: Callable[[dict], object]) -> None:
 def test_split_by_name(capture: Path):
     names = [f"images/{i:04d}.png" for i in range(12)]
     change(capture, lambda c: c.update(train_filenames=names[3:], val_filenames=names[1:3]))
-    scene = load_nerfstudio(capture)
+    scene = load_transforms(capture)
     assert (len(scene.train), len(scene.val)) == (9, 2)
     assert (scene.val.images[1].numpy() == cv2.imread(str(capture / "images/0002.png"))).all()
 
 
 def test_what_nerfstudio_turned_is_turned_back(capture: Path):
-    before = load_nerfstudio(capture)
+    before = load_transforms(capture)
     turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 2]])
     whole = np.concatenate([turn, [[0, 0, 0, 1]]])
 
@@ -190,7 +190,7 @@ def test_what_nerfstudio_turned_is_turned_back(capture: Path):
             frame["transform_matrix"] = (whole @ np.array(frame["transform_matrix"])).tolist()
 
     change(capture, apply)
-    after = load_nerfstudio(capture)
+    after = load_transforms(capture)
     torch.testing.assert_close(after.to_source, before.to_source, atol=1e-5, rtol=0)
     torch.testing.assert_close(after.train.cameras.c2w, before.train.cameras.c2w, atol=1e-5, rtol=0)
 
@@ -201,14 +201,14 @@ def test_a_mask_of_a_frame(capture: Path, caplog: pytest.LogCaptureFixture):
     cv2.imwrite(str(capture / "mask.png"), mask)
     change(capture, lambda c: c["frames"][1].update(mask_path="mask.png", depth_file_path="depth.png"))
     with caplog.at_level(logging.INFO):
-        scene = load_nerfstudio(capture, reading=Reading(masked="unknown"))
-    assert "depth_file_path is not used" in caplog.text
+        scene = load_transforms(capture, reading=Reading(masked="unknown"))
+    assert "keys that are not used: depth_file_path" in caplog.text
     assert torch.equal(scene.train.mask_of(0), torch.from_numpy(mask > 0)) and scene.train.mask_of(1).all()
 
 
 def test_a_fisheye_of_a_frame(tmp_path: Path):
     lens = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": -0.001}
-    scene = load_nerfstudio(write(tmp_path / "capture", INTRINSICS, per_frame=lambda i: lens if i == 3 else {}))
+    scene = load_transforms(write(tmp_path / "capture", INTRINSICS, per_frame=lambda i: lens if i == 3 else {}))
     lenses = scene.train.cameras.lenses
     assert lenses is not None and lenses.fisheye.sum() == 1
     which = int(lenses.fisheye.int().argmax())
@@ -216,26 +216,26 @@ def test_a_fisheye_of_a_frame(tmp_path: Path):
 
 
 def test_holdout_counts(capture: Path):
-    scene = load_nerfstudio(capture, reading=Reading(holdout=5))
+    scene = load_transforms(capture, reading=Reading(holdout=5))
     assert (len(scene.train), len(scene.val)) == (9, 3)
-    assert len(load_nerfstudio(capture, reading=Reading(holdout=100)).val) == 1
+    assert len(load_transforms(capture, reading=Reading(holdout=100)).val) == 1
     with pytest.raises(InputError, match="holdout: found 1"):
         Reading(holdout=1)
     change(capture, lambda c: c.update(frames=c["frames"][:2]))
-    scene = load_nerfstudio(capture)
+    scene = load_transforms(capture)
     assert (len(scene.train), len(scene.val)) == (1, 1), "two photos: one to learn from"
 
 
 def test_missing_extensions_are_found(capture: Path):
     change(capture, lambda c: [f.update(file_path=f["file_path"].removesuffix(".png")) for f in c["frames"]])
-    assert len(load_nerfstudio(capture).train) == 10
+    assert len(load_transforms(capture).train) == 10
 
 
 def test_some_missing_photos_are_left_out_with_a_warning(capture: Path, caplog: pytest.LogCaptureFixture):
     for i in (3, 4, 7):
         (capture / f"images/{i:04d}.png").unlink()
     with caplog.at_level(logging.WARNING):
-        scene = load_nerfstudio(capture)
+        scene = load_transforms(capture)
     assert (len(scene.train), len(scene.val)) == (7, 2)
     # Poses stay with their photos: the dots still agree.
     assert dot_error(scene) < 0.02
@@ -246,7 +246,7 @@ def test_alpha_makes_a_bounded_scene(capture: Path):
     for i in range(12):
         at = seen_at(opengl_pose(0.5 * i), INTRINSICS, POINT)
         cv2.imwrite(str(capture / f"images/{i:04d}.png"), dot(at, 4))
-    scene = load_nerfstudio(capture)
+    scene = load_transforms(capture)
     assert scene.train.channels == 4 and not scene.bounds.unbounded
     centre = transform(scene.to_source, scene.bounds.centre)
     np.testing.assert_allclose(centre, POINT, atol=0.15)
@@ -254,7 +254,7 @@ def test_alpha_makes_a_bounded_scene(capture: Path):
 
 @pytest.mark.real_data
 def test_fox(real_data: Path):
-    scene = load_nerfstudio(real_data / "fox", reading=Reading(resize=120))
+    scene = load_transforms(real_data / "fox", reading=Reading(resize=120))
     assert scene.name == "fox" and (len(scene.train), len(scene.val)) == (43, 7)
     assert scene.resolution == (68, 120) and scene.bounds.unbounded
     # The head hangs between the cameras and what they look at is in view of all of them.
