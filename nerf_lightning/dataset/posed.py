@@ -119,6 +119,7 @@ def build_scene(
     checks.split_size(source, "val split", len(split.val))
     poses = np.stack([shot.c2w for shot in shots])
     views = read_shots(source, shots, reading)
+    check_visible(source, views)
 
     def take(part: list[int]) -> PosedViews:
         return PosedViews(views[torch.tensor(part, dtype=torch.long)], poses[part])

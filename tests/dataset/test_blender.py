@@ -77,6 +77,43 @@ def test_rgb_renders_with_borders_of_one_colour_are_bounded(border: int | None, 
     assert scene.bounds.unbounded is (border is None)
 
 
+def edit_all(folder: Path, **keys: object) -> None:
+    for path in folder.glob("transforms_*.json"):
+        path.write_text(json.dumps({**json.loads(path.read_text()), **keys}))
+
+
+def test_intrinsics_in_pixels_go_before_the_angle_of_view(folder: Path):
+    edit_all(folder, fl_x=11.0, fl_y=12.0, cx=3.5, cy=2.5, k1=-0.01, w=8, h=6)
+    cameras = load_blender(folder).train.cameras
+    torch.testing.assert_close(cameras.K[0], torch.tensor([[11.0, 0, 3.5], [0, 12, 2.5], [0, 0, 1]]))
+    assert cameras.lenses.coefficients[0, 0] == pytest.approx(-0.01)
+    edit_all(folder, camera_angle_x=None)
+    torch.testing.assert_close(load_blender(folder).train.cameras.K, cameras.K)
+
+
+def test_a_split_without_photos_is_a_camera_path(folder: Path):
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 2, 3] = 3, 4, 5
+    write_split(folder, "test", np.zeros((3, 6, 8, 4), np.uint8), poses)
+    for file in (folder / "test").iterdir():
+        file.unlink()
+    scene = load_blender(folder)
+    assert scene.test is None and scene.orbit.c2w[:, 2, 3].tolist() == [3, 4, 5]
+    assert scene.orbit.size(0) == (8, 6)
+
+
+def test_test_photos_beside_val_are_kept_apart(folder: Path):
+    write_split(folder, "test", make_images(), np.stack([np.eye(4)] * 3))
+    scene = load_blender(folder)
+    assert (len(scene.train), len(scene.val), len(scene.test)) == (2, 1, 3)
+
+
+def test_some_training_photos_are_held_out_where_no_others_are_there(folder: Path, caplog: pytest.LogCaptureFixture):
+    (folder / "transforms_val.json").unlink()
+    scene = load_blender(folder)
+    assert (len(scene.train), len(scene.val)) == (1, 1) and "no held-out photos" in caplog.text
+
+
 def test_renders_of_several_sizes(folder: Path):
     imageio.imwrite(folder / "train" / "r_1.png", np.full((12, 16, 4), 7, np.uint8))
     cameras = load_blender(folder).train.cameras

@@ -226,3 +226,42 @@ def test_a_lens_whose_rays_do_not_lead_back_is_none(focal: float, distortion: Di
 @pytest.mark.parametrize(("focal", "k1"), [(1e5, -0.2), (1e5, 900.0), (4000.0, 0.1), (6000.0, -0.3)])
 def test_a_strong_lens_on_a_small_sensor_is_one(focal: float, k1: float):
     assert Optics(6000, 4000, focal, focal, 3000, 2000, Distortion(k1=k1)).sees_every_pixel()
+
+
+VARIANTS: dict[str, tuple[str, str, str, str]] = {
+    "reduced photos alone": ("sparse/0", "images_4", "{:04d}.png", "{:04d}.png"),
+    "two spaces": ("sparse/0", "images", "my  photo {:d}.png", "my  photo {:d}.png"),
+    "undistorted below dense/0": ("dense/0/sparse", "dense/0/images", "{:04d}.png", "{:04d}.png"),
+    "upper case": ("sparse/0", "images", "{:04d}.PNG", "{:04d}.png"),
+    "another machine": ("sparse/0", "images", "/home/me/images/{:04d}.png", "{:04d}.png"),
+    "Windows": ("sparse/0", "images", "cam0\\{:04d}.png", "cam0/{:04d}.png"),
+    "photos elsewhere": ("sparse/0", "pictures", "{:04d}.png", "{:04d}.png"),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_layouts_and_names_of_other_programs(variant: str, views: Views, tmp_path: Path):
+    model, folder, stated, stored = VARIANTS[variant]
+    expected = open_scene(str(colmap(tmp_path / "plain", views)))
+    for i in range(len(views)):
+        image = views.image(i).numpy()
+        image = image[::4, ::4] if folder == "images_4" else image
+        file = tmp_path / "s" / folder / stored.format(i)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        imageio.imwrite(file, image)
+    names = [stated.format(i) for i in range(len(views))]
+    write_colmap(tmp_path / "s" / model, views.cameras.c2w.numpy(), names, cameras_of(views), text=True)
+    scene = open_scene(str(tmp_path / "s"))
+    assert scene.name == "s" and len(scene.train) == len(expected.train)
+    torch.testing.assert_close(scene.train.cameras.centres.sort(0)[0], expected.train.cameras.centres.sort(0)[0])
+    factor = 4 if folder == "images_4" else 1
+    assert float(scene.train.cameras.K[0, 0, 0]) == pytest.approx(float(expected.train.cameras.K[0, 0, 0]) / factor)
+    if factor == 1 and "spaces" not in variant:
+        assert torch.equal(scene.train.image(0), expected.train.image(0))
+
+
+def test_several_scenes_in_a_folder_are_ambiguous(views: Views, tmp_path: Path):
+    for name in ("a", "b"):
+        colmap(tmp_path / name, views)
+    with pytest.raises(InputError, match="several COLMAP models: a/sparse/0, b/sparse/0, expected one"):
+        open_scene(str(tmp_path))

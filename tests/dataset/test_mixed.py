@@ -104,6 +104,44 @@ def test_masks_beside_photos_are_found(ending: str, views: Views, tmp_path: Path
     assert agreement > 0.97 if ending == ".jpg" else agreement == 1
 
 
+def write_subfolders(folder: Path, views: Views, masked: tuple[str, ...]) -> Path:
+    """Two cameras, whose photos have the same names in folders of their own; a mask leaves column 5 or 9 out."""
+    columns = {"front": 5, "back": 9}
+    names = []
+    for camera, column in columns.items():
+        for i in range(len(views) // 2):
+            names.append(f"{camera}/{i:04d}.png")
+            image = np.random.default_rng(i).integers(0, 255, (40, 48, 3), dtype=np.uint8)
+            (folder / "images" / camera).mkdir(parents=True, exist_ok=True)
+            imageio.imwrite(folder / "images" / names[-1], image)
+            if camera in masked:
+                mask = np.full((40, 48), 255, np.uint8)
+                mask[:, column] = 0
+                (folder / "masks" / camera).mkdir(parents=True, exist_ok=True)
+                imageio.imwrite(folder / "masks" / names[-1], mask)
+    write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
+    return folder
+
+
+def test_masks_of_equal_names_go_to_the_photos_of_their_folder(views: Views, tmp_path: Path):
+    scene = open_scene(str(write_subfolders(tmp_path / "both", views, ("front", "back"))))
+    for part in (scene.train, scene.val):
+        for view, name in enumerate(part.names):
+            hidden = 9 if name.startswith("back") else 5
+            assert (~part.mask_of(view)).nonzero()[:, 1].unique().tolist() == [hidden], name
+    half = open_scene(str(write_subfolders(tmp_path / "half", views, ("front",))))
+    hidden = {name.split("/")[0]: int((~half.train.mask_of(view)).sum()) for view, name in enumerate(half.train.names)}
+    assert hidden == {"back": 0, "front": 40}, "the other camera's masks are not taken"
+
+
+def test_one_mask_for_two_photos_is_ambiguous(views: Views, tmp_path: Path):
+    folder = write_subfolders(tmp_path, views, ())
+    (folder / "masks").mkdir()
+    imageio.imwrite(folder / "masks/0000.png", np.full((40, 48), 255, np.uint8))
+    with pytest.raises(InputError, match="masks/0000.png: found one mask for back/0000.png and front/0000.png"):
+        open_scene(str(folder))
+
+
 def test_masks_of_another_size_and_inverted_ones(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     folder = capture(tmp_path, views)
     write_masks(folder / "masks", views, side=2, invert=True)

@@ -76,6 +76,19 @@ def test_K_near_far_and_box_come_from_the_file(left_out: str | None, arrays: Arr
     assert (scene.bounds.near, scene.bounds.far) == (2.0, 6.0)
 
 
+def test_splits_of_own_files(arrays: Arrays, path: Path):
+    """Test photos count apart from val, or instead of it; without both, some training photos are held out."""
+    test = {"images_test": arrays["images_train"], "c2ws_test": arrays["c2ws_train"]}
+    np.savez(path, **arrays, **test)
+    scene = load_npz(path)
+    assert (len(scene.train), len(scene.val), len(scene.test)) == (2, 1, 2)
+    train = {key: value for key, value in arrays.items() if "val" not in key}
+    np.savez(path, **train, **test)
+    assert (len(load_npz(path).val), load_npz(path).test) == (2, None)
+    np.savez(path, **train)
+    assert (len(load_npz(path).train), len(load_npz(path).val)) == (1, 1)
+
+
 def test_float_images_become_bytes(arrays: Arrays, path: Path):
     exact = arrays["images_train"]
     np.savez(path, **{**arrays, "images_train": exact.astype(np.float32) / 255})

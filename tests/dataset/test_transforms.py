@@ -260,3 +260,105 @@ def test_fox(real_data: Path):
     # The head hangs between the cameras and what they look at is in view of all of them.
     seen = [bool(scene.train.cameras.project(torch.zeros(1, 3), view)[2]) for view in range(len(scene.train))]
     assert np.mean(seen) > 0.9
+
+
+def test_every_key_of_the_geometry_undoes_what_nerfstudio_did(capture: Path):
+    """`applied_scale`, after `applied_transform`: exports have the capture's unit."""
+    before = load_transforms(capture)
+    turn = np.array([[0.0, 1, 0, 0.5], [1, 0, 0, 0], [0, 0, -1, 2]])
+    whole = np.concatenate([turn, [[0, 0, 0, 1]]])
+
+    def apply(content: dict) -> None:
+        content.update(applied_transform=turn.tolist(), applied_scale=0.1)
+        for frame in content["frames"]:
+            matrix = whole @ np.array(frame["transform_matrix"])
+            matrix[:3, 3] *= 0.1
+            frame["transform_matrix"] = matrix.tolist()
+
+    change(capture, apply)
+    after = load_transforms(capture)
+    torch.testing.assert_close(after.to_source, before.to_source, atol=1e-5, rtol=0)
+    torch.testing.assert_close(after.train.cameras.c2w, before.train.cameras.c2w, atol=1e-5, rtol=0)
+
+
+def test_a_uniform_scale_in_rotations_is_divided_out(capture: Path, caplog: pytest.LogCaptureFixture):
+    before = load_transforms(capture)
+
+    def scale(content: dict) -> None:
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, :3] *= 0.33
+            frame["transform_matrix"] = matrix.tolist()
+
+    change(capture, scale)
+    with caplog.at_level(logging.WARNING):
+        after = load_transforms(capture)
+    assert "12 of 12 rotations carry a uniform scale, such as 0.33: divided out" in caplog.text
+    torch.testing.assert_close(after.train.cameras.c2w, before.train.cameras.c2w, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_photos_at_a_fraction_of_the_stated_size_keep_their_angle_of_view(factor: int, capture: Path):
+    before = load_transforms(capture)
+    for file in (capture / "images").iterdir():
+        image = cv2.imread(str(file))
+        cv2.imwrite(str(file), cv2.resize(image, (W // factor, H // factor), interpolation=cv2.INTER_AREA))
+    after = load_transforms(capture)
+    assert after.resolution == (W // factor, H // factor)
+    expected = before.train.cameras.K[0] / torch.tensor([[factor], [factor], [1.0]])
+    torch.testing.assert_close(after.train.cameras.K[0], expected)
+    assert dot_error(after) < 0.1
+
+
+def test_intrinsics_of_larger_photos_are_refused_where_no_size_is_stated(capture: Path):
+    change(capture, lambda c: [c.pop("w"), c.pop("h"), c.update(fl_x=560, fl_y=600, cx=332, cy=224)])
+    with pytest.raises(InputError, match="the middle of photos 4.15 times as large as these"):
+        load_transforms(capture)
+
+
+def test_numbers_as_text_other_encodings_and_3x4_matrices_are_read(capture: Path):
+    before = load_transforms(capture)
+
+    def rewrite(content: dict) -> None:
+        content["fl_x"] = str(content["fl_x"])
+        for frame in content["frames"]:
+            frame["transform_matrix"] = frame["transform_matrix"][:3]
+
+    change(capture, rewrite)
+    path = capture / "transforms.json"
+    path.write_bytes(path.read_text().encode("utf-16"))
+    after = load_transforms(capture)
+    assert torch.equal(after.train.cameras.K, before.train.cameras.K)
+    assert torch.equal(after.train.cameras.c2w, before.train.cameras.c2w)
+
+
+def test_a_test_split_beside_val_is_kept_apart(capture: Path):
+    names = [f"./images/{i:04d}.png" for i in range(12)]
+    change(capture, lambda c: c.update(train_filenames=names[4:], val_filenames=names[:1], test_filenames=names[1:4]))
+    scene = load_transforms(capture)
+    assert (len(scene.train), len(scene.val), len(scene.test)) == (8, 1, 3)
+    assert scene.test.names == ("images/0001.png", "images/0002.png", "images/0003.png")
+
+
+REFUSED = {
+    "degrees": ({"fl_x": None, "camera_angle_x": 62.0}, "it seems to be in degrees: write 1.0821"),
+    "rolling shutter": ({"rolling_shutter": [0, 0, 0.03, 0]}, "rolling_shutter: found"),
+    "F-theta lens": ({"ftheta_p1": 0.3}, "ftheta_p1: found 0.3"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_keys_that_bend_rays_otherwise_are_refused(case: str, capture: Path):
+    keys, words = REFUSED[case]
+    change(capture, lambda c: c.update(keys))
+    with pytest.raises(InputError, match=words):
+        load_transforms(capture)
+
+
+def test_unknown_keys_are_listed_once(capture: Path, caplog: pytest.LogCaptureFixture):
+    change(
+        capture, lambda c: [c.update(rolling_shutter=[0, 0, 0, 0], mystery=1), [f.update(hue=2) for f in c["frames"]]]
+    )
+    with caplog.at_level(logging.INFO):
+        load_transforms(capture)
+    assert caplog.text.count("keys that are not used: hue, mystery") == 1

@@ -111,7 +111,7 @@ def principal_point(where: object, key: str, cx: float, cy: float, width: float,
         InputError: it lies as many times farther than the middle along both axes.
     """
     across, down = 2 * cx / width, 2 * cy / height
-    if min(across, down) > 1.8 and abs(across / down - 1) < 0.1:
+    if min(across, down) > 1.8 and abs(across / down - 1) < 0.25:
         found = f"{cx:g}, {cy:g}, the middle of photos {across:.3g} times as large as these, of {width:g}x{height:g}"
         raise InputError(where, key, found, "intrinsics of these photos", "give w and h of the photos they belong to")
 

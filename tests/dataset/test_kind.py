@@ -1,0 +1,143 @@
+"""What is bounded is decided by the photos, the same for every file format."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.cameras import in_other_frame
+from nerf_lightning.dataset import Reading, Scene, Views, open_scene, save_npz
+from nerf_lightning.errors import InputError
+from tests.dataset.colmap_files import cameras_of, photos, write_colmap, write_llff, write_transforms
+
+FORMATS = ("npz", "blender", "transforms", "colmap", "llff")
+
+
+@pytest.fixture(scope="session")
+def ball_views(ball_views_of: Callable[..., Views]) -> Views:
+    return ball_views_of(4)
+
+
+def write_scene(format: str, folder: Path, views: Views) -> Path:
+    """All views in a format; the first three are held out where it has a split."""
+    folder.mkdir(exist_ok=True)
+    focal, (width, _) = float(views.cameras.K[0, 0, 0]), views.cameras.size(0)
+    if format == "npz":
+        images, c2w = views.images.numpy(), views.cameras.c2w.numpy()
+        np.savez(
+            folder / "s.npz",
+            images_train=images[3:],
+            c2ws_train=c2w[3:],
+            images_val=images[:3],
+            c2ws_val=c2w[:3],
+            focal=focal,
+        )
+        return folder / "s.npz"
+    names = photos(folder / "images", views)
+    if format == "colmap":
+        write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
+    elif format == "llff":
+        write_llff(folder / "poses_bounds.npy", views)
+    elif format == "transforms":
+        write_transforms(folder / "transforms.json", views, [f"images/{name}" for name in names])
+    else:
+        opengl = (views.cameras.c2w * torch.tensor([1.0, -1, -1, 1])).tolist()
+        frames = [{"file_path": f"images/{n[:-4]}", "transform_matrix": m} for n, m in zip(names, opengl, strict=True)]
+        for split, part in (("train", frames[3:]), ("val", frames[:3])):
+            content = {"camera_angle_x": 2 * float(np.arctan(0.5 * width / focal)), "frames": part}
+            (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+    return folder
+
+
+def with_background(views: Views, alpha: int | None) -> Views:
+    """On noise, without alpha or with one that is the same everywhere."""
+    noise = torch.randint(0, 255, (len(views.pixels), 3), generator=torch.Generator().manual_seed(0))
+    rgb = torch.where(views.pixels[:, 3:] > 0, views.pixels[:, :3], noise).to(torch.uint8)
+    if alpha is None:
+        return replace(views, pixels=rgb)
+    return replace(views, pixels=torch.cat([rgb, torch.full_like(rgb[:, :1], alpha)], dim=1))
+
+
+def on_colour(views: Views, colour: int) -> Views:
+    alpha = views.pixels[:, 3:].float() / 255
+    return replace(views, pixels=(views.pixels[:, :3] * alpha + colour * (1 - alpha)).round().to(torch.uint8))
+
+
+def with_margin(views: Views) -> Views:
+    """A background, and transparent margins as undistorting leaves them."""
+    views = with_background(views, 255)
+    for view in range(len(views)):
+        views.image(view)[[0, -1], :, 3] = 0
+        views.image(view)[:, [0, -1], 3] = 0
+    return views
+
+
+SHOWN: dict[str, tuple[Callable[[Views], Views], bool, int, str]] = {
+    "cut out": (lambda views: views, True, 4, "alpha cuts the subject out"),
+    "on grey": (lambda views: on_colour(views, 90), True, 3, "borders have one colour"),
+    "background": (lambda views: with_background(views, None), False, 3, "show a background"),
+    "opaque alpha": (lambda views: with_background(views, 255), False, 3, "show a background"),
+    "margins": (with_margin, False, 3, "show a background"),
+}
+
+
+@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("shown", SHOWN)
+def test_every_format_is_decided_alike(shown: str, format: str, ball_views: Views, tmp_path: Path):
+    edit, bounded, channels, reason = SHOWN[shown]
+    scene = open_scene(str(write_scene(format, tmp_path / "s", edit(ball_views))))
+    assert scene.bounds.unbounded is not bounded and scene.train.channels == channels
+    assert reason in scene.describe()["kind"] and scene.describe()["bounded"] is bounded
+    if shown == "on grey":
+        assert scene.background == pytest.approx((90 / 255,) * 3)
+    if shown == "margins":
+        assert torch.equal(scene.train.mask_of(0), with_margin(ball_views).image(3)[..., 3] == 255) or format not in (
+            "npz",
+            "blender",
+        )
+        assert not scene.train.mask_of(0)[0].any() and scene.train.mask_of(0)[1:-1, 1:-1].all()
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_all_formats_of_a_place_give_one_frame(format: str, ball_views: Views, tmp_path: Path):
+    views = with_background(ball_views, None)
+    scene = open_scene(str(write_scene(format, tmp_path / "s", views)))
+    assert float(scene.train.cameras.centres.norm(dim=1).median()) == pytest.approx(1, rel=0.02)
+    torch.testing.assert_close(scene.bounds.aabb, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    first = 3 if format in ("npz", "blender") else 1
+    back = in_other_frame(scene.train.cameras.c2w[:1], scene.to_source)[0].float()
+    torch.testing.assert_close(back, views.cameras.c2w[first], atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_user_may_know_better(format: str, ball_views: Views, tmp_path: Path):
+    path = str(write_scene(format, tmp_path / "s", with_background(ball_views, None)))
+    scene = open_scene(path, reading=Reading(bounded="true"))
+    assert not scene.bounds.unbounded and scene.kind == "dataset.bounded=true"
+    cut = str(write_scene(format, tmp_path / "t", ball_views))
+    assert open_scene(cut, reading=Reading(bounded="false")).bounds.unbounded
+    with pytest.raises(InputError, match="dataset.bounded: found 'maybe', expected auto, true or false"):
+        Reading(bounded="maybe")
+
+
+def test_nothing_visible_is_refused(ball_views: Views, tmp_path: Path):
+    hidden = replace(ball_views, pixels=ball_views.pixels * torch.tensor([1, 1, 1, 0], dtype=torch.uint8))
+    with pytest.raises(InputError, match="alpha is 0 everywhere"):
+        open_scene(str(write_scene("transforms", tmp_path / "a", hidden)))
+    folder = write_scene("transforms", tmp_path / "b", with_background(ball_views, None))
+    for i in range(12):
+        (folder / "masks").mkdir(exist_ok=True)
+        imageio.imwrite(folder / f"masks/{i:04d}.png", np.zeros((40, 48), np.uint8))
+    with pytest.raises(InputError, match="masks"):
+        open_scene(str(folder))
+
+
+def test_a_stated_box_rules(ball: Scene, tmp_path: Path):
+    save_npz(replace(ball, bounds=replace(ball.bounds, unbounded=True)), tmp_path / "s.npz")
+    scene = open_scene(str(tmp_path / "s.npz"))
+    assert scene.bounds.unbounded and torch.equal(scene.bounds.aabb, ball.bounds.aabb) and "box" in scene.kind

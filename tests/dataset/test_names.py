@@ -1,0 +1,80 @@
+"""Names in scene files, and the files on disk that they mean."""
+
+import logging
+import unicodedata
+from pathlib import Path
+
+import pytest
+
+from nerf_lightning.dataset.formats.names import ImageFinder
+from nerf_lightning.errors import InputError
+
+
+def make_files(root: Path, *names: str) -> Path:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b"")
+    return root
+
+
+def find(root: Path, name: str) -> Path | None:
+    return ImageFinder(root).find(name, "file", "key")
+
+
+FOUND = {
+    "exact": ("images/a.png", "images/a.png"),
+    "without extension": ("images/a", "images/a.png"),
+    "dot": ("./images/a", "images/a.png"),
+    "backslashes": (".\\images\\a.png", "images/a.png"),
+    "other machine": ("/home/someone/scene/images/a.png", "images/a.png"),
+    "other system": ("C:\\scans\\scene\\images\\a.png", "images/a.png"),
+    "case": ("Images/A.PNG", "images/a.png"),
+    "extension": ("images/a.jpg", "images/a.png"),
+    "other folder": ("photos/a.png", "images/a.png"),
+    "two spaces": ("images/b  c.png", "images/b  c.png"),
+    "composed": (unicodedata.normalize("NFC", "images/café.png"), unicodedata.normalize("NFD", "images/café.png")),
+    "nothing": ("images/z.png", None),
+    "number": ("images/1", None),
+}
+
+
+@pytest.mark.parametrize("case", FOUND)
+def test_names_mean_the_one_file_that_fits(case: str, tmp_path: Path):
+    cafe = unicodedata.normalize("NFD", "images/café.png")
+    others = ("images/._a.png", "images/.DS_Store", "masks/a.png", "images_4/a.png", "images/10.png")
+    root = make_files(tmp_path, "images/a.png", "images/b  c.png", cafe, *others)
+    name, expected = FOUND[case]
+    assert find(root, name) == (None if expected is None else root / expected)
+
+
+def test_folders_decide_between_files_of_one_name(tmp_path: Path):
+    root = make_files(tmp_path, "images/front/0.png", "images/back/0.png")
+    assert find(root, "/data/Front/0.PNG") == root / "images/front/0.png"
+    with pytest.raises(
+        InputError, match=r"file: key: found '0\.jpg', which may mean 2 files: images/back/0\.png, images/front"
+    ):
+        find(root, "0.jpg")
+
+
+def test_reduced_copies_count_where_nothing_else_has_the_name(tmp_path: Path):
+    assert find(make_files(tmp_path, "images_4/0.png", "masks/1.png"), "images/0.png") == tmp_path / "images_4/0.png"
+
+
+def test_a_file_is_taken_for_one_name(tmp_path: Path):
+    """Test poses whose photos are not there must not take the training photos of the same numbers."""
+    finder = ImageFinder(make_files(tmp_path, "images_train/1.png"))
+    assert finder.find("images_train/1.png", "train", "") == tmp_path / "images_train/1.png"
+    assert finder.find("images_test/1.png", "test", "") is None
+    moved = ImageFinder(tmp_path)
+    assert moved.find("images_test/1.png", "test", "") == tmp_path / "images_train/1.png"
+    with pytest.raises(InputError, match="'images_test/1.png' and 'images_train/1.png', of which only"):
+        moved.find("images_train/1.png", "train", "")
+
+
+def test_substitutions_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    finder = ImageFinder(make_files(tmp_path, "a.png", "b.png", "c.png"))
+    for name in ("a.PNG", "b.PNG", ".\\c.png"):
+        finder.find(name, "file", "key")
+    with caplog.at_level(logging.WARNING):
+        finder.report("file")
+    assert len(caplog.records) == 1 and "2 names" in caplog.text and "a.png for 'a.PNG'" in caplog.text
