@@ -99,5 +99,9 @@ def check_visible(source: object, views: Views) -> None:
         raise InputError(source, "", "training photos whose alpha is 0 everywhere", "photos that show something")
     if views.known is not None and not len(views.known):
         raise InputError(
-            source, "", "masks that leave out every pixel", "photos of which something is known", "invert?"
+            source,
+            "",
+            "masks that leave out every pixel",
+            "photos of which something is known",
+            "dataset.invert_masks=true?",
         )
