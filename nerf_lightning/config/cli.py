@@ -19,7 +19,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
 from nerf_lightning.config.keys import check_keys, without_nulls
-from nerf_lightning.config.renames import rename_given, renamed_overrides
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leave, listen
 from nerf_lightning.utils.files import full_disk, no_room, output_path, remove_empty, user_path
@@ -126,7 +125,6 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
         nonlocal started
         started = True
         try:
-            rename_given(cfg)
             check_keys(cfg, config, HydraConfig.get().runtime.choices)
             return task(cfg)
         except (Exception, Interrupted) as error:
@@ -142,7 +140,7 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     try:
         check_flags(sys.argv[1:])
         given = to_folders(without_nulls(by_path(sys.argv[1:], conf_dir())))
-        sys.argv[1:] = renamed_overrides(quoted(given, texts))
+        sys.argv[1:] = quoted(given, texts)
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
     except Exception as error:
         # Before the task starts only Hydra is at work, on the command line: any error then is bad input.

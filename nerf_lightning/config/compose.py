@@ -8,14 +8,12 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
 from nerf_lightning.config.keys import check_keys, without_nulls
-from nerf_lightning.config.renames import rename_given, renamed_overrides
 
 
 def composed(overrides: list[str], folder: Path, config: str = "config") -> DictConfig:
     """The configuration that a command line would give to the verb `config`, with `folder` as the run's."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose(config, renamed_overrides(without_nulls(overrides)), return_hydra_config=True)
-    rename_given(cfg)
+        cfg = compose(config, without_nulls(overrides), return_hydra_config=True)
     with open_dict(cfg):
         cfg.hydra.runtime.output_dir = str(folder)
     HydraConfig.instance().set_config(cfg)

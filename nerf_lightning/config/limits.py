@@ -22,7 +22,7 @@ class Limits:
 
 
 def limits_of(cfg: DictConfig, device: torch.device) -> Limits:
-    """A run's own limits, or else the defaults of its device; runs of earlier versions have none.
+    """A run's own limits, or else the defaults of its device.
 
     Raises:
         InputError: for an unknown limit, or one below 1.

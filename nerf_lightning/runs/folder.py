@@ -20,7 +20,6 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.config.build import Frame, build_system, resolved
-from nerf_lightning.config.renames import with_what_was_left_out
 from nerf_lightning.errors import InputError, found_in
 from nerf_lightning.runs.checkpoint import check_finite, read_checkpoint
 from nerf_lightning.runs.scene_file import frame_from, load_scene
@@ -41,7 +40,7 @@ def plain_config(cfg: DictConfig) -> dict[str, Any]:
     path = plain["dataset"].get("path")
     if path is not None:
         plain["dataset"]["path"] = os.path.abspath(path)
-    return with_what_was_left_out(plain)
+    return plain
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:

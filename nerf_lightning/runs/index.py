@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from nerf_lightning.config.renames import with_new_names
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.untrusted import read_json, read_yaml
 
@@ -72,7 +71,7 @@ def read_run(folder: Path) -> Run:
         config = read_yaml(folder / "config.yaml", "a run's configuration in YAML")
     except InputError:  # told by the verbs that open runs
         config = {}
-    plain = with_new_names(config) if isinstance(config, dict) else {}
+    plain = config if isinstance(config, dict) else {}
     if not (folder / "results.json").exists():
         return Run(folder, plain, {}, "unfinished", "no results.json yet")
     try:

@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.config.renames import with_new_names
 from nerf_lightning.errors import InputError
 
 TRUST = "NERF_LIGHTNING_TRUST"
@@ -46,7 +45,7 @@ def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
         path: where it came from, for messages.
 
     Returns:
-        The configuration, with each option under its present name.
+        The configuration.
 
     Raises:
         InputError: if it holds anything else.
@@ -56,7 +55,7 @@ def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
     if (values := _values(plain)) > MOST_VALUES:
         raise InputError(path, "", f"{values:,} values", f"a configuration of at most {MOST_VALUES:,}")
     _check(path, "", plain)
-    return with_new_names(plain)
+    return plain
 
 
 def _values(node: Any) -> int:

@@ -59,8 +59,6 @@ Threads = Annotated[Count, AtMost(1024)]
 """Threads of one process; beyond, starting them fails on common systems, and ends the process."""
 STACK = 8 * 2**20
 """Bytes that are set aside for each."""
-LATER = {"device": "auto", "compile": False, "limits": {"batch": None, "chunk": None}}
-"""Options that runs of earlier versions lack, and that may be given when they are resumed."""
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
@@ -167,8 +165,7 @@ def train(
 
 def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     """The configuration of the run in `folder` with this command line's overrides on top, and its last checkpoint."""
-    saved = OmegaConf.create(LATER)
-    saved.merge_with(load_config(folder))
+    saved = load_config(folder)
     checkpoint = folder / "checkpoints" / "last.ckpt"
     read_checkpoint(checkpoint, RESUMED)  # fails in one line before anything starts, if it is broken
     given = [override.partition("=")[0] for override in HydraConfig.get().overrides.task]

@@ -7,10 +7,8 @@ import signal
 from pathlib import Path
 
 import pytest
-import yaml
 from commands import BARE, command
 
-from nerf_lightning.config.renames import RENAMED
 from nerf_lightning.runs.owner import owned
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3"]
@@ -136,21 +134,6 @@ def test_a_job_that_another_process_trains_is_left_to_it(inside, tmp_path: Path)
 def test_a_sweep_that_cannot_be_meant_is_refused_in_a_line(arguments: list[str], words: str, inside, tmp_path: Path):
     code, out, err = inside("-m", *SMALL, *arguments)
     assert code == 2 and words in err and err.count("\n") == 1 and not list(tmp_path.iterdir())
-
-
-def test_a_sweep_of_an_earlier_version_goes_on(inside, tmp_path: Path):
-    """Its jobs are known to be done, though options had other names."""
-    command = ["-m", "+experiment=smoke_3d", "dataset.size=16", "budget.steps=2", "callbacks.orbit=null", "seed=0,1"]
-    assert inside(*command)[0] == 0
-    configs = list((tmp_path / "outputs" / "smoke_3d").glob("*/*/config.yaml"))
-    for path in configs:
-        config = yaml.safe_load(path.read_text())
-        for old, new in RENAMED.items():
-            (group, before), after = old.split("."), new.split(".")[1]
-            config[group] = {before if key == after else key: value for key, value in config[group].items()}
-        path.write_text(yaml.safe_dump(config, sort_keys=False))
-    code, out, _ = inside(*command)
-    assert len(configs) == 2 and code == 0 and out.count("done before") == 2
 
 
 @pytest.mark.filterwarnings("ignore")  # Optuna warns, and here warnings are errors
