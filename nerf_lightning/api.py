@@ -19,8 +19,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.config.cli import given_of, quoted
+from nerf_lightning.config.cli import given_of
 from nerf_lightning.config.compose import composed
+from nerf_lightning.config.literal import override_of
 from nerf_lightning.dataset import Reading, Scene, open_scene
 from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.export.verb import export
@@ -83,9 +84,10 @@ class Run:
             InputError: as the verb does.
         """
         output = user_path(path)
-        given = [f"run={self.path}", f"output={output}", f"format={format}", f"device={self.system.device.type}"]
+        paths = [override_of("run", self.path), override_of("output", output)]
+        given = [*paths, f"format={format}", f"device={self.system.device.type}"]
         with undisturbed():
-            keys = given_of(composed([*quoted(given, ("run", "output")), *options], self.path, "export"))
+            keys = given_of(composed([*given, *options], self.path, "export"))
             check_options("", ExportOptions, keys)
             export(ExportOptions(**keys))
         return output
@@ -153,9 +155,9 @@ def train(
     place = Path("outputs", scene.name, now) if folder is None else user_path(folder)
     given = [
         "dataset=photos",
-        f"dataset.path={scene.source}",
+        override_of("dataset.path", scene.source),
         f"dataset.resize={scene.train.cameras.longest}",
-        f"name={scene.name}",
+        override_of("name", scene.name),
         f"seed={seed}",
         f"device={device}",
         f"budget.seconds={'null' if seconds is None else seconds}",
@@ -164,7 +166,7 @@ def train(
     if recipe is not None:
         given.append(f"recipe={recipe}")
     with undisturbed(), listening():
-        cfg = composed([*quoted(given, ("dataset.path", "name")), *options], place)
+        cfg = composed([*given, *options], place)
         try:
             with own_folder(place, may_overwrite(cfg), renamed=folder is None) as place:
                 train_configured(cfg, folder=place, scene=scene)

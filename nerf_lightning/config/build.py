@@ -20,7 +20,8 @@ from omegaconf.errors import ConfigKeyError
 from nerf_lightning.callbacks import Budget, Results
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.config.limits import limits_of
-from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.config.literal import escape
+from nerf_lightning.dataset import PixelDataModule, RayDataModule, from_photos
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.refine import Corrections
@@ -61,7 +62,8 @@ def make(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> Any:
     options = {key: value for key, value in resolved(node).items() if key not in ("_target_", "_partial_")}
     check_options(path, target, options, extra, complete=not late)
     # Hydra only binds the options: it would turn dataclasses among `extra` into configs.
-    bound = hydra.utils.instantiate(node, _partial_=True, _convert_="all")
+    literal = escape(escape(resolved(node)))  # Hydra resolves what it is given twice
+    bound = hydra.utils.instantiate(literal, _partial_=True, _convert_="all")
     try:
         # What Hydra binds it examines at every call, which a training step would pay for: once is enough.
         made = partial(bound.func, *bound.args, **{**bound.keywords, **extra}) if late else bound(**extra)
@@ -109,14 +111,17 @@ def device_of(cfg: DictConfig) -> torch.device:
 
 def build_data(cfg: DictConfig, path: str | None = None) -> RayDataModule | PixelDataModule:
     """The data module, with its scene loaded; `path` names other photos than the configuration does."""
-    if path is None:
-        return make(cfg, "dataset", RayDataModule, PixelDataModule)
-    elsewhere = copy.deepcopy(cfg)
-    if "path" in inspect.signature(target_of(cfg, "dataset")).parameters:
-        elsewhere.dataset.path = path
-    else:  # a built-in scene
-        elsewhere.dataset = {"_target_": "nerf_lightning.dataset.from_photos", "path": path}
-    return make(elsewhere, "dataset", RayDataModule, PixelDataModule)
+    return make(cfg if path is None else with_photos(cfg, path), "dataset", RayDataModule, PixelDataModule)
+
+
+def with_photos(cfg: DictConfig, path: str) -> DictConfig:
+    """A copy of a configuration that reads other photos: those at `path`, in place of a built-in scene too."""
+    moved = copy.deepcopy(cfg)
+    if "path" not in inspect.signature(target_of(cfg, "dataset")).parameters:
+        shared = {key: value for key, value in cfg.dataset.items() if key in inspect.signature(from_photos).parameters}
+        moved.dataset = {"_target_": "nerf_lightning.dataset.from_photos", **shared}
+    OmegaConf.update(moved, "dataset.path", escape(path), force_add=True)
+    return moved
 
 
 def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> Any:

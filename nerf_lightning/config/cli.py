@@ -6,6 +6,7 @@ import re
 import sys
 import threading
 import traceback
+from argparse import Namespace
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -14,11 +15,12 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
 from nerf_lightning.config.keys import check_keys, without_nulls
+from nerf_lightning.config.literal import escape, override_of, parse_argument, quote_texts
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leave, listen
 from nerf_lightning.utils.files import full_disk, no_room, output_path, remove_empty, user_path
@@ -49,7 +51,7 @@ def by_path(arguments: Sequence[str], folder: Path) -> list[str]:
             from nerf_lightning.utils.untrusted import read_yaml
 
             read_yaml(path, "an experiment in YAML")  # Hydra reads without limits
-            argument = f"{key}={os.path.relpath(path.with_suffix(''), folder / 'experiment')}"
+            argument = override_of(key, os.path.relpath(path.with_suffix(""), folder / "experiment"))
         found.append(argument)
     return found
 
@@ -57,48 +59,37 @@ def by_path(arguments: Sequence[str], folder: Path) -> list[str]:
 def to_folders(arguments: Sequence[str]) -> list[str]:
     """Rewrites the folders that Hydra makes, with ~ filled in.
 
+    Args:
+        arguments: as `quote_texts` gives them.
+
     Raises:
         InputError: where there can be no such folder.
     """
     found = []
     for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key in FOLDERS and "${" not in value:
-            folder = output_path(value.strip("'\""))
+        key = argument.partition("=")[0]
+        parsed = parse_argument(argument) if key in FOLDERS else None
+        if parsed is not None and isinstance(text := parsed.value(), str) and "${" not in text:
+            folder = output_path(text)
             if folder.exists() and not folder.is_dir():
                 raise InputError(folder, "", "a file", f"a folder to write into ({key})", "give another one")
-            (argument,) = quoted([f"{key}={folder}"], FOLDERS)
+            argument = override_of(key, folder)
         found.append(argument)
     return found
 
 
-def check_flags(arguments: Sequence[str]) -> None:
-    """Raises InputError for flags that Hydra does not know, which it would answer with its usage in many lines."""
+def check_flags(arguments: Sequence[str]) -> Namespace:
+    """Parses the flags. Raises InputError for those that Hydra does not know, which it would answer with its usage."""
 
     def refused(message: str) -> NoReturn:
         raise InputError("command line", "", message, "flags that --hydra-help lists, and KEY=VALUE")
 
     parser = get_args_parser()
     parser.error = refused  # type: ignore[method-assign]
-    if parser.parse_args(arguments).experimental_rerun:  # it unpickles a file, which may run anything
+    flags = parser.parse_args(arguments)
+    if flags.experimental_rerun:  # it unpickles a file, which may run anything
         refused("--experimental-rerun")
-
-
-def quoted(arguments: Sequence[str], keys: Sequence[str]) -> list[str]:
-    """Quotes the values of some keys, so that Hydra reads them as plain text.
-
-    Args:
-        arguments: of the command line.
-        keys: whose values are text; a value already in quotes or brackets stays as it is.
-    """
-    found = []
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key in keys and value and value[0] not in "'\"[" and value != "null":
-            escaped = value.replace("'", "\\'")
-            argument = f"{key}='{escaped}'"
-        found.append(argument)
-    return found
+    return flags
 
 
 def given_of(cfg: DictConfig) -> dict[str, Any]:
@@ -112,7 +103,7 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     """Composes `conf/<config>.yaml` with the command line and calls `task`; exits with 2 on bad input or a full disk, with 130
     after Ctrl-C and with 143 after SIGTERM.
 
-    The values of the keys in `texts` may hold commas and other characters that are special to Hydra.
+    The values of the keys in `texts` may hold commas and other characters that are special to Hydra, see `quote_texts`.
 
     Bad input is anything the user can fix: it gets one line. Anything else is a defect and keeps its traceback.
     """
@@ -125,7 +116,11 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
         nonlocal started
         started = True
         try:
-            check_keys(cfg, config, HydraConfig.get().runtime.choices)
+            runtime: Any = HydraConfig.get().runtime
+            plain: Any = OmegaConf.to_container(runtime)
+            with read_write(runtime):  # Hydra does not escape the path that it puts there
+                runtime.output_dir = escape(plain["output_dir"])
+            check_keys(cfg, config, runtime.choices)
             return task(cfg)
         except (Exception, Interrupted) as error:
             told = as_told(error)
@@ -138,9 +133,9 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     threading.excepthook = _untold
     listen()
     try:
-        check_flags(sys.argv[1:])
-        given = to_folders(without_nulls(by_path(sys.argv[1:], conf_dir())))
-        sys.argv[1:] = quoted(given, texts)
+        flags = check_flags(sys.argv[1:])
+        given = without_nulls(by_path(sys.argv[1:], conf_dir()))
+        sys.argv[1:] = to_folders(quote_texts(given, (*texts, *FOLDERS), flags.multirun))
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
     except Exception as error:
         # Before the task starts only Hydra is at work, on the command line: any error then is bad input.

@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 
 from nerf_lightning.cameras import Cameras, in_other_frame
 from nerf_lightning.config.build import SceneFrame, build_data, target_of
+from nerf_lightning.config.literal import escape
 from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
@@ -82,7 +83,7 @@ def data_again(
     if "download" in inspect.signature(target_of(cfg, "dataset")).parameters:
         at_hand.dataset.download = False
         if at_hand.dataset.get("path") is None and source != BUILT_IN:
-            at_hand.dataset.path = source
+            at_hand.dataset.path = escape(source)
     data = build_data(at_hand, photos)
     if isinstance(data, RayDataModule):
         data.scene = in_frame_of(data.scene, scene)

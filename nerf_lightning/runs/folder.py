@@ -26,7 +26,7 @@ from nerf_lightning.runs.scene_file import frame_from, load_scene
 from nerf_lightning.runs.trusted import check_config
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import atomic, user_path
 from nerf_lightning.utils.options import Seed, check_options
 from nerf_lightning.utils.untrusted import NONSENSE, existing_file, read_yaml
 
@@ -39,7 +39,7 @@ def plain_config(cfg: DictConfig) -> dict[str, Any]:
     plain = {key: value for key, value in resolved(cfg).items() if key != "overwrite"}  # of the command, not of the run
     path = plain["dataset"].get("path")
     if path is not None:
-        plain["dataset"]["path"] = os.path.abspath(path)
+        plain["dataset"]["path"] = os.path.abspath(user_path(path))
     return plain
 
 

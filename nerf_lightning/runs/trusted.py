@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.config.literal import escape
 from nerf_lightning.errors import InputError
 
 TRUST = "NERF_LIGHTNING_TRUST"
@@ -45,7 +46,7 @@ def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
         path: where it came from, for messages.
 
     Returns:
-        The configuration.
+        The configuration, escaped for OmegaConf: text from outside is never an interpolation.
 
     Raises:
         InputError: if it holds anything else.
@@ -55,7 +56,7 @@ def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
     if (values := _values(plain)) > MOST_VALUES:
         raise InputError(path, "", f"{values:,} values", f"a configuration of at most {MOST_VALUES:,}")
     _check(path, "", plain)
-    return plain
+    return escape(plain)
 
 
 def _values(node: Any) -> int:
@@ -80,7 +81,7 @@ def _check(path: Path | str, key: str, node: Any) -> None:
     elif isinstance(node, list):
         for index, value in enumerate(node):
             _check(path, f"{key}[{index}]", value)
-    elif isinstance(node, str) and ("${" in node or node == "???"):
+    elif node == "???":
         raise InputError(path, key, repr(node), "a resolved value")
     elif isinstance(node, float) and not math.isfinite(node):
         raise InputError(path, key, str(node), "a finite number")

@@ -26,8 +26,10 @@ from nerf_lightning.config.build import (
     device_of,
     frame_of,
     resolved,
+    with_photos,
 )
 from nerf_lightning.config.limits import limits_of
+from nerf_lightning.config.literal import escape
 from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, Scene, draw_rays
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
@@ -168,13 +170,16 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     saved = load_config(folder)
     checkpoint = folder / "checkpoints" / "last.ckpt"
     read_checkpoint(checkpoint, RESUMED)  # fails in one line before anything starts, if it is broken
-    given = [override.partition("=")[0] for override in HydraConfig.get().overrides.task]
+    given = [override.partition("=")[0].lstrip("+") for override in HydraConfig.get().overrides.task]
+    if "dataset.path" in given and cfg.dataset.path is not None:
+        saved = with_photos(saved, cfg.dataset.path)
     for key in given:
         if key == "resume":
             continue
         if OmegaConf.select(saved, key, default=key) is key:
             raise InputError("resume", key, "an option the run does not have", f"one of those in {folder}/config.yaml")
-        OmegaConf.update(saved, key, OmegaConf.select(cfg, key))
+        value = OmegaConf.select(cfg, key)
+        OmegaConf.update(saved, key, escape(resolved(value) if isinstance(value, DictConfig) else value), merge=False)
     if "device" in given:  # the trainer's was resolved when the run began
         OmegaConf.update(saved, "trainer.accelerator", cfg.trainer.accelerator)
     return saved, checkpoint

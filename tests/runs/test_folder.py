@@ -85,9 +85,12 @@ def test_a_user_may_trust_another_package(config: dict, tmp_path: Path, monkeypa
     assert load_config(tmp_path).model._target_ == "decimal.Decimal"
 
 
-def test_interpolations_are_refused(config: dict, tmp_path: Path):
-    config["dataset"]["size"] = "${oc.env:HOME}"
-    with pytest.raises(InputError, match=r"dataset\.size.*a resolved value"):
+def test_nothing_is_interpolated(config: dict, tmp_path: Path):
+    """A path may hold such text; a stranger's must not read the environment."""
+    config["dataset"]["path"] = "${oc.env:HOME}"
+    assert load_config(written(config, tmp_path)).dataset.path == "${oc.env:HOME}"
+    config["dataset"]["path"] = "???"
+    with pytest.raises(InputError, match=r"dataset\.path.*a resolved value"):
         load_config(written(config, tmp_path))
 
 

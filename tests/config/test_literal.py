@@ -1,0 +1,157 @@
+"""Text on command lines: every path is read as it is written."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+from PIL import Image
+
+from nerf_lightning.config import cli
+from nerf_lightning.config.literal import escape, override_of, quote_texts
+from nerf_lightning.evaluate.__main__ import task as evaluate
+
+KEYS = ("dataset.path", "resume", "hydra.run.dir", "name")
+NASTY = 'scan (1), ${x} #2 = "ü" [b]'
+ODD = (
+    *("a b", "a (1)", "a[b]", "[b]", "{a}", "a,b", ",", "a=b", "=", "#1", "a'b", "'a'", '"a"', 'a"', "$a", "${a}", "${a"),
+    *("a\\b", "a\\", "\\${a}", "a\\'b", "ü", "日本", "é", "2024", "1e5", "true", "a:b", "a;b&c", "100%", "~a", "choice(a,b)"),
+    NASTY,
+)  # fmt: skip
+
+
+def values_of(argument: str) -> list[object]:
+    """What jobs find at the key that an argument sets, after Hydra and OmegaConf have read it."""
+    parsed = OverridesParser.create().parse_override(argument)
+    if not parsed.is_sweep_override():
+        return [OmegaConf.create({"value": parsed.value()}).value]
+    jobs = (OverridesParser.create().parse_override(f"key={one}") for one in parsed.sweep_string_iterator())
+    return [OmegaConf.create({"value": job.value()}).value for job in jobs]
+
+
+@pytest.fixture(autouse=True)
+def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SCANS", "scans (1)")
+
+
+@pytest.mark.parametrize("text", ODD)
+def test_an_existing_path_is_literal(text: str, tmp_path: Path):
+    (tmp_path / text).mkdir()
+    for key in KEYS:
+        for sweep in (False, True):
+            (argument,) = quote_texts([f"{key}={text}"], KEYS, sweep)
+            assert values_of(argument) == [text]
+            assert quote_texts([argument], KEYS, sweep) == [argument] or text[0] in "'\""
+    assert values_of(override_of("key", text)) == [text]
+    assert OmegaConf.create(escape({"a": [text]})).a[0] == text
+
+
+@pytest.mark.parametrize("text", [text for text in ODD if "${" not in text and text not in ("'a'", '"a"', "[b]")])
+def test_a_path_that_is_not_there_is_literal_too(text: str):
+    (argument,) = quote_texts([f"hydra.run.dir={text}"], KEYS)
+    assert values_of(argument) == [text]
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ("scan", "scan"),
+        ("null", None),
+        ("", ""),
+        ("'a, b'", "a, b"),
+        ('"a, b"', "a, b"),
+        ("[a,b]", ["a", "b"]),
+        ("${oc.env:SCANS}", "scans (1)"),
+        ("${oc.env:SCANS}/ü, #2", "scans (1)/ü, #2"),
+    ],
+)
+def test_what_hydra_reads_stays(value: str, expected: object):
+    for sweep in (False, True) if "," not in value or value[0] in "'\"[" else (False,):
+        (argument,) = quote_texts([f"++dataset.path={value}"], KEYS, sweep)
+        assert values_of(argument) == [expected]
+        assert value.startswith("${") or argument == f"++dataset.path={value}"
+
+
+@pytest.mark.parametrize(
+    ("value", "expected", "said"),
+    [
+        ("a,b", ["a", "b"], "dataset.path: 2 values to sweep: a | b"),
+        (
+            "a (1), 2024,${oc.env:SCANS}",
+            ["a (1)", "2024", "scans (1)"],
+            "dataset.path: 3 values to sweep: a (1) | 2024",
+        ),
+        ("both, together", ["both, together"], "dataset.path=both, together: one value, as there is"),
+        ("'c,d','e'", ["c,d", "e"], ""),
+        ("choice(a,b)", ["a", "b"], ""),
+        ("scan (1)", ["scan (1)"], ""),
+    ],
+)
+def test_commas_in_a_sweep(value: str, expected: list[str], said: str, tmp_path: Path, capsys):
+    (tmp_path / "both, together").mkdir()
+    (argument,) = quote_texts([f"dataset.path={value}"], KEYS, sweep=True)
+    assert values_of(argument) == expected
+    assert said in (out := capsys.readouterr().out) and bool(said) == bool(out)
+
+
+def test_a_list_of_paths_that_are_there_is_a_sweep_in_an_experiment_that_sweeps(tmp_path: Path):
+    for name in ("a (1)", "b"):
+        (tmp_path / name).mkdir()
+    assert values_of(*quote_texts(["dataset.path=a (1),b"], KEYS)) == ["a (1)", "b"]
+
+
+def test_other_keys_are_hydras_unless_it_cannot_read_them():
+    read = ["seed=1,2", "model.levels=[1,2]", "~logger", "-m", "--config-dir=a (1)", "budget.seconds=1e2"]
+    assert quote_texts(read, KEYS) == read
+    assert values_of(*quote_texts(["+callbacks.own.file=a (1).txt"], KEYS)) == ["a (1).txt"]
+
+
+SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "callbacks=null", "budget.steps=2", "logger=null"]
+
+
+def write_picture(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    Image.fromarray(np.arange(432, dtype=np.uint8).reshape(12, 12, 3)).save(folder / "photo, 1.png")
+    return folder / "photo, 1.png"
+
+
+def test_a_run_in_a_folder_of_any_name_on_a_picture_of_any_name(inside, verb, tmp_path: Path):
+    """Trained, resumed on a picture that has moved, measured on a third."""
+    picture = write_picture(tmp_path / NASTY)
+    (tmp_path / f"run {NASTY}").mkdir()
+    code, _, err = inside(
+        *SMALL, "callbacks=picture", f"dataset.path={NASTY}/{picture.name}", f"hydra.run.dir=run {NASTY}"
+    )
+    assert code == 0, err
+    run = tmp_path / f"run {NASTY}"
+    saved = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+    assert saved["dataset"]["path"] == str(picture) and (run / "checkpoints" / "last.ckpt").exists()
+    moved = picture.rename(tmp_path / "moved: ${y} 'é'.png")
+    code, _, err = inside(f"resume=run {NASTY}", f"dataset.path={moved.name}", "budget.steps=4")
+    assert code == 0, err
+    saved = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+    assert saved["dataset"]["path"] == str(moved) and saved["budget"]["steps"] == 4
+    assert '"steps": 4' in (run / "results.json").read_text(encoding="utf-8")
+    picture = write_picture(tmp_path / "(2)")
+    given = [f"run=run {NASTY}", f"dataset.path=(2)/{picture.name}"]
+    code, _, err = verb(lambda: cli.run("evaluate", evaluate, texts=("run", "output", "dataset.path")), *given)
+    assert code == 0, err
+    assert f"(2)/{picture.name}" in (run / "evaluation" / "views.json").read_text(encoding="utf-8")
+
+
+def test_a_sweep_over_paths(inside, tmp_path: Path):
+    for name in ("a (1)", "b, ü"):
+        write_picture(tmp_path / name)
+    paths = f"dataset.path={os.path.join('a (1)', 'photo, 1.png')}"
+    code, out, err = inside("-m", *SMALL, paths, "hydra.sweep.dir=sweep (1), ü", "seed=0,1")
+    assert code == 0, err
+    configs = [
+        yaml.safe_load(path.read_text(encoding="utf-8")) for path in (tmp_path / "sweep (1), ü").rglob("config.yaml")
+    ]
+    assert [config["dataset"]["path"] for config in configs] == [str(tmp_path / "a (1)" / "photo, 1.png")] * 2
+    assert sorted(config["seed"] for config in configs) == [0, 1]
+    assert "one value, as there is a file" in out

@@ -1,0 +1,44 @@
+"""Runs whose photos have moved, of every kind of dataset: they go on, and are measured, on those at dataset.path."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from nerf_lightning.config import cli
+from nerf_lightning.dataset import save_npz
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.evaluate.__main__ import task as evaluate
+
+SMALL = (
+    *("dataset.rays=64", "dataset.samples=null", "budget.steps=2", "callbacks.throughput=null"),
+    *("callbacks.orbit=null", "callbacks.snapshots=null", "logger=null", "model.levels=2", "hydra.run.dir=run"),
+)
+
+
+@pytest.mark.parametrize(
+    ("source", "kept"),
+    [
+        (["dataset=photos", "dataset.path=published.npz"], "from_photos"),
+        (["dataset=lego", "dataset.url=http://stranger.example/published.npz", "dataset.folder=."], "from_download"),
+        (["dataset=bricks", "dataset.size=16", "dataset.train_views=4", "dataset.val_views=2"], "from_photos"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_moved_run_goes_on_and_is_measured(source: list[str], kept: str, inside, verb, tmp_path: Path):
+    save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), tmp_path / "published.npz")
+    code, _, err = inside(*source, *SMALL)
+    assert code == 0, err
+    (tmp_path / "run").rename(tmp_path / "moved")
+    (tmp_path / "published.npz").rename(tmp_path / "elsewhere.npz")
+    code, _, err = inside("resume=moved", "dataset.path=elsewhere.npz", "budget.steps=4")
+    assert code == 0, err
+    config = yaml.safe_load((tmp_path / "moved" / "config.yaml").read_text(encoding="utf-8"))
+    dataset = config["dataset"]
+    assert dataset["_target_"] == f"nerf_lightning.dataset.{kept}"
+    assert (dataset["path"], dataset["rays"]) == (str(tmp_path / "elsewhere.npz"), 64)
+    assert config["budget"]["steps"] == 4
+    (tmp_path / "elsewhere.npz").rename(tmp_path / "last.npz")
+    given = ["run=moved", "dataset.path=last.npz"]
+    code, out, err = verb(lambda: cli.run("evaluate", evaluate, texts=("run", "output", "dataset.path")), *given)
+    assert code == 0 and "over 2 held-out views" in out, err
