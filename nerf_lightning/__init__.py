@@ -30,11 +30,15 @@ to world; pixel centres lie at +0.5. Lengths are in the scene's own unit, colour
 import sys
 from typing import TYPE_CHECKING, Any
 
+from nerf_lightning.utils.torchvision_guard import guard_torchvision
+
 if sys.argv[:1] == ["-m"] and any(word.partition(".")[0] == __name__ for word in sys.orig_argv):
     # A command line looks for its module: from here on, through all imports, Ctrl-C ends it in a line.
     from nerf_lightning.utils.ending import end_at_once
 
     end_at_once()
+
+guard_torchvision()  # before anything imports Lightning
 
 if TYPE_CHECKING:
     from nerf_lightning.api import Run, View, load_run, load_scene, train

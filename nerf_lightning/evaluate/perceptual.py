@@ -1,12 +1,13 @@
-"""LPIPS (Zhang et al. 2018), if its weights are on this machine already: nothing is ever downloaded."""
+"""LPIPS (Zhang et al. 2018), if torchvision and its weights are on this machine already: nothing is ever downloaded."""
 
-import importlib.util
+import importlib
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
 
 WEIGHTS = "alexnet-owt-7be5be79.pth"
 """AlexNet's, as torchvision names them in torch.hub's folder."""
@@ -24,13 +25,14 @@ def perceptual_distance() -> tuple[Distance | None, str]:
     Returns:
         It, or None and the reason why it cannot be computed.
     """
-    if importlib.util.find_spec("torchvision") is None:
-        return None, "torchvision is not installed"
+    try:
+        importlib.import_module("torchvision")
+    except ImportError as error:  # not there, or see utils/torchvision_guard.py
+        missing = "torchvision is not installed: pip install 'nerf_lightning[lpips]'"
+        return None, missing if str(error).startswith("No module") else str(error)
     weights = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS
     if not weights.exists():
         return None, f"{weights} is not there"
-
-    from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
 
     def distance(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float | None:
         if min(image.shape[:2]) < SMALLEST:

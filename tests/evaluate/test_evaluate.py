@@ -3,6 +3,8 @@
 import json
 import math
 import shutil
+import sys
+import types
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -69,9 +71,8 @@ def test_means_are_of_what_could_be_told():
 
 def test_lpips_is_told_where_its_weights_are_and_nothing_is_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: None)
-    assert perceptual_distance() == (None, "torchvision is not installed")
-    monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: name)
+    assert perceptual_distance() == (None, "torchvision is not installed: pip install 'nerf_lightning[lpips]'")
+    monkeypatch.setitem(sys.modules, "torchvision", types.ModuleType("torchvision"))
     assert perceptual_distance() == (None, f"{tmp_path}/checkpoints/alexnet-owt-7be5be79.pth is not there")
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").write_bytes(b"")
@@ -81,9 +82,7 @@ def test_lpips_is_told_where_its_weights_are_and_nothing_is_fetched(tmp_path: Pa
         asked.update(shape=first.shape, net=net_type, normalize=normalize)
         return (first - second).abs().mean()
 
-    monkeypatch.setattr(
-        "torchmetrics.functional.image.learned_perceptual_image_patch_similarity", metric, raising=False
-    )
+    monkeypatch.setattr(perceptual, "learned_perceptual_image_patch_similarity", metric)
     distance, why = perceptual_distance()
     assert distance is not None and why == ""
     assert distance(torch.ones(80, 100, 3), torch.zeros(80, 100, 3)) == 1.0
