@@ -95,7 +95,7 @@ def size_of_capture(run: SceneRun, solved: Solved, layout: TagLayout) -> Rows:
         layout: of the tags, in whose frame the truth is known.
     """
     low, high = true_box(Tabletop(layout))
-    to_truth = torch.from_numpy(home(solved, layout)).float()
+    to_truth = torch.from_numpy(home(solved, layout)).double()
     room = 0.2 * (high - low)
     box = torch.from_numpy(np.stack([low - room, high + room])).float()
     box[0, 2] = ABOVE

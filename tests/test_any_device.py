@@ -159,6 +159,8 @@ def test_a_run_is_looked_at(device: torch.device, run: Path, tmp_path: Path, ver
     for output, *given in (
         ("mesh.ply", "format=ply"),
         ("mesh.glb", "format=glb", "box=[-0.9,-0.9,-0.9,0.9,0.9,0.9]"),
+        ("mesh.obj", "format=obj"),
+        ("mesh.stl", "format=stl"),
         ("points.ply", "format=ply", "content=points"),
         ("voxels.npz", "format=npz"),
     ):

@@ -44,7 +44,7 @@ def test_a_scene_of_a_room_knows_what_its_rays_meet(tmp_path: Path, monkeypatch:
 
 
 def rays_in_the_room(rays: Rays, scene) -> tuple[torch.Tensor, torch.Tensor]:
-    turn = scene.to_source[:3, :3]
+    turn = scene.to_source[:3, :3].float()
     directions = rays.directions @ turn.mT
     return rays.origins @ turn.mT + scene.to_source[:3, 3], torch.nn.functional.normalize(directions, dim=1)
 

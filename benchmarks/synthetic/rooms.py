@@ -50,7 +50,7 @@ def photos_that_show(room: Room, scene: Scene, places: Float[Tensor, "N 3"]) -> 
 def meet(room: Room, scene: Scene, rays: Rays) -> tuple[Float[Tensor, "R"], Int[Tensor, "R"]]:
     """Distance of what rays of a scene meet, its unit, and the body's number."""
     scale = float(torch.linalg.det(scene.to_source[:3, :3])) ** (1 / 3)
-    turn, shift = scene.to_source[:3, :3], scene.to_source[:3, 3]
+    turn, shift = scene.to_source[:3, :3].to(rays.origins), scene.to_source[:3, 3].to(rays.origins)
     there = Rays(rays.origins @ turn.mT + shift, rays.directions @ turn.mT / scale)
     _, distance, which = room.see(there)
     return distance / scale, which

@@ -193,7 +193,7 @@ class Cameras:
             Pixels (column, row; the first pixel's centre is at 0.5), of no use for points that the view does not see;
             depths along the optical axis, world units; and which points are in the picture.
         """
-        local = (points - self.centres[view]) @ self.c2w[view, :3, :3]
+        local = (points - self.centres[view]).to(self.c2w) @ self.c2w[view, :3, :3]
         depth = local[:, 2]
         if self.lenses is None:
             ahead, flat = depth > 0, local[:, :2] / torch.where(depth > 0, depth, 1.0)[:, None]

@@ -159,7 +159,7 @@ def assemble_scene(
         to_source = torch.eye(4, dtype=torch.float64)
     else:
         _, to_source = framed(torch.from_numpy(train.c2w), torch.arange(len(train.c2w)))
-    from_source = torch.linalg.inv(to_source.double())
+    from_source = torch.linalg.inv(to_source)
 
     def move(cameras: Cameras, c2w: Float[np.ndarray, "V 4 4"]) -> Cameras:
         return replace(cameras, c2w=in_other_frame(torch.from_numpy(c2w), from_source).float())
@@ -189,7 +189,7 @@ def assemble_scene(
         orbit=orbit_like(views.cameras) if path is None else path,
         bounds=bounds,
         background=kind.background,
-        to_source=(to_source if hints.to_source is None else torch.from_numpy(hints.to_source) @ to_source).float(),
+        to_source=to_source if hints.to_source is None else torch.from_numpy(hints.to_source) @ to_source,
         kind=kind.reason,
     )
 
@@ -198,7 +198,7 @@ def unbounded_box(views: Views, to_source: Float[Tensor, "4 4"], hints: Hints) -
     """The cube [-1, 1]^3, and where sampling starts: before the nearest content that is known, or what cameras look at."""
     known = [] if hints.nearest is None else [hints.nearest * float(torch.linalg.det(to_source[:3, :3])) ** (-1 / 3)]
     if hints.points is not None and len(hints.points):
-        points = transform(torch.linalg.inv(to_source.double()), torch.from_numpy(hints.points)).float()
+        points = transform(torch.linalg.inv(to_source), torch.from_numpy(hints.points)).float()
         known.append(nearest_point(points, views))
     starts = [CLEAR * distance for distance in known]
     if axes_meet(views.cameras.c2w):
@@ -243,7 +243,7 @@ def framed(c2w: Float[Tensor, "V 4 4"], train: Int[Tensor, "T"]) -> tuple[Float[
     moved = c2w.clone()
     moved[:, :3, :3] = turn @ c2w[:, :3, :3]
     moved[:, :3, 3] = (c2w[:, :3, 3] - centre) @ turn.mT / scale
-    to_source = torch.eye(4)
+    to_source = torch.eye(4, dtype=torch.float64)
     to_source[:3, :3] = scale * turn.mT
     to_source[:3, 3] = centre
     return moved, to_source

@@ -30,8 +30,9 @@ class Scene:
     bounds: Bounds
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The colour behind the content: baked into images without alpha, the convention for images with it."""
-    to_source: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
-    """Similarity from this scene's frame to the file's own, so that exports keep the original place and scale."""
+    to_source: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
+    """Similarity from this scene's frame to the file's own, so that exports keep the original place and scale. In double
+    precision: georeferenced files have coordinates of millions of metres."""
     test: Views | None = None
     """Held out, and measured on at the end alone, where a format has both."""
     kind: str = ""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.drawing.panels import to_bytes
+from nerf_lightning.export.shapes import encode_mesh, encode_ply, format_offset
 from nerf_lightning.export.surface import Surface, find_surface, lit_cells
 from nerf_lightning.export.volume import PLACES, Volume
 from nerf_lightning.runs.open import SceneRun
@@ -20,8 +21,8 @@ from nerf_lightning.system import NeRF3D
 if TYPE_CHECKING:
     import trimesh
 
-Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From z up, as scenes have it, to y up, as glTF wants it: written as the node's transform."""
+OFFSETS = {"stl": "coordinates lack the offset {}", "glb": "the node's transform holds the offset {}"}
+"""What to say of it, by format: single precision does not hold coordinates that are large for the mesh's size."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def colours_at(system: NeRF3D, places: Float[Tensor, "N 3"], outwards: Float[Ten
 def upright(run: SceneRun) -> Float[ndarray, "4 4"]:
     """The rotation from the photos' frame, whatever is up in it, to the scene's, whose z axis points up."""
     turn = np.eye(4)
-    turn[:3, :3] = np.linalg.inv(run.to_source[:3, :3].double().numpy()) * run.scale
+    turn[:3, :3] = np.linalg.inv(run.to_source[:3, :3].numpy()) * run.scale
     return turn
 
 
@@ -62,39 +63,31 @@ def coloured_mesh(
     # Half a cell inside: just outside the surface no photo constrains the colour.
     rgb = colours_at(run.system, places - normals * (volume.cell / 2), normals)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=rgb, process=False)
-    mesh.apply_transform(run.to_source.double().numpy())
+    mesh.apply_transform(run.to_source.numpy())
     return mesh, surface
 
 
 def mesh_file(run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None, suffix: str) -> Shape:
-    """A coloured mesh as .ply or .glb."""
-    import trimesh
-
+    """A coloured mesh as .ply, .obj or .glb; its triangles alone as .stl."""
     mesh, surface = coloured_mesh(run, cameras, volume, threshold)
-    if suffix == "glb":
-        scene = trimesh.Scene()
-        scene.add_geometry(mesh, transform=Y_UP @ upright(run))
-        content = scene.export(file_type="glb")
-    else:
-        content = mesh.export(file_type=suffix)
+    content, offset = encode_mesh(mesh, suffix, upright(run))
     words = [
         f"{len(mesh.faces):,} triangles",
         "watertight" if mesh.is_watertight else f"{open_edges(mesh)} open edges",
         " x ".join(f"{side:.4g}" for side in mesh.extents) + " in the photos' unit",
         f"surface at opacity {surface.threshold:.2f}",
         *([f"{surface.floaters} floating pieces left out"] if surface.floaters else []),
+        *([OFFSETS[suffix].format(format_offset(offset))] if offset.any() else []),
     ]
-    return Shape(_bytes(content), ", ".join(words))
+    return Shape(content, ", ".join(words))
 
 
 def points_file(run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None) -> Shape:
     """The mesh's vertices alone, with their colours, as .ply."""
-    import trimesh
-
     mesh, surface = coloured_mesh(run, cameras, volume, threshold)
     colours: Any = mesh.visual
-    content = trimesh.PointCloud(mesh.vertices, colours.vertex_colors).export(file_type="ply")
-    return Shape(_bytes(content), f"{len(mesh.vertices):,} points, surface at opacity {surface.threshold:.2f}")
+    content = encode_ply(mesh.vertices, colours.vertex_colors[:, :3])
+    return Shape(content, f"{len(mesh.vertices):,} points, surface at opacity {surface.threshold:.2f}")
 
 
 def voxels_file(run: SceneRun, volume: Volume) -> Shape:
@@ -112,14 +105,11 @@ def voxels_file(run: SceneRun, volume: Volume) -> Shape:
     outwards[outwards.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0])  # where density is even, any direction will do
     rgb = np.zeros((*solid.shape, 3), np.uint8)
     rgb[solid.numpy()] = colours_at(run.system, volume.places(index.float()), outwards)
-    to_world = torch.eye(4, dtype=torch.float64)
-    to_world[:3, :3] *= volume.cell
-    to_world[:3, 3] = volume.places(torch.zeros(1, 3))[0]
     file = io.BytesIO()
     arrays: dict[str, Any] = {
         "density": (volume.density / run.scale).numpy().astype(np.float32),
         "rgb": rgb,
-        "to_source": (run.to_source.double() @ to_world).numpy(),
+        "to_source": (run.to_source @ volume.to_world).numpy(),
     }
     np.savez_compressed(file, **arrays)
     shape = " x ".join(map(str, solid.shape))
@@ -130,8 +120,3 @@ def open_edges(mesh: "trimesh.Trimesh") -> int:
     """Edges that do not lie between exactly two triangles."""
     _, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
     return int((counts != 2).sum())
-
-
-def _bytes(content: Any) -> bytes:
-    assert isinstance(content, bytes)  # of both formats
-    return content

@@ -30,6 +30,8 @@ NAMES = {
     ("npz", "mesh"): "voxels.npz",
     ("ply", "mesh"): "mesh.ply",
     ("glb", "mesh"): "mesh.glb",
+    ("obj", "mesh"): "mesh.obj",
+    ("stl", "mesh"): "mesh.stl",
     ("ply", "points"): "points.ply",
     ("html", "mesh"): FIELD_PAGE,
     ("transforms", "mesh"): "posed",
@@ -62,7 +64,7 @@ def export(options: ExportOptions) -> None:
         output = output_path(options.output)
     if options.format == "transforms":
         return posed(options, source, output)
-    if options.format in ("ply", "glb"):
+    if options.format in ("ply", "glb", "obj", "stl"):
         require("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
     made = {"compact": compacted, "html": paged}.get(options.format, shaped)
     content, words = made(options, source, device)
@@ -106,7 +108,7 @@ def compacted(options: ExportOptions, source: Path, device: torch.device) -> tup
 def shaped(options: ExportOptions, source: Path, device: torch.device) -> tuple[bytes, str]:
     """A run as a mesh, points or voxels."""
     found = open_scene_run(source, device)
-    box = None if options.box is None else torch.tensor(options.box).view(2, 3)
+    box = None if options.box is None else torch.tensor(options.box, dtype=torch.float64).view(2, 3)
     volume = volume_of(found, options.resolution, box)
     if options.format == "npz":
         shape = voxels_file(found, volume)

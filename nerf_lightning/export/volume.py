@@ -46,6 +46,14 @@ class Volume:
         return self.low + (index + 0.5) * self.cell
 
     @property
+    def to_world(self) -> Float[Tensor, "4 4"]:
+        """Maps indices to the world frame, in double precision; whole numbers are centres of cells."""
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3, :3] *= self.cell
+        matrix[:3, 3] = self.low.double() + self.cell / 2
+        return matrix
+
+    @property
     def centres(self) -> Float[Tensor, "X Y Z 3"]:
         """Where in the world the centres of all cells are."""
         axes = [torch.arange(count) for count in self.density.shape]
@@ -62,11 +70,11 @@ def region_of(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tensor
     Raises:
         InputError: where the box lies outside the bounds.
     """
-    corners = transform(torch.linalg.inv(to_source), torch.cartesian_prod(*box.T))
+    corners = transform(torch.linalg.inv(to_source), torch.cartesian_prod(*box.double().T)).float()
     aabb = bounds.aabb.cpu()
     region = torch.stack([torch.maximum(corners.amin(0), aabb[0]), torch.minimum(corners.amax(0), aabb[1])])
     if not (region[0] < region[1]).all():
-        where = transform(to_source, torch.cartesian_prod(*aabb.T))
+        where = transform(to_source, torch.cartesian_prod(*aabb.double().T))
         low, high = ([round(x, 4) for x in corner.tolist()] for corner in (where.amin(0), where.amax(0)))
         raise InputError(
             "config", "box", str(box.flatten().tolist()), f"something within {low} to {high}, the scene's box"
@@ -127,8 +135,13 @@ def cropped(volume: Volume, box: Float[Tensor, "2 3"], to_source: Float[Tensor, 
         box: lower and upper corner in the frame of the photos' own file.
         to_source: similarity from the world frame to that one.
     """
-    places = transform(to_source, volume.centres)
-    inside = ((places >= box[0]) & (places <= box[1])).all(-1)
+    matrix = to_source @ volume.to_world
+    i, j, k = (torch.arange(count, dtype=torch.float64) for count in volume.density.shape)
+    i, j = i[:, None, None], j[:, None]
+    inside = torch.ones(volume.density.shape, dtype=torch.bool)
+    for (x, y, z, shift), low, high in zip(matrix[:3].tolist(), *box.tolist(), strict=True):
+        place = x * i + y * j + z * k + shift
+        inside &= (place >= low) & (place <= high)
     return replace(volume, density=volume.density * inside)
 
 

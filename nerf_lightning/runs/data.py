@@ -18,6 +18,9 @@ from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.scene_file import frame_from, numbers
 
+SAME_FRAME = 1e-5
+"""Frames that differ less, in entries of the similarity between them, are one: in the unit of the run's own."""
+
 
 def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
     """A scene in the frame that a run was trained in, which other photos of it, or a later version of this package, may place
@@ -30,9 +33,9 @@ def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
     frame, _, to_source = frame_from(content, "scene.json") if "aabb" in content else (None, None, None)
     if to_source is None or not isinstance(frame, SceneFrame):
         return scene
-    if torch.allclose(to_source, scene.to_source, atol=1e-5):
+    moved = torch.linalg.solve(to_source, scene.to_source)
+    if torch.allclose(moved, torch.eye(4, dtype=moved.dtype), atol=SAME_FRAME):
         return replace(scene, bounds=frame.bounds, to_source=to_source)
-    moved = torch.linalg.solve(to_source.double(), scene.to_source.double())
 
     def placed(cameras: Cameras) -> Cameras:
         return replace(cameras, c2w=in_other_frame(cameras.c2w, moved).float())

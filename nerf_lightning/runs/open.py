@@ -31,7 +31,7 @@ class SceneRun:
     @property
     def scale(self) -> float:
         """Length of a world unit in the frame of the photos' own file."""
-        return float(torch.linalg.det(self.to_source[:3, :3].double())) ** (1 / 3)
+        return float(torch.linalg.det(self.to_source[:3, :3])) ** (1 / 3)
 
 
 def open_run(path: Path, device: torch.device) -> RunFolder:

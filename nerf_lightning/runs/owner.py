@@ -20,7 +20,8 @@ RUN = ("config.yaml", "results.json", "checkpoints")
 MADE = (
     *RUN, "scene.json", "error.txt", "hparams.yaml", "events.out.tfevents.*", "snapshots", "final.png", "orbit.gif",
     "training.gif", "error.png", "spectrum.png", "curve.png", "baselines.json", "enlarged.*", "enlarged_*",
-    "compact.npz", "field.html", "mesh.ply", "mesh.glb", "points.ply", "voxels.npz", "posed", "render_*", "evaluation",
+    "compact.npz", "field.html", "mesh.ply", "mesh.obj", "mesh.glb", "mesh.stl", "points.ply", "voxels.npz", "posed",
+    "render_*", "evaluation",
 )  # fmt: skip
 """What runs leave, and what the verbs make from them, where no other names are given."""
 

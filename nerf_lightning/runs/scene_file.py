@@ -107,7 +107,7 @@ def frame_from(scene: Mapping[str, Any], where: object) -> tuple[Frame, Cameras 
     red, green, blue = colour.tolist()
     to_source = checks.similarity(where, "to_source", numbers(where, "to_source", scene["to_source"]))
     frame = SceneFrame(Bounds(aabb, scene["unbounded"], near, far, pixel), (red, green, blue))
-    return frame, _orbit(where, scene["orbit"]), torch.from_numpy(to_source).float()
+    return frame, _orbit(where, scene["orbit"]), torch.from_numpy(to_source)
 
 
 def numbers(where: object, key: str, value: Any) -> Float[np.ndarray, "..."]:

@@ -209,7 +209,7 @@ def test_a_scene_of_portrait_and_landscape(views: Views, tmp_path: Path):
     assert {tuple(size) for size in scene.train.cameras.sizes.tolist()} == {(48, 40), (26, 33)}
     assert scene.resolution == (48, 40)
     whole = views.cameras.view_rays(2).directions.view(40, 48, 3)[4:-3, 10:-12].reshape(-1, 3)
-    turn = torch.linalg.inv(scene.to_source[:3, :3])
+    turn = torch.linalg.inv(scene.to_source[:3, :3]).float()
     expected = torch.nn.functional.normalize(whole @ turn.T, dim=1)
     torch.testing.assert_close(scene.train.cameras.view_rays(1).directions, expected, atol=1e-5, rtol=0)
 

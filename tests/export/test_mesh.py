@@ -11,6 +11,7 @@ import pytest
 import torch
 import trimesh
 from export.balls import CENTRE, DENSE, RADIUS, ball_run, ball_system
+from scipy.spatial import cKDTree
 
 from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
@@ -18,6 +19,8 @@ from nerf_lightning.export.__main__ import task
 from nerf_lightning.export.mesh import mesh_file, points_file, voxels_file
 from nerf_lightning.export.volume import cells_across, region_of, sample_volume, volume_of
 
+UTM = torch.tensor([5e5, 5.4112e6, 300.0], dtype=torch.float64)
+"""Metres, as georeferenced files have coordinates."""
 SCALE, SHIFT = 0.02, torch.tensor([5.0, -1.0, 2.0])
 TURN = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 RESOLUTION = 40
@@ -25,7 +28,7 @@ RESOLUTION = 40
 
 def to_source() -> torch.Tensor:
     """Another place, direction and scale: what a capture's own frame is to the one a run works in."""
-    similarity = torch.eye(4)
+    similarity = torch.eye(4, dtype=torch.float64)
     similarity[:3, :3] = SCALE * TURN
     similarity[:3, 3] = SHIFT
     return similarity
@@ -35,7 +38,7 @@ def there(places: torch.Tensor) -> np.ndarray:
     return (places @ (SCALE * TURN).T + SHIFT).numpy()
 
 
-@pytest.mark.parametrize("suffix", ["ply", "glb"])
+@pytest.mark.parametrize("suffix", ["ply", "glb", "obj", "stl"])
 def test_meshes_stand_in_the_photos_own_frame(suffix: str):
     run = ball_run(to_source())
     shape = mesh_file(run, run.orbit, sample_volume(run.system, RESOLUTION), None, suffix)
@@ -49,10 +52,57 @@ def test_meshes_stand_in_the_photos_own_frame(suffix: str):
     radius = np.linalg.norm(vertices - there(CENTRE), axis=1)
     assert np.percentile(np.abs(radius - SCALE * RADIUS), 95) < 1.5 * cell
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * (SCALE * RADIUS) ** 3, rel=0.2)
+    if suffix == "stl":
+        return  # the format has no colours
     red, blue = mesh.visual.vertex_colors[:, 0], mesh.visual.vertex_colors[:, 2]
     height = (vertices @ TURN.numpy())[:, 2]
     top, bottom = height.argmax(), height.argmin()
     assert red[top] > 240 > 20 > blue[top] and blue[bottom] > 240 > 20 > red[bottom], "seen from outside"
+
+
+def written(suffix: str, shift: torch.Tensor) -> tuple[np.ndarray, str, bytes]:
+    """Vertices as another library reads them, without their order; what is said of the file; and the file."""
+    run = ball_run(to_source())
+    run.to_source[:3, 3] += shift
+    volume = sample_volume(run.system, RESOLUTION)
+    if suffix == "points":
+        shape, suffix = points_file(run, run.orbit, volume, None), "ply"
+    else:
+        shape = mesh_file(run, run.orbit, volume, None, suffix)
+    loaded = trimesh.load(io.BytesIO(shape.content), file_type=suffix, process=False)
+    vertices = loaded.to_mesh().vertices if isinstance(loaded, trimesh.Scene) else loaded.vertices
+    return np.asarray(vertices), shape.words, shape.content
+
+
+@pytest.mark.parametrize("suffix", ["ply", "points", "obj", "stl", "glb"])
+def test_georeferenced_vertices_are_as_exact_as_at_the_origin(suffix: str):
+    """In UTM coordinates single precision would leave steps of half a metre."""
+    near, words, _ = written("ply", torch.zeros(3))
+    far, words, content = written(suffix, UTM)
+    shift = UTM.numpy()
+    if suffix == "glb":  # y is up, and the turn that leads to that is undone
+        far = np.stack([far[:, 0], -far[:, 2], far[:, 1]], axis=1) @ TURN.T.numpy()
+        assert "the node's transform holds the offset 500005, 5411199, 302" in words
+    if suffix == "stl":
+        assert "coordinates lack the offset 500005, 5411199, 302" in words
+        assert b"offset 500005, 5411199, 302 " in content[:80]
+        shift = shift - [500005, 5411199, 302]
+    size = np.ptp(near, axis=0).max()
+    # Their order differs: each triangle of an STL file has vertices of its own.
+    for some, others in ((near, far - shift), (far - shift, near)):
+        assert cKDTree(some).query(others)[0].max() < 1e-6 * size
+    near_x, far_x = (np.unique(np.round(v[:, 0] / size, 5)) for v in (near, far - shift))
+    assert len(near_x) > 100 and len(far_x) == pytest.approx(len(near_x), rel=0.02)
+
+
+def test_a_box_cuts_georeferenced_cells_where_it_is():
+    run = ball_run(to_source())
+    near = volume_of(run, RESOLUTION, box := torch.tensor([[4.99, -1.005, 1.99], [5.006, -0.992, 2.01]]).double())
+    run.to_source[:3, 3] += UTM
+    far = volume_of(run, RESOLUTION, box + UTM)
+    torch.testing.assert_close(far.low, near.low, atol=1e-6, rtol=0)
+    torch.testing.assert_close(far.density, near.density, atol=0.01, rtol=0)
+    assert near.density.shape == (40, 33, 27), "the box, in cells of the scene"
 
 
 def test_points_are_the_meshs_vertices():

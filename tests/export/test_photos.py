@@ -1,5 +1,6 @@
 """Photos and cameras written for other programs, read again."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,6 +60,19 @@ def test_what_is_written_is_read_again(lens: Distortion, fisheye: bool, masked: 
         torch.testing.assert_close(found.cameras.K, views.cameras.K)
         local = [(x.view_rays(1).directions @ x.c2w[1, :3, :3]) for x in (found.cameras, views.cameras)]
         torch.testing.assert_close(*local, atol=1e-5, rtol=1e-5)
+
+
+def test_georeferenced_poses_are_written_in_double_precision(tmp_path: Path):
+    views, written = photographed(3, 3, Distortion(), False, False), []
+    to_source = torch.eye(4, dtype=torch.float64)
+    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    for name, shift in (("near", [0.0, 0.0, 0.0]), ("far", [5e5, 5.4112e6, 300.0])):
+        to_source[:3, 3] = torch.tensor(shift)
+        write_photos(Scene("made", "made", views, views, views.cameras, box, to_source=to_source), tmp_path / name)
+        frames = json.loads((tmp_path / name / "transforms.json").read_text())["frames"]
+        written.append(torch.tensor([frame["transform_matrix"] for frame in frames], dtype=torch.float64))
+    shift = (written[1] - written[0])[:, :3, 3]
+    torch.testing.assert_close(shift, to_source[:3, 3].expand(6, 3), atol=1e-8, rtol=0)
 
 
 def test_alpha_stays_and_equal_names_become_numbers(tmp_path: Path):

@@ -92,7 +92,8 @@ def test_a_strangers_run_neither_asks_the_network_nor_leaves_a_file(small_run: P
     assert not (tmp_path / ".profile").exists()
 
 
-def test_photos_are_seen_in_the_frame_of_the_run(tmp_path: Path):
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (5e5, 5.4112e6, 300.0)], ids=["local", "georeferenced"])
+def test_photos_are_seen_in_the_frame_of_the_run(shift: tuple[float, float, float], tmp_path: Path):
     """Half of a capture has another middle and another scale than all of it; its cameras still stand where they stood."""
     whole = bricks(size=16, train_views=12, val_views=2, cache="")
     views: Views = whole.train
@@ -102,7 +103,9 @@ def test_photos_are_seen_in_the_frame_of_the_run(tmp_path: Path):
         names = [f"{i:04d}.png" for i in chosen]
         for old, new in zip(photos(tmp_path / name / "images", some, first=100), names, strict=True):
             (tmp_path / name / "images" / old).rename(tmp_path / name / "images" / new)
-        write_colmap(tmp_path / name / "sparse/0", some.cameras.c2w.numpy(), names, cameras_of(some))
+        c2w = some.cameras.c2w.double()
+        c2w[:, :3, 3] += torch.tensor(shift, dtype=torch.float64)
+        write_colmap(tmp_path / name / "sparse/0", c2w.numpy(), names, cameras_of(some))
         return str(tmp_path / name)
 
     cfg = composed(["dataset=photos", f"dataset.path={capture('all', list(range(12)))}"], tmp_path / "run")

@@ -164,7 +164,7 @@ def save_npz(scene: Scene, path: Path) -> None:
         arrays["unbounded"] = torch.tensor(True)
     if any(scene.background):
         arrays["background"] = torch.tensor(scene.background, dtype=torch.float64)
-    if not torch.equal(scene.to_source, torch.eye(4)):
+    if not torch.equal(scene.to_source, torch.eye(4, dtype=torch.float64)):
         arrays["to_source"] = scene.to_source
     content: dict[str, Any] = {key: array.numpy() for key, array in arrays.items()}
     try:
