@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 import nerf_lightning as nl
-from nerf_lightning.cameras import Cameras, Distortion, Lenses
+from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 from nerf_lightning.dataset import Scene, Views, draw_rays
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.stability.toys import PILE, around, enclosing, photograph, toy
@@ -78,7 +78,7 @@ def through_fisheye(views: int, phase: float) -> Views:
     half = math.atan(float(0.5 * SIZE / K[0, 0, 0]))
     focal = 0.5 * SIZE / (half * (1 + FISHEYE.k1 * half**2 + FISHEYE.k2 * half**4))
     K[:, 0, 0] = K[:, 1, 1] = focal
-    lenses = Lenses(torch.tensor([FISHEYE]).repeat(views, 1), torch.ones(views, dtype=torch.bool))
+    lenses = Lenses(torch.tensor([FISHEYE]).repeat(views, 1), torch.full((views,), Projection.FISHEYE))
     cameras = Cameras(K, straight.c2w, straight.sizes, lenses)
     return Views.of(photograph(PILE, cameras, GREY), cameras)
 

@@ -13,7 +13,7 @@ import torch
 
 import nerf_lightning as nl
 from nerf_lightning.callbacks import results
-from nerf_lightning.cameras import Cameras, Distortion, Lenses
+from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """16 photos on grey: every second is twice as wide as high; a box is masked in every third."""
     root = tmp_path_factory.mktemp("capture")
     cameras = around(16, 24)
-    lenses = Lenses(torch.tensor([Distortion(K1)]).repeat(16, 1), torch.ones(16, dtype=torch.bool))
+    lenses = Lenses(torch.tensor([Distortion(K1)]).repeat(16, 1), torch.full((16,), Projection.FISHEYE))
     square = Cameras(cameras.K, cameras.c2w, cameras.sizes, lenses)
     K = cameras.K.clone()
     K[:, 0, 2] += 12

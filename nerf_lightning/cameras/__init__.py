@@ -2,7 +2,7 @@
 
 from nerf_lightning.cameras.bounds import Bounds, InBounds
 from nerf_lightning.cameras.cameras import Cameras, Rays
-from nerf_lightning.cameras.lenses import Distortion, Lenses
+from nerf_lightning.cameras.lenses import Distortion, Lenses, Projection
 from nerf_lightning.cameras.orbit import (
     axes_meet,
     focus_point,
@@ -28,6 +28,7 @@ __all__ = [
     "Distortion",
     "InBounds",
     "Lenses",
+    "Projection",
     "Rays",
     "axes_meet",
     "focus_point",

@@ -1,5 +1,6 @@
 """Cameras and Rays, the data of the first stages."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -7,8 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf_lightning.cameras.lenses import Lenses, distort, per_view, to_directions, to_flat, undistort
+from nerf_lightning.cameras.lenses import Lenses, Projection, distort, per_view, to_directions, to_flat, undistort
 
+PINHOLE_FOV_DEG, PINHOLE_ASPECT = 90.0, 4 / 3
+"""Horizontal field of view, and width by height, of pinhole cameras that stand for equirectangular ones."""
 LATTICE = 33
 """Places along each side of a photo where its lens is undone beforehand: between them one step of Newton's method suffices."""
 
@@ -123,6 +126,20 @@ class Cameras:
         K[:, :2, :2] *= factor
         return replace(self, K=K, lenses=None if self.lenses is None else self.lenses.zoomed(factor))
 
+    def as_pinholes(self) -> "Cameras":
+        """Pinhole cameras in the same places, without distortion. Equirectangular views become `PINHOLE_FOV_DEG` wide, with the
+        same pixels per angle at the centre."""
+        if self.lenses is None:
+            return self
+        focal = self.K[:, 0, 0].cpu()
+        width = 2 * focal * math.tan(math.radians(PINHOLE_FOV_DEG) / 2)
+        sizes = torch.stack([width, width / PINHOLE_ASPECT], dim=1).round().long().clamp_min(1)
+        K = torch.diag_embed(torch.stack([focal, focal, torch.ones_like(focal)], dim=1))
+        K[:, :2, 2] = sizes.to(K) / 2
+        everywhere = self.lenses.projection == Projection.EQUIRECTANGULAR
+        sizes = torch.where(everywhere.cpu()[:, None], sizes, self.sizes)
+        return Cameras(torch.where(everywhere[:, None, None], K.to(self.K), self.K), self.c2w, sizes)
+
     def pixel_width(self, place: Float[Tensor, "3"]) -> float:
         """Width of what one pixel shows at a place, world units: the median over the views."""
         return float(((self.centres - place).norm(dim=1) / self.K[:, 0, 0]).median())
@@ -137,7 +154,7 @@ class Cameras:
             coefficients = self.lenses.coefficients[view]
             places = torch.stack([u, v], dim=1)
             flat = undistort(_on_sensor(self.K[view], places), coefficients, self._guess(view, places), steps=1)
-            local = to_directions(flat, self.lenses.fisheye[view])
+            local = to_directions(flat, self.lenses.projection[view])
             directions = (self.c2w[view, :3, :3] * local[:, None]).sum(2)
         return Rays(self.centres[view], torch.nn.functional.normalize(directions, dim=1))
 
@@ -191,21 +208,28 @@ class Cameras:
 
         Returns:
             Pixels (column, row; the first pixel's centre is at 0.5), of no use for points that the view does not see;
-            depths along the optical axis, world units; and which points are in the picture.
+            depths along the optical axis, or distances in an equirectangular view, world units; and which points are in the
+            picture.
         """
         local = (points - self.centres[view]).to(self.c2w) @ self.c2w[view, :3, :3]
         depth = local[:, 2]
         if self.lenses is None:
             ahead, flat = depth > 0, local[:, :2] / torch.where(depth > 0, depth, 1.0)[:, None]
         else:
-            fisheye = per_view(self.lenses.fisheye, view)
-            flat = to_flat(local, fisheye)
+            projection = per_view(self.lenses.projection, view)
+            flat = to_flat(local, projection)
             # Beyond the rim a polynomial may lead back into the picture.
-            ahead = ((depth > 0) | fisheye) & (flat.norm(dim=1) <= self.rims[view])
+            ahead = ((depth > 0) | (projection != Projection.PERSPECTIVE)) & (flat.norm(dim=1) <= self.rims[view])
             flat = distort(flat, per_view(self.lenses.coefficients, view))[0]
-        K = self.K[view]
+        K, size = self.K[view], self.sizes[view].to(self.K)
         pixels = flat @ K[:2, :2].T + K[:2, 2]
-        inside = ahead & (pixels >= 0).all(1) & (pixels < self.sizes[view].to(pixels)).all(1)
+        if self.lenses is not None:
+            everywhere = projection == Projection.EQUIRECTANGULAR
+            depth = torch.where(everywhere, local.norm(dim=1), depth)
+            # The seam and the poles lie on the border.
+            last = size * (1 - torch.finfo(size.dtype).eps)
+            pixels = torch.where(everywhere[:, None], pixels.clamp_min(0).minimum(last), pixels)
+        inside = ahead & (pixels >= 0).all(1) & (pixels < size).all(1)
         return pixels, depth, inside
 
     @cached_property

@@ -1,10 +1,11 @@
 """Lens models: from directions to places in a photo, and back."""
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 NEWTON = 8
@@ -35,28 +36,39 @@ POWERS = Distortion(k1=2, k2=4, k3=6, k4=8, d1=2, d2=4, d3=6, p1=1, p2=1, s1=1, 
 """Of the distance from the axis, by which each bends a place in proportion to that distance."""
 
 
+class Projection(IntEnum):
+    """How a direction (x, y, z) in the camera frame becomes flat coordinates."""
+
+    PERSPECTIVE = 0
+    """(x/z, y/z)."""
+    FISHEYE = 1
+    """Those times theta / tan(theta), where theta is the angle to the optical axis: equidistant."""
+    EQUIRECTANGULAR = 2
+    """Longitude to the right of the optical axis and latitude downward, radians: a photo of all directions."""
+
+
 @dataclass(frozen=True)
 class Lenses:
-    """The distortion of V views, in OpenCV's and COLMAP's terms.
+    """The projection and the distortion of V views, in OpenCV's and COLMAP's terms.
 
-    A direction (x, y, z) in the camera frame has the flat coordinates (x/z, y/z); with a fisheye lens those times
-    theta / tan(theta), where theta is the angle to the optical axis. The distortion moves them; K makes pixels of them.
+    A direction has flat coordinates, see `Projection`. The distortion moves them; K makes pixels of them.
     """
 
     coefficients: Float[Tensor, "V 11"]
     """See `Distortion`."""
-    fisheye: Bool[Tensor, "V"]
+    projection: Int[Tensor, "V"]
+    """See `Projection`."""
 
     def __getitem__(self, index: slice | Tensor) -> "Lenses":
-        return Lenses(self.coefficients[index], self.fisheye[index])
+        return Lenses(self.coefficients[index], self.projection[index])
 
     def zoomed(self, factor: float) -> "Lenses":
         """Of cameras with that many times the focal length, which bend the same places of a photo alike: a place is bent by how
         far it lies from the axis in focal lengths."""
-        return Lenses(self.coefficients * factor ** self.coefficients.new_tensor(POWERS), self.fisheye)
+        return Lenses(self.coefficients * factor ** self.coefficients.new_tensor(POWERS), self.projection)
 
     def to(self, device: torch.device | str) -> "Lenses":
-        return Lenses(self.coefficients.to(device), self.fisheye.to(device))
+        return Lenses(self.coefficients.to(device), self.projection.to(device))
 
 
 def distort(
@@ -121,21 +133,30 @@ def undistort(
     return flat
 
 
-def to_directions(flat: Float[Tensor, "N 2"], fisheye: Bool[Tensor, "#N"]) -> Float[Tensor, "N 3"]:
+def to_directions(flat: Float[Tensor, "N 2"], projection: Int[Tensor, "#N"]) -> Float[Tensor, "N 3"]:
     """Directions of any length, camera frame, with some flat coordinates."""
-    theta = flat.norm(dim=1)
-    bent = torch.sinc(theta / torch.pi)  # sin(theta) / theta
-    across = torch.where(fisheye, bent, 1.0)[:, None] * flat
-    return torch.cat([across, torch.where(fisheye, theta.cos(), 1.0)[:, None]], dim=1)
+    theta = flat.norm(dim=1, keepdim=True)
+    perspective = torch.cat([flat, torch.ones_like(theta)], dim=1)
+    fisheye = torch.cat([flat * torch.sinc(theta / torch.pi), theta.cos()], dim=1)  # sin(theta) / theta
+    longitude, latitude = flat.unbind(1)
+    level = latitude.cos()
+    equirectangular = torch.stack([longitude.sin() * level, latitude.sin(), longitude.cos() * level], dim=1)
+    kind = projection[:, None]
+    bent = torch.where(kind == Projection.FISHEYE, fisheye, equirectangular)
+    return torch.where(kind == Projection.PERSPECTIVE, perspective, bent)
 
 
-def to_flat(directions: Float[Tensor, "N 3"], fisheye: Bool[Tensor, "#N"]) -> Float[Tensor, "N 2"]:
-    """The inverse of `to_directions`; of no use for directions that a lens without fisheye does not see (z <= 0)."""
-    across, ahead = directions[:, :2], directions[:, 2]
-    beside = across.norm(dim=1)
-    bent = torch.atan2(beside, ahead) / beside.clamp_min(NEVER)
-    straight = 1 / torch.where(ahead.abs() < NEVER, NEVER, ahead)
-    return across * torch.where(fisheye, bent, straight)[:, None]
+def to_flat(directions: Float[Tensor, "N 3"], projection: Int[Tensor, "#N"]) -> Float[Tensor, "N 2"]:
+    """The inverse of `to_directions`; of no use for directions that a perspective lens does not see (z <= 0)."""
+    across, ahead = directions[:, :2], directions[:, 2:]
+    beside = across.norm(dim=1, keepdim=True)
+    perspective = across / torch.where(ahead.abs() < NEVER, NEVER, ahead)
+    fisheye = across * torch.atan2(beside, ahead) / beside.clamp_min(NEVER)
+    x, y, z = directions.unbind(1)
+    equirectangular = torch.stack([torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))], dim=1)
+    kind = projection[:, None]
+    bent = torch.where(kind == Projection.FISHEYE, fisheye, equirectangular)
+    return torch.where(kind == Projection.PERSPECTIVE, perspective, bent)
 
 
 def per_view(values: Shaped[Tensor, "V *rest"], view: Shaped[Tensor, "N"] | int) -> Shaped[Tensor, "N *rest"]:

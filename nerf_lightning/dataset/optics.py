@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerf_lightning.cameras import Cameras, Distortion, Lenses
+from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 from nerf_lightning.cameras.lenses import distort, undistort
 from nerf_lightning.dataset.lens import Lens
 
@@ -22,7 +22,7 @@ FITTED = 1e-5
 
 @dataclass(frozen=True)
 class Optics:
-    """Intrinsics in pixels, pixel centres at +0.5, and the distortion (see `cameras.Lenses`)."""
+    """Intrinsics in pixels, pixel centres at +0.5, the distortion and the projection (see `cameras.Lenses`)."""
 
     width: int
     height: int
@@ -31,7 +31,7 @@ class Optics:
     cx: float
     cy: float
     distortion: Distortion = Distortion()
-    fisheye: bool = False
+    projection: Projection = Projection.PERSPECTIVE
 
     @property
     def K(self) -> Float[np.ndarray, "3 3"]:
@@ -40,12 +40,12 @@ class Optics:
     @property
     def bent(self) -> bool:
         """Whether it is not a pinhole camera's."""
-        return self.fisheye or any(self.distortion)
+        return self.projection != Projection.PERSPECTIVE or any(self.distortion)
 
     def perspective(self) -> Lens | None:
         """The same as OpenCV's five coefficients; None where they do not suffice."""
         d = self.distortion
-        if self.fisheye or any((d.k4, d.d1, d.d2, d.d3, d.s1, d.s2)):
+        if self.projection != Projection.PERSPECTIVE or any((d.k4, d.d1, d.d2, d.d3, d.s1, d.s2)):
             return None
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy, (d.k1, d.k2, d.p1, d.p2, d.k3))
 
@@ -76,7 +76,7 @@ def leads_back(optics: Optics) -> bool:
     """Whether rays through pixels all over the photo appear in it where they were cast: as training makes them, in single
     precision, which a distortion may be too strong for."""
     width, height = optics.width, optics.height
-    lenses = Lenses(torch.tensor([optics.distortion]).float(), torch.tensor([optics.fisheye]))
+    lenses = Lenses(torch.tensor([optics.distortion]).float(), torch.tensor([optics.projection]))
     cameras = Cameras(
         torch.from_numpy(optics.K).float()[None], torch.eye(4)[None], torch.tensor([[width, height]]), lenses
     )
@@ -86,6 +86,19 @@ def leads_back(optics: Optics) -> bool:
     places, _, _ = cameras.project(directions, 0)
     off = places - torch.stack([col, row], dim=1) - 0.5
     return bool((off.abs() < RETURNED).all())  # false for nan too
+
+
+def equirectangular(width: int, height: int) -> Optics:
+    """The optics of a photo of all directions, 360 degrees wide and 180 high, whose centre lies on the optical axis."""
+    return Optics(
+        width,
+        height,
+        fx=width / (2 * math.pi),
+        fy=height / math.pi,
+        cx=width / 2,
+        cy=height / 2,
+        projection=Projection.EQUIRECTANGULAR,
+    )
 
 
 def field_of_view_lens(
@@ -109,4 +122,4 @@ def field_of_view_lens(
     if np.abs(theta + powers @ k - wanted).max() > FITTED:
         return None
     k1, k2, k3, k4 = map(float, k)
-    return Optics(width, height, fx * slope, fy * slope, cx, cy, Distortion(k1, k2, k3, k4), fisheye=True)
+    return Optics(width, height, fx * slope, fy * slope, cx, cy, Distortion(k1, k2, k3, k4), Projection.FISHEYE)

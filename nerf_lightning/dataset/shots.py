@@ -148,7 +148,7 @@ def read_shots(source: Path, shots: Sequence[Shot], reading: Reading) -> Views:
     bent = None
     if any(shot.optics.bent for shot in shots) and not reading.undistort:
         coefficients = torch.tensor([shot.optics.distortion for shot in shots])
-        bent = Lenses(coefficients.float(), torch.tensor([shot.optics.fisheye for shot in shots]))
+        bent = Lenses(coefficients.float(), torch.tensor([shot.optics.projection for shot in shots]))
     c2w = torch.from_numpy(np.stack([shot.c2w for shot in shots]))
     of = sizes if reading.undistort else [(shot.optics.width, shot.optics.height) for shot in shots]
     cameras = Cameras(torch.from_numpy(K).float(), c2w.float(), torch.tensor(of), bent).resized(torch.tensor(small))
@@ -205,10 +205,9 @@ def _pinhole(source: Path, shot: Shot, size: tuple[int, int]) -> Lens:
     x, y = width / o.width, height / o.height
     lens = replace(o, width=width, height=height, fx=o.fx * x, fy=o.fy * y, cx=o.cx * x, cy=o.cy * y).perspective()
     if lens is None:
+        found = "a lens with more than these, a fisheye or a photo of all directions"
         expected = "at most k1, k2, k3, p1, p2 for undistort=true"
-        raise InputError(
-            source, shot.name, "a lens with more than these, or a fisheye", expected, "leave undistort=false"
-        )
+        raise InputError(source, shot.name, found, expected, "leave undistort=false")
     return lens
 
 

@@ -41,12 +41,12 @@ def camera_map(
         tags: corners in the world by id.
         unit: of lengths, in words.
     """
-    cameras = scene.train.cameras
+    camera = scene.train.cameras[0].as_pinholes()
     orbit = scene.orbit.centres.double().numpy()
     box = scene.bounds.aabb.double().numpy()
     solid = np.concatenate([np.stack([c2w[:3, 3] for _, c2w in numbered]), orbit, box, *tags.values()])
     depth = FRUSTUM * float(np.ptp(solid[:, :2], axis=0).max())
-    shape = frustum(cameras.K[0].double().numpy(), *cameras.size(0), depth)
+    shape = frustum(camera.K[0].double().numpy(), *camera.size(0), depth)
     frusta = [(number, shape @ c2w[:3, :3].T + c2w[:3, 3]) for number, c2w in numbered]
     everything = np.concatenate([solid, *[points for _, points in frusta]])
     low, high = everything.min(0) - depth / 2, everything.max(0) + depth / 2

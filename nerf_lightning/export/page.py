@@ -104,7 +104,7 @@ def described(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
 def photos_of(cameras: Cameras, names: Sequence[str], focus: Float[Tensor, "3"]) -> dict[str, Any]:
     """Photos to look through, and how deep to draw their pyramids."""
     depth = FRUSTUM * float((cameras.centres - focus).norm(dim=1).median())
-    return {"names": list(names), "depth": depth, **poses(cameras)}
+    return {"names": list(names), "depth": depth, **poses(cameras.as_pinholes())}
 
 
 def field_page(

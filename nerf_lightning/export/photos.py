@@ -6,15 +6,15 @@ from typing import Any
 import imageio.v3 as imageio
 import numpy as np
 
-from nerf_lightning.cameras import Distortion, in_other_frame
+from nerf_lightning.cameras import Distortion, Projection, in_other_frame
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.dataset.formats.conventions import opengl_to_opencv
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.progress import tracked
 
-STATED = {False: ("k1", "k2", "k3", "p1", "p2"), True: ("k1", "k2", "k3", "k4")}
-"""Coefficients of a lens that the format knows, without and with a fisheye."""
+STATED = {Projection.PERSPECTIVE: ("k1", "k2", "k3", "p1", "p2"), Projection.FISHEYE: ("k1", "k2", "k3", "k4")}
+"""Coefficients of a lens that the format knows."""
 
 
 def write_photos(scene: Scene, folder: Path) -> None:
@@ -59,12 +59,15 @@ def optics(views: Views, view: int) -> dict[str, Any]:
     lenses = views.cameras.lenses
     if lenses is None:
         return {"camera_model": "PINHOLE", **found}
-    fisheye = bool(lenses.fisheye[view])
+    projection = Projection(int(lenses.projection[view]))
+    if projection == Projection.EQUIRECTANGULAR:
+        # nerfstudio's readers want the height for both focal lengths; here the size says it all.
+        return {"camera_model": "EQUIRECTANGULAR", **found, "fl_x": height, "fl_y": height}
     lens = Distortion(*lenses.coefficients[view].tolist())._asdict()
-    if unknown := [name for name, value in lens.items() if value and name not in STATED[fisheye]]:
-        expected = f"at most {', '.join(STATED[fisheye])}, as transforms.json knows"
+    if unknown := [name for name, value in lens.items() if value and name not in STATED[projection]]:
+        expected = f"at most {', '.join(STATED[projection])}, as transforms.json knows"
         raise InputError(
             views.name(view), unknown[0], f"{lens[unknown[0]]:g}", expected, "train with dataset.undistort=true"
         )
-    model = "OPENCV_FISHEYE" if fisheye else "OPENCV"
-    return {"camera_model": model, **found, **{name: lens[name] for name in STATED[fisheye]}}
+    model = "OPENCV_FISHEYE" if projection == Projection.FISHEYE else "OPENCV"
+    return {"camera_model": model, **found, **{name: lens[name] for name in STATED[projection]}}

@@ -4,6 +4,7 @@ import logging
 
 import numpy as np
 
+from nerf_lightning.cameras import Projection
 from nerf_lightning.dataset import Reading, Scene, open_scene
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.drawing.camera_map import camera_map
@@ -88,8 +89,9 @@ def facts_of(scene: Scene) -> dict[str, str]:
         sizes[tuple(size)] = sizes.get(tuple(size), 0) + 1
     cameras, bounds = scene.train.cameras, scene.bounds
     lens = "pinhole" if cameras.lenses is None else "distorted; rays follow the lens"
-    if cameras.lenses is not None and bool(cameras.lenses.fisheye.any()):
-        lens = "fisheye; rays follow the lens"
+    for projection in (Projection.FISHEYE, Projection.EQUIRECTANGULAR):
+        if cameras.lenses is not None and bool((cameras.lenses.projection == projection).any()):
+            lens = f"{projection.name.lower()}; rays follow the lens"
     low, high = (", ".join(f"{value:.3g}" for value in corner.tolist()) for corner in bounds.aabb)
     facts = {
         "source": scene.source,

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.cameras import Cameras
+from nerf_lightning.cameras import Cameras, Projection
 from nerf_lightning.errors import InputError
 
 
@@ -19,15 +19,20 @@ class LensCorrections(torch.nn.Module):
         vignetting: whether photos may be darker toward their corners.
 
     Raises:
-        InputError: for a focal length of fisheye lenses.
+        InputError: for a focal length of lenses that have none, or vignetting of photos of all directions.
     """
 
     axes: Tensor
 
     def __init__(self, cameras: Cameras, focal: bool, vignetting: bool):
         super().__init__()
-        if focal and cameras.lenses is not None and bool(cameras.lenses.fisheye.any()):
-            raise InputError("refine.focal", "", "true, with fisheye lenses", "false for these")
+        if cameras.lenses is not None:
+            projection = cameras.lenses.projection
+            if focal and bool((projection != Projection.PERSPECTIVE).any()):
+                found = "true, with fisheye lenses or photos of all directions"
+                raise InputError("refine.focal", "", found, "false for these")
+            if vignetting and bool((projection == Projection.EQUIRECTANGULAR).any()):
+                raise InputError("refine.vignetting", "", "true, with photos of all directions", "false for these")
         self.register_buffer("axes", cameras.c2w[:, :3, 2].clone(), persistent=False)
         half = cameras.sizes.to(cameras.K) / 2
         corners = torch.maximum(cameras.K[:, :2, 2], 2 * half - cameras.K[:, :2, 2])

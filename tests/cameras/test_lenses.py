@@ -5,23 +5,24 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.cameras import Cameras, Distortion, Lenses
+from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 
 WIDTH, HEIGHT = 640, 480
 K = np.array([[520.0, 0, 322.3], [0, 510, 236.7], [0, 0, 1]])
+PERSPECTIVE, FISHEYE, _ = Projection
 MODELS = {
-    "radial": (Distortion(k1=-0.2, k2=0.05), False),
-    "barrel": (Distortion(k1=0.1, k2=-0.02, p1=0.004, p2=-0.006, k3=0.003), False),
-    "rational": (Distortion(k1=0.1, k2=0.03, k3=0.01, d1=0.12, d2=0.01, d3=0.002, p1=0.004, p2=-0.006), False),
-    "prism": (Distortion(k1=-0.1, s1=0.01, s2=-0.02), False),
-    "fisheye": (Distortion(k1=0.05, k2=-0.02, k3=0.01, k4=-0.003), True),
+    "radial": (Distortion(k1=-0.2, k2=0.05), PERSPECTIVE),
+    "barrel": (Distortion(k1=0.1, k2=-0.02, p1=0.004, p2=-0.006, k3=0.003), PERSPECTIVE),
+    "rational": (Distortion(k1=0.1, k2=0.03, k3=0.01, d1=0.12, d2=0.01, d3=0.002, p1=0.004, p2=-0.006), PERSPECTIVE),
+    "prism": (Distortion(k1=-0.1, s1=0.01, s2=-0.02), PERSPECTIVE),
+    "fisheye": (Distortion(k1=0.05, k2=-0.02, k3=0.01, k4=-0.003), FISHEYE),
 }
 STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
 def cameras_with(name: str) -> Cameras:
-    distortion, fisheye = MODELS[name]
-    lenses = Lenses(torch.tensor([distortion]), torch.tensor([fisheye]))
+    distortion, projection = MODELS[name]
+    lenses = Lenses(torch.tensor([distortion]), torch.tensor([projection]))
     return Cameras(torch.from_numpy(K).float()[None], torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]), lenses)
 
 
@@ -31,10 +32,10 @@ def places(count: int = 10_000) -> tuple[torch.Tensor, torch.Tensor]:
 
 def opencv(name: str, row: torch.Tensor, col: torch.Tensor) -> np.ndarray:
     """Directions by OpenCV, whose pixel centres are at integers."""
-    d, fisheye = MODELS[name]
+    d, projection = MODELS[name]
     seen = torch.stack([col, row], dim=1).double().numpy()[:, None]
     intrinsics = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    if fisheye:
+    if projection == FISHEYE:
         flat = cv2.fisheye.undistortPoints(seen, intrinsics, np.array(d[:4]), criteria=STOP)
     else:
         four = np.array([d.k1, d.k2, d.p1, d.p2, d.k3, d.d1, d.d2, d.d3, d.s1, 0, d.s2, 0])
@@ -52,7 +53,7 @@ def test_rays_are_those_of_opencv(name: str):
     assert (np.sum(rays * expected, axis=1) > 0).all() and angle.max() < 1e-5
 
 
-@pytest.mark.parametrize("name", [name for name, (_, fisheye) in MODELS.items() if not fisheye])
+@pytest.mark.parametrize("name", [name for name, (_, projection) in MODELS.items() if projection == PERSPECTIVE])
 def test_another_focal_length_bends_the_same_places_alike(name: str):
     row, col = places(500)
     given, zoomed = (
@@ -72,7 +73,7 @@ def test_projecting_leads_back_to_the_pixel(name: str):
 
 
 def test_a_fisheye_sees_beside_and_behind_itself():
-    lens = Lenses(torch.tensor([Distortion(k1=0.01)]), torch.tensor([True]))
+    lens = Lenses(torch.tensor([Distortion(k1=0.01)]), torch.tensor([FISHEYE]))
     wide = torch.tensor([[[200.0, 0, 322], [0, 200, 237], [0, 0, 1]]])
     cameras = Cameras(wide, torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]), lens)
     rays = cameras.view_rays(0)
@@ -84,7 +85,7 @@ def test_a_fisheye_sees_beside_and_behind_itself():
 
 def test_what_lies_beyond_the_rim_is_not_in_the_picture():
     # This polynomial leads back into the picture from far outside.
-    lens = Lenses(torch.tensor([Distortion(k1=-0.2)]), torch.tensor([False]))
+    lens = Lenses(torch.tensor([Distortion(k1=-0.2)]), torch.tensor([PERSPECTIVE]))
     cameras = Cameras(torch.from_numpy(K).float()[None], torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]), lens)
     outside = torch.tensor([[2.2, 0.0, 1.0]])
     assert not cameras.project(outside, 0)[2] and not cameras.project(torch.tensor([[0.0, 0.0, -1.0]]), 0)[2]
@@ -93,7 +94,7 @@ def test_what_lies_beyond_the_rim_is_not_in_the_picture():
 
 def test_a_lens_without_distortion_is_a_pinhole():
     pinhole = Cameras(torch.from_numpy(K).float()[None], torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]))
-    lens = Cameras(pinhole.K, pinhole.c2w, pinhole.sizes, Lenses(torch.zeros(1, 11), torch.tensor([False])))
+    lens = Cameras(pinhole.K, pinhole.c2w, pinhole.sizes, Lenses(torch.zeros(1, 11), torch.tensor([PERSPECTIVE])))
     row, col = places(200)
     view = torch.zeros_like(row)
     torch.testing.assert_close(lens.rays(view, row, col).directions, pinhole.rays(view, row, col).directions)

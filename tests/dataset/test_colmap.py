@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.cameras import Distortion
+from nerf_lightning.cameras import Distortion, Projection
 from nerf_lightning.dataset import Reading, Scene, Views, open_scene
 from nerf_lightning.dataset.formats.colmap_cameras import MODELS, NUMBERS, optics_of
 from nerf_lightning.dataset.optics import Optics
@@ -108,20 +108,32 @@ PARAMETERS = {
     ),
     "OPENCV_FISHEYE": (
         (50.0, 51, 24, 20, 0.1, 0.02, 0.03, 0.04),
-        Optics(48, 40, 50, 51, 24, 20, Distortion(0.1, 0.02, 0.03, 0.04), True),
+        Optics(48, 40, 50, 51, 24, 20, Distortion(0.1, 0.02, 0.03, 0.04), Projection.FISHEYE),
     ),
     "FULL_OPENCV": (
         (50.0, 51, 24, 20, 0.1, 0.2, 0.01, 0.02, 0.3, 0.01, 0.02, 0.03),
         Optics(48, 40, 50, 51, 24, 20, Distortion(0.1, 0.2, 0.3, d1=0.01, d2=0.02, d3=0.03, p1=0.01, p2=0.02)),
     ),
-    "SIMPLE_RADIAL_FISHEYE": ((50.0, 24, 20, 0.1), Optics(48, 40, 50, 50, 24, 20, Distortion(0.1), True)),
-    "RADIAL_FISHEYE": ((50.0, 24, 20, 0.1, 0.02), Optics(48, 40, 50, 50, 24, 20, Distortion(0.1, 0.02), True)),
+    "SIMPLE_RADIAL_FISHEYE": ((50.0, 24, 20, 0.1), Optics(48, 40, 50, 50, 24, 20, Distortion(0.1), Projection.FISHEYE)),
+    "RADIAL_FISHEYE": (
+        (50.0, 24, 20, 0.1, 0.02),
+        Optics(48, 40, 50, 50, 24, 20, Distortion(0.1, 0.02), Projection.FISHEYE),
+    ),
     "THIN_PRISM_FISHEYE": (
         (50.0, 51, 24, 20, 0.1, 0.02, 0.01, 0.02, 0.03, 0.04, 0.001, 0.002),
-        Optics(48, 40, 50, 51, 24, 20, Distortion(0.1, 0.02, 0.03, 0.04, p1=0.01, p2=0.02, s1=0.001, s2=0.002), True),
+        Optics(
+            48,
+            40,
+            50,
+            51,
+            24,
+            20,
+            Distortion(0.1, 0.02, 0.03, 0.04, p1=0.01, p2=0.02, s1=0.001, s2=0.002),
+            Projection.FISHEYE,
+        ),
     ),
-    "SIMPLE_FISHEYE": ((50.0, 24, 20), Optics(48, 40, 50, 50, 24, 20, fisheye=True)),
-    "FISHEYE": ((50.0, 51, 24, 20), Optics(48, 40, 50, 51, 24, 20, fisheye=True)),
+    "SIMPLE_FISHEYE": ((50.0, 24, 20), Optics(48, 40, 50, 50, 24, 20, projection=Projection.FISHEYE)),
+    "FISHEYE": ((50.0, 51, 24, 20), Optics(48, 40, 50, 51, 24, 20, projection=Projection.FISHEYE)),
 }
 
 
@@ -149,7 +161,7 @@ def rays_of(optics: Optics, uv: np.ndarray) -> np.ndarray:
 
     seen = torch.from_numpy((uv - (optics.cx, optics.cy)) / (optics.fx, optics.fy))
     flat = undistort(seen, torch.tensor([optics.distortion], dtype=torch.float64))
-    return to_directions(flat, torch.tensor([optics.fisheye])).numpy()
+    return to_directions(flat, torch.tensor([optics.projection])).numpy()
 
 
 def test_a_lens_that_folds_the_photo_is_refused():
@@ -210,17 +222,17 @@ def test_llff_tells_where_content_starts(views: Views, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("focal", "distortion", "fisheye"),
+    ("focal", "distortion", "projection"),
     [
-        (30.6, Distortion(k3=-3e5, d2=-8e12), True),
-        (111.0, Distortion(k1=6e9, d2=-6e12), True),
-        (38.0, Distortion(k1=-4e9, d1=-7e6), False),
-        (6443.0, Distortion(k3=2e3, d1=-6e7), False),
+        (30.6, Distortion(k3=-3e5, d2=-8e12), Projection.FISHEYE),
+        (111.0, Distortion(k1=6e9, d2=-6e12), Projection.FISHEYE),
+        (38.0, Distortion(k1=-4e9, d1=-7e6), Projection.PERSPECTIVE),
+        (6443.0, Distortion(k3=2e3, d1=-6e7), Projection.PERSPECTIVE),
     ],
 )
-def test_a_lens_whose_rays_do_not_lead_back_is_none(focal: float, distortion: Distortion, fisheye: bool):
+def test_a_lens_whose_rays_do_not_lead_back_is_none(focal: float, distortion: Distortion, projection: Projection):
     """Their borders unfold in double precision; between, or in single precision, rays go elsewhere."""
-    assert not Optics(640, 480, focal, focal, 320, 240, distortion, fisheye).sees_every_pixel()
+    assert not Optics(640, 480, focal, focal, 320, 240, distortion, projection).sees_every_pixel()
 
 
 @pytest.mark.parametrize(("focal", "k1"), [(1e5, -0.2), (1e5, 900.0), (4000.0, 0.1), (6000.0, -0.3)])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.cameras import focus_point, transform
+from nerf_lightning.cameras import Projection, focus_point, transform
 from nerf_lightning.dataset import Scene, load_transforms
 from nerf_lightning.dataset.lens import Lens, rectify
 from nerf_lightning.dataset.shots import Reading
@@ -210,8 +210,8 @@ def test_a_fisheye_of_a_frame(tmp_path: Path):
     lens = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": -0.001}
     scene = load_transforms(write(tmp_path / "capture", INTRINSICS, per_frame=lambda i: lens if i == 3 else {}))
     lenses = scene.train.cameras.lenses
-    assert lenses is not None and lenses.fisheye.sum() == 1
-    which = int(lenses.fisheye.int().argmax())
+    assert lenses is not None and lenses.projection.tolist().count(Projection.FISHEYE) == 1
+    which = int(lenses.projection.argmax())
     assert lenses.coefficients[which, :4].tolist() == pytest.approx([0.02, -0.01, 0.003, -0.001])
 
 

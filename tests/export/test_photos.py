@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerf_lightning.cameras import Bounds, Cameras, Distortion, Lenses, in_other_frame, orbit_around
+from nerf_lightning.cameras import Bounds, Cameras, Distortion, Lenses, Projection, in_other_frame, orbit_around
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.dataset.formats.transforms import load_transforms
 from nerf_lightning.dataset.views import Runs
@@ -17,12 +17,12 @@ from nerf_lightning.export.photos import write_photos
 WIDTH, HEIGHT = 12, 8
 
 
-def photographed(count: int, channels: int, lens: Distortion, fisheye: bool, masked: bool) -> Views:
+def photographed(count: int, channels: int, lens: Distortion, projection: Projection, masked: bool) -> Views:
     generator = torch.Generator().manual_seed(count)
     pixels = torch.randint(0, 256, (count, HEIGHT, WIDTH, channels), generator=generator, dtype=torch.uint8)
     c2w = orbit_around(torch.zeros(3), torch.tensor([0.0, 0, 1]), 1.5, 0.4, count)
     K = torch.tensor([[15.0, 0, 6.2], [0, 14, 3.9], [0, 0, 1]]).repeat(count, 1, 1)
-    lenses = Lenses(torch.tensor([lens] * count), torch.tensor([fisheye] * count)) if any(lens) or fisheye else None
+    lenses = Lenses(torch.tensor([lens] * count), torch.tensor([projection] * count)) if any(lens) else None
     cameras = replace(Cameras.of_size(K, c2w, WIDTH, HEIGHT), lenses=lenses)
     known = None
     if masked:
@@ -31,20 +31,20 @@ def photographed(count: int, channels: int, lens: Distortion, fisheye: bool, mas
 
 
 LENSES = {
-    "pinhole": (Distortion(), False),
-    "opencv": (Distortion(k1=0.05, k2=-0.01, p1=0.002, p2=-0.001), False),
-    "fisheye": (Distortion(k1=0.02, k4=-0.001), True),
+    "pinhole": (Distortion(), Projection.PERSPECTIVE),
+    "opencv": (Distortion(k1=0.05, k2=-0.01, p1=0.002, p2=-0.001), Projection.PERSPECTIVE),
+    "fisheye": (Distortion(k1=0.02, k4=-0.001), Projection.FISHEYE),
 }
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize(("lens", "fisheye"), LENSES.values(), ids=LENSES)
-def test_what_is_written_is_read_again(lens: Distortion, fisheye: bool, masked: bool, tmp_path: Path):
+@pytest.mark.parametrize(("lens", "projection"), LENSES.values(), ids=LENSES)
+def test_what_is_written_is_read_again(lens: Distortion, projection: Projection, masked: bool, tmp_path: Path):
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)))[0]
     to_source = torch.eye(4)
     to_source[:3, :3] = 2.5 * turn * turn.det()
     to_source[:3, 3] = torch.tensor([3.0, -1.0, 0.5])
-    train, val = (photographed(count, 3, lens, fisheye, masked) for count in (6, 2))
+    train, val = (photographed(count, 3, lens, projection, masked) for count in (6, 2))
     box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
     write_photos(Scene("made", "made", train, val, val.cameras, box, to_source=to_source), tmp_path)
     again = load_transforms(tmp_path)
@@ -63,7 +63,7 @@ def test_what_is_written_is_read_again(lens: Distortion, fisheye: bool, masked: 
 
 
 def test_georeferenced_poses_are_written_in_double_precision(tmp_path: Path):
-    views, written = photographed(3, 3, Distortion(), False, False), []
+    views, written = photographed(3, 3, Distortion(), Projection.PERSPECTIVE, False), []
     to_source = torch.eye(4, dtype=torch.float64)
     box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
     for name, shift in (("near", [0.0, 0.0, 0.0]), ("far", [5e5, 5.4112e6, 300.0])):
@@ -76,7 +76,7 @@ def test_georeferenced_poses_are_written_in_double_precision(tmp_path: Path):
 
 
 def test_alpha_stays_and_equal_names_become_numbers(tmp_path: Path):
-    views = photographed(3, 4, Distortion(), False, False)
+    views = photographed(3, 4, Distortion(), Projection.PERSPECTIVE, False)
     for view in range(3):  # cut out
         views.image(view)[[0, -1], :, 3] = 0
         views.image(view)[:, [0, -1], 3] = 0
@@ -88,7 +88,7 @@ def test_alpha_stays_and_equal_names_become_numbers(tmp_path: Path):
 
 
 def test_a_lens_that_the_format_does_not_know_is_refused(tmp_path: Path):
-    views = photographed(3, 3, Distortion(d1=0.1), False, False)
+    views = photographed(3, 3, Distortion(d1=0.1), Projection.PERSPECTIVE, False)
     box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
     with pytest.raises(InputError, match=r"3_0.jpg: d1: found 0.1, expected at most k1, k2, k3, p1, p2"):
         write_photos(Scene("made", "made", views, views, views.cameras, box), tmp_path)

@@ -1,6 +1,6 @@
 """COLMAP's camera models (https://colmap.github.io/cameras.html)."""
 
-from nerf_lightning.cameras import Distortion
+from nerf_lightning.cameras import Distortion, Projection
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.optics import Optics, field_of_view_lens
 from nerf_lightning.errors import InputError
@@ -26,7 +26,7 @@ def optics_of(where: object, key: str, name: str, width: int, height: int, p: tu
         "RADIAL_FISHEYE"
     )
     fx, fy, cx, cy, *more = (p[0], *p) if one_focal else p
-    fisheye = "FISHEYE" in name
+    projection = Projection.FISHEYE if "FISHEYE" in name else Projection.PERSPECTIVE
     for focal, side, place in ((fx, width, cx), (fy, height, cy)):
         checks.focal_length(where, key, focal, side)
         checks.sensor(where, key, place)
@@ -46,7 +46,7 @@ def optics_of(where: object, key: str, name: str, width: int, height: int, p: tu
             distortion = distortion._replace(k3=rest[0], k4=rest[1], s1=rest[2], s2=rest[3])
     else:
         distortion = Distortion(*more)
-    optics = Optics(width, height, fx, fy, cx, cy, distortion, fisheye)
+    optics = Optics(width, height, fx, fy, cx, cy, distortion, projection)
     if not optics.sees_every_pixel():
         found_text = f"{name} with {', '.join(f'{value:g}' for value in p)}"
         raise InputError(where, key, found_text, "a distortion that does not fold the photo")

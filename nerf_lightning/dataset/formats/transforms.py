@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerf_lightning.cameras import Cameras, Distortion
+from nerf_lightning.cameras import Cameras, Distortion, Projection
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.conventions import opengl_to_opencv
 from nerf_lightning.dataset.formats.names import ImageFinder, fold_name
 from nerf_lightning.dataset.masks import find_masks
-from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.dataset.optics import Optics, equirectangular
 from nerf_lightning.dataset.orientation import OrientationChooser
 from nerf_lightning.dataset.posed import Hints, Split, build_scene, split_shots
 from nerf_lightning.dataset.scene import Scene
@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
+EQUIRECTANGULAR = "EQUIRECTANGULAR"
 INTRINSICS = {
     *("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "camera_model"),
     *("is_fisheye", "k1", "k2", "k3", "k4", "p1", "p2"),
@@ -331,8 +332,10 @@ def read_optics(frame: Frame, width: int, height: int) -> Optics:
     """
     file, name_key = frame.file, frame.name_key
     model = frame.get("camera_model") or "OPENCV"
+    if model == EQUIRECTANGULAR:
+        return equirectangular(width, height)
     if model not in (*PERSPECTIVE, *FISHEYE):
-        expected = f"one of {', '.join((*PERSPECTIVE, *FISHEYE))}"
+        expected = f"one of {', '.join((*PERSPECTIVE, *FISHEYE, EQUIRECTANGULAR))}"
         raise InputError(file, name_key("camera_model"), repr(model)[:60], expected)
     fisheye = model in FISHEYE or bool(frame.get("is_fisheye"))
     for key in REFUSED if fisheye else (*REFUSED, "k4"):
@@ -349,7 +352,9 @@ def read_optics(frame: Frame, width: int, height: int) -> Optics:
     distortion = Distortion(**{key: frame.number(key) or 0.0 for key in names})
     cx, cy = read_place(frame, "cx", width), read_place(frame, "cy", height)
     checks.principal_point(file, f"{name_key('cx')}, {name_key('cy')}", cx, cy, width, height)
-    optics = Optics(width, height, fx, fy, cx, cy, distortion, fisheye)
+    optics = Optics(
+        width, height, fx, fy, cx, cy, distortion, Projection.FISHEYE if fisheye else Projection.PERSPECTIVE
+    )
     if not optics.sees_every_pixel():
         expected = "that of a real lens"
         raise InputError(file, ", ".join(map(name_key, names)), "a distortion that folds the photo over", expected)

@@ -1,0 +1,127 @@
+"""Equirectangular photos of a room: read, trained on with corrected poses, exported."""
+
+import json
+import math
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+from cameras.test_equirectangular import panoramas
+from export.balls import CENTRE, RADIUS, ball_run
+
+import nerf_lightning as nl
+from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at, orbit_around
+from nerf_lightning.dataset import RayDataModule, Scene, Views
+from nerf_lightning.dataset.optics import equirectangular
+from nerf_lightning.dataset.shots import Reading, Shot, read_shots
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.mesh import mesh_file
+from nerf_lightning.export.page import field_page
+from nerf_lightning.export.photos import write_photos
+from nerf_lightning.export.smallest import smallest
+from nerf_lightning.export.volume import sample_volume
+from nerf_lightning.inspect.verb import facts_of
+from nerf_lightning.runs.folder import plain_config
+from nerf_lightning.runs.open import open_run
+from nerf_lightning.stability.rooms import Room, pile, walls
+from nerf_lightning.utils.device import CPU
+
+WIDTH, HEIGHT, STEPS = 64, 32, 80
+ROOM = Room([*pile(0.5, 2.0), *walls(3.0, -0.5, 2.5, 0.6, 0.8)], 3)
+UP = torch.tensor([0.0, 0.0, 1.0])
+
+
+def poses(count: int, seed: int) -> torch.Tensor:
+    """Level cameras anywhere around the pile, turned any way about the vertical."""
+    generator = torch.Generator().manual_seed(seed)
+    turn, radius, height, heading = torch.rand(4, count, generator=generator)
+    turn, heading = 2 * math.pi * turn, 2 * math.pi * heading
+    eye = torch.stack([turn.cos() * (1.0 + radius), turn.sin() * (1.0 + radius), 0.2 + height], dim=1)
+    return look_at(eye, eye + torch.stack([heading.cos(), heading.sin(), 0 * heading], dim=1), UP)
+
+
+def photograph(c2w: torch.Tensor) -> torch.Tensor:
+    """What a camera sees in all directions, by the definition of the projection: bytes."""
+    longitude = ((torch.arange(2 * WIDTH) + 0.5) / (2 * WIDTH) - 0.5) * 2 * math.pi
+    latitude = ((torch.arange(2 * HEIGHT) + 0.5) / (2 * HEIGHT) - 0.5)[:, None] * math.pi
+    right, down, ahead = longitude.sin() * latitude.cos(), latitude.sin(), longitude.cos() * latitude.cos()
+    local = torch.stack([right, down.expand_as(right), ahead], dim=2).view(-1, 3)
+    colours, _, _ = ROOM.see(Rays(c2w[:3, 3].expand_as(local), local @ c2w[:3, :3].T))
+    return (colours.view(HEIGHT, 2, WIDTH, 2, 3).mean((1, 3)).clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def photographs(count: int, seed: int) -> Views:
+    cameras = panoramas(poses(count, seed), WIDTH, HEIGHT)
+    return Views.of(torch.stack([photograph(c2w) for c2w in cameras.c2w]), cameras)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    train, val = photographs(16, 0), photographs(3, 1)
+    lens = train.cameras[0].as_pinholes()
+    circle = orbit_around(torch.zeros(3), UP, 1.5, 0.4, 4)
+    orbit = Cameras.of_size(lens.K.repeat(4, 1, 1), circle, lens.width, lens.height)
+    bounds = Bounds(torch.tensor([[-3.2, -3.2, -0.7], [3.2, 3.2, 2.2]]))
+    return Scene("room", "built-in", train, val, orbit, bounds)
+
+
+def test_a_room_is_learned_and_exported(scene: Scene, tmp_path: Path):
+    mean = scene.train.pixels.float().mean(0)
+    plain = -10 * math.log10(float(((scene.val.pixels.float() - mean) / 255).square().mean()))
+    options = ["model=tensorf", "refine=both", "sampler.samples=48", "sampler.resolution=16", "~logger"]
+    options += [
+        "callbacks.snapshots=null",
+        "callbacks.orbit.frames=2",
+        "callbacks.heldout.at=[]",
+        "dataset.samples=8192",
+    ]
+    run = nl.train(scene, steps=STEPS, device="cpu", folder=tmp_path / "run", options=options)
+    assert run.psnr > plain + 6
+    found, data = open_run(run.path, CPU), RayDataModule(scene)
+    compact = smallest(found.system, data, plain_config(found.cfg), 3.0)
+    assert compact.psnr > plain + 5
+    cameras = scene.train.cameras
+    page = field_page(compact.content, run.system, scene.orbit, "room", [], cameras, [str(i) for i in range(16)])
+    photos = json.loads(page.split('id="about">')[1].split("</script>")[0])["photos"]
+    assert photos["lenses"] == [[20, 15, *cameras.as_pinholes().K[0, [0, 1, 0, 1], [0, 1, 2, 2]].tolist()]]
+
+
+def test_the_inspection_names_the_projection(scene: Scene):
+    assert facts_of(scene)["lens"] == "equirectangular; rays follow the lens"
+
+
+def test_surfaces_are_seen_in_every_direction():
+    run = ball_run(torch.eye(4, dtype=torch.float64))
+    around = orbit_around(CENTRE, UP, 3.0, 0.6, 6)
+    away = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # the ball lies on the seam of half of them
+    c2w = torch.cat([around, orbit_around(CENTRE, UP, 3.0, -0.6, 6) @ away])
+    shape = mesh_file(run, panoramas(c2w, 160, 80), sample_volume(run.system, 32), None, "ply")
+    assert "watertight" in shape.words and "floating" not in shape.words
+    vertices = np.frombuffer(
+        shape.content.split(b"end_header\n")[1], np.dtype([("v", "<f8", 3), ("rgb", "u1", 3)]), 100
+    )["v"]
+    assert np.abs(np.linalg.norm(vertices - CENTRE.numpy(), axis=1) - RADIUS).max() < 0.1
+
+
+def test_photos_of_all_directions_are_reduced_but_not_undistorted(tmp_path: Path):
+    shots = []
+    for number, c2w in enumerate(poses(3, 2)):
+        imageio.imwrite(tmp_path / f"{number}.png", photograph(c2w).numpy())
+        shots.append(
+            Shot(f"{number}.png", tmp_path / f"{number}.png", c2w.double().numpy(), equirectangular(WIDTH, HEIGHT))
+        )
+    views = read_shots(tmp_path, shots, Reading(resize=32))
+    expected = panoramas(poses(3, 2), 32, 16)
+    assert views.cameras.lenses is not None and views.cameras.sizes.tolist() == [[32, 16]] * 3
+    torch.testing.assert_close(views.cameras.view_rays(1).directions, expected.view_rays(1).directions)
+    with pytest.raises(InputError, match=r"0.png: found a lens .* photo of all directions, .* undistort=false"):
+        read_shots(tmp_path, shots, Reading(undistort=True))
+
+
+def test_photos_are_written_with_the_name_of_their_projection(scene: Scene, tmp_path: Path):
+    write_photos(scene, tmp_path)
+    frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
+    assert frame["camera_model"] == "EQUIRECTANGULAR" and (frame["w"], frame["h"]) == (WIDTH, HEIGHT)
+    assert [frame[key] for key in ("fl_x", "fl_y", "cx", "cy")] == [HEIGHT, HEIGHT, WIDTH / 2, HEIGHT / 2]
