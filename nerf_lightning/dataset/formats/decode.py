@@ -1,17 +1,20 @@
 """Image files to arrays: any depth and channel count becomes 8-bit RGB or RGBA.
 
-OpenCV rather than Pillow, which cuts 16-bit colour to its high byte and cannot open TIFFs of floats to say so.
+Pillow decodes JPEG, as it reports files that are cut short and decodes at reduced scale. OpenCV decodes the rest: Pillow
+cuts 16-bit colour to its high byte and cannot open TIFFs of floats to say so.
 """
 
-import warnings
 import zlib
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL.Image import Transpose
+from PIL.JpegImagePlugin import JpegImageFile
 
+from nerf_lightning.dataset.formats.header import DAMAGED, JPEG, QUARTER_TURNS, read_header
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.memory import check_memory
@@ -19,8 +22,21 @@ from nerf_lightning.utils.quiet import native_errors_hidden
 from nerf_lightning.utils.untrusted import existing_file
 
 THREADS = 4
-ORIENTATION, QUARTER_TURNS = 0x0112, (5, 6, 7, 8)
-"""EXIF's tag for how the camera was held, and its values for photos that lie on their side."""
+TURNS = {
+    2: Transpose.FLIP_LEFT_RIGHT,
+    3: Transpose.ROTATE_180,
+    4: Transpose.FLIP_TOP_BOTTOM,
+    5: Transpose.TRANSPOSE,
+    6: Transpose.ROTATE_270,
+    7: Transpose.TRANSVERSE,
+    8: Transpose.ROTATE_90,
+}
+"""What makes a photo upright, by its EXIF orientation."""
+DRAFT_SCALES = (8, 4, 2)
+"""Factors by which libjpeg reduces while it decodes."""
+OVERSAMPLING = 2
+"""Least ratio of a reduced JPEG's sides to those it is averaged to, where they differ: its low-pass filter is sharper than
+an average, and shows only where little is averaged afterwards (43 dB against the average of the whole photo, else above 50)."""
 PNG = b"\x89PNG"
 PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
 """Bits a channel that there are, by the kind of colour: grey, RGB, of a palette, grey and alpha, RGBA."""
@@ -30,13 +46,15 @@ HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 """Brands after `ftyp` in photos of phones (ISO 23008-12); the last two stand for any codec."""
 
 
-def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]:
+def read_pixels(path: Path, upright: bool = False, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "H W C"]:
     """Decodes one image: RGB, or RGBA with straight alpha; 16 bits become 8, grey becomes RGB.
 
     Args:
         path: PNG, JPEG, TIFF or whatever else OpenCV reads, or HEIC.
         upright: apply the EXIF rotation (not to images with alpha). Off for posed photos, whose poses and intrinsics
             are about the pixels as stored. HEIC photos are upright always: the rotation is part of their format.
+        size: width and height that the caller averages it to. A JPEG is then decoded at 1/2, 1/4 or 1/8 of its size where
+            that is exact and leaves enough pixels.
 
     Raises:
         InputError: missing, truncated, not an image, or of floating-point pixels; HEIC without the package that reads it.
@@ -44,12 +62,10 @@ def read_pixels(path: Path, upright: bool = False) -> UInt8[np.ndarray, "H W C"]
     existing_file(path)
     try:
         data = path.read_bytes()
-        if _cut_short(data):
-            raise InputError(
-                path, "", "an image that was cut short or changed", "a whole PNG, JPEG or TIFF", "copy it again"
-            )
+        if data.startswith(JPEG):
+            return _decode_jpeg(path, data, upright, size)
         if data.startswith(PNG):
-            _check_png_header(path, data)
+            _check_png(path, data)
         # UNCHANGED keeps alpha and 16 bits, and leaves the EXIF rotation alone.
         with native_errors_hidden():  # what follows says it in a line
             raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
@@ -74,16 +90,42 @@ def image_header(path: Path, upright: bool = False) -> tuple[int, int, bool]:
         InputError: see `read_pixels`.
     """
     existing_file(path)
-    try:
-        with warnings.catch_warnings(), Image.open(path) as image:
-            warnings.simplefilter("ignore")  # of sizes: nothing is decoded here
-            alpha = "A" in image.getbands() or "transparency" in image.info
-            turned = upright and not alpha and image.getexif().get(ORIENTATION, 1) in QUARTER_TURNS
-            width, height = image.size
-            return (height, width, alpha) if turned else (width, height, alpha)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, UnidentifiedImageError):
+    header = read_header(path)
+    if header is None:
         shape = read_pixels(path, upright).shape  # says what is wrong
         return shape[1], shape[0], shape[2] == 4
+    if upright and not header.alpha and header.orientation in QUARTER_TURNS:
+        return header.height, header.width, header.alpha
+    return header.width, header.height, header.alpha
+
+
+def _decode_jpeg(path: Path, data: bytes, upright: bool, size: tuple[int, int] | None) -> UInt8[np.ndarray, "H W 3"]:
+    header = read_header(path)
+    orientation = header.orientation if upright and header is not None else 1
+    wanted = size[::-1] if size is not None and orientation in QUARTER_TURNS else size
+    try:
+        with JpegImageFile(BytesIO(data)) as image:
+            width, height = image.size
+            factor = 1 if wanted is None else draft_scale(width, height, wanted)
+            check_memory(path, "", f"{width}x{height} pixels", 3 * width * height // factor**2)
+            image.draft(image.mode, (width // factor, height // factor))
+            image.load()
+            straight = image if image.mode == "RGB" else image.convert("RGB")
+            turn = TURNS.get(orientation)
+            return np.array(straight if turn is None else straight.transpose(turn))
+    except DAMAGED as error:
+        found = f"an image that was cut short or changed ({error})"
+        raise InputError(path, "", found, "a whole JPEG", "copy it again") from error
+
+
+def draft_scale(width: int, height: int, wanted: tuple[int, int]) -> int:
+    """The largest factor by which libjpeg may reduce a photo that is averaged to `wanted` pixels afterwards."""
+    for factor in DRAFT_SCALES:
+        reduced = width // factor, height // factor
+        exact = (width % factor, height % factor) == (0, 0)
+        if exact and (reduced == wanted or all(a >= OVERSAMPLING * b for a, b in zip(reduced, wanted, strict=True))):
+            return factor
+    return 1
 
 
 def _rgb8(path: Path, raw: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "H W C"]:
@@ -116,21 +158,8 @@ def _heic(path: Path, data: bytes) -> UInt8[np.ndarray, "H W C"]:
     return np.asarray(image.convert("RGBA" if "A" in image.mode else "RGB"))
 
 
-def _cut_short(data: bytes) -> bool:
-    """Whether the end is missing, or part of a PNG has changed: some OpenCV versions fill the rest with grey and only warn."""
-    if data.startswith(PNG):
-        return not _whole_png(data)
-    if not data.startswith(b"\xff\xd8"):
-        return False
-    # Skip the segments before the scan: a thumbnail in the EXIF segment has an end marker of its own.
-    at = 2
-    while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return data.find(b"\xff\xd9", at) < 0
-
-
 def _whole_png(data: bytes) -> bool:
-    """Whether all chunks have their checksum, up to the last."""
+    """Whether all chunks have their checksum, up to the last: some OpenCV versions fill the rest with grey and only warn."""
     at, name = 8, b""
     while at + 12 <= len(data) and name != b"IEND":
         end = at + 8 + int.from_bytes(data[at : at + 4], "big")
@@ -141,8 +170,10 @@ def _whole_png(data: bytes) -> bool:
     return name == b"IEND"
 
 
-def _check_png_header(path: Path, data: bytes) -> None:
-    """Refuses what libpng and OpenCV would, which tell the terminal."""
+def _check_png(path: Path, data: bytes) -> None:
+    """Refuses what was cut short or changed, and what libpng and OpenCV would, which tell the terminal."""
+    if not _whole_png(data):
+        raise InputError(path, "", "an image that was cut short or changed", "a whole PNG", "copy it again")
     width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
     depth, kind = data[24], data[25]
     if depth not in PNG_DEPTHS.get(kind, ()) or not (0 < width <= PNG_SIDE and 0 < height <= PNG_SIDE):

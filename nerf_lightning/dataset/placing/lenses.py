@@ -10,7 +10,8 @@ from typing import Any
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from nerf_lightning.dataset.formats.exif import DAMAGED, DETAILS, exif_tags
+from nerf_lightning.dataset.formats.exif import exif_tags
+from nerf_lightning.dataset.formats.header import DAMAGED, DETAILS
 
 MAKE, MODEL, FOCAL, FOCAL_35MM = 0x010F, 0x0110, 0x920A, 0xA405
 """Numbers of EXIF tags."""

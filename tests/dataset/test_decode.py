@@ -1,0 +1,93 @@
+"""Decoding: JPEG at reduced scale, legal oddities, files cut short, headers."""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerf_lightning.dataset.formats.decode import draft_scale, image_header, read_pixels
+from nerf_lightning.dataset.resize import area_resize
+from nerf_lightning.errors import InputError
+from tests.dataset.exif import tags
+
+
+def photo(width: int, height: int) -> np.ndarray:
+    """Fine detail over a ramp, not the same when turned or flipped."""
+    y, x = np.mgrid[:height, :width]
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 60, (height, width, 3)), (0, 0), 1.0)
+    ramp = np.stack([x * 255 / width, y * 255 / height, (x + y) * 127 / (width + height)], axis=-1)
+    return (ramp + noise).clip(0, 255).astype(np.uint8)
+
+
+def save(path: Path, pixels: np.ndarray, orientation: int = 1) -> Path:
+    Image.fromarray(pixels).save(path, quality=95, exif=tags(orientation))
+    return path
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("upright", [False, True])
+def test_a_jpeg_at_reduced_scale_is_its_area_average(orientation: int, upright: bool, tmp_path: Path):
+    path = save(tmp_path / "a.jpg", photo(160, 96), orientation)
+    whole = read_pixels(path, upright)
+    size = (40, 24) if whole.shape == (96, 160, 3) else (24, 40)
+    assert image_header(path, upright) == (4 * size[0], 4 * size[1], False)
+    reduced = read_pixels(path, upright, size)
+    assert reduced.shape[1::-1] == size
+    off = np.abs(reduced.astype(int) - area_resize(whole, *size))
+    assert off.mean() < 2 and off.max() <= 16
+
+
+@pytest.mark.parametrize(
+    ("size", "wanted", "factor"),
+    [
+        ((4032, 3024), (1008, 756), 4),
+        ((4032, 3024), (504, 378), 8),
+        ((4032, 3024), (500, 375), 4),  # two pixels for each at least, where it is no exact fraction
+        ((4032, 3024), (1344, 1008), 1),
+        ((4032, 3024), (1000, 750), 2),
+        ((4030, 3024), (1008, 756), 1),  # reduced, it would end beside the pixel grid
+        ((4032, 3024), (4032, 3024), 1),
+    ],
+)
+def test_scale_of_decoding(size: tuple[int, int], wanted: tuple[int, int], factor: int):
+    assert draft_scale(*size, wanted) == factor
+
+
+def test_fill_bytes_before_markers_are_legal(tmp_path: Path):
+    """ITU-T T.81, B.1.1.2: any marker may be preceded by any number of bytes 0xFF."""
+    path = save(tmp_path / "a.jpg", photo(32, 16))
+    before, data = read_pixels(path), path.read_bytes()
+    tables = data.index(b"\xff\xdb")
+    path.write_bytes(data[:2] + b"\xff" * 3 + data[2:tables] + b"\xff" * 2 + data[tables:])
+    assert np.array_equal(read_pixels(path), before)
+
+
+@pytest.mark.parametrize("size", [None, (32, 16)])
+def test_a_jpeg_cut_anywhere_is_refused_in_a_line(size: tuple[int, int] | None, tmp_path: Path):
+    path = save(tmp_path / "a.jpg", photo(64, 32))
+    data = path.read_bytes()
+    for kept in np.linspace(3, len(data) - 3, 40).astype(int):
+        path.write_bytes(data[:kept])
+        with pytest.raises(InputError, match="cut short or changed") as caught:
+            read_pixels(path, size=size)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("mode", ["L", "CMYK"])
+def test_jpegs_of_other_colours(mode: str, tmp_path: Path):
+    Image.fromarray(photo(32, 16)).convert(mode).save(tmp_path / "a.jpg", quality=95)
+    whole, reduced = read_pixels(tmp_path / "a.jpg"), read_pixels(tmp_path / "a.jpg", size=(16, 8))
+    expected = Image.fromarray(photo(32, 16)).convert(mode).convert("RGB")
+    assert np.abs(whole.astype(int) - np.asarray(expected)).mean() < 4
+    assert np.abs(reduced.astype(int) - area_resize(whole, 16, 8)).mean() < 4
+
+
+def test_a_header_is_read_again_when_its_file_changes(tmp_path: Path):
+    path = save(tmp_path / "a.jpg", photo(32, 16))
+    assert image_header(path)[:2] == (32, 16)
+    save(path, photo(16, 32))
+    os.utime(path, ns=(0, 1))
+    assert image_header(path)[:2] == (16, 32)
