@@ -23,6 +23,7 @@ from nerf_lightning.config.cli import given_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.literal import override_of
 from nerf_lightning.dataset import Reading, Scene, open_scene
+from nerf_lightning.dataset.size import AUTO, auto_resize, parse_resize
 from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.export.verb import export
 from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
@@ -93,17 +94,18 @@ class Run:
         return output
 
 
-def load_scene(path: str | Path, resize: int | None = None) -> Scene:
+def load_scene(path: str | Path, resize: int | str | None = AUTO) -> Scene:
     """A scene in any format that the command line takes.
 
     Args:
         path: an .npz file, a Blender folder, or a nerfstudio / instant-ngp capture.
-        resize: longest side in pixels; larger photos are shrunk.
+        resize: longest side in pixels; larger photos are shrunk. "auto": what a training of 90 s on this machine's processor
+            can use, 800 pixels at least; None keeps the size.
 
     Raises:
         InputError: if there is none, or it is damaged.
     """
-    return open_scene(os.path.abspath(user_path(path)), reading=Reading(resize))
+    return open_scene(os.path.abspath(user_path(path)), reading=Reading(parse_resize(resize)))
 
 
 def load_run(path: str | Path, device: str = "auto") -> Run:
@@ -136,7 +138,7 @@ def train(
     """Trains as `python -m nerf_lightning dataset=photos dataset.path=SCENE` does, with the same defaults and results.
 
     Args:
-        scene: from `load_scene`, or its path.
+        scene: from `load_scene`, or its path, whose photos are then read at the size that suits the budget.
         recipe: a model with the settings that suit it, such as tensorf_medium; None for the command line's default.
         seconds, steps: length of the training; with both, whichever ends first; without either, 90 seconds.
         seed: of weights, batches and jitter: the same seed, threads and steps give the same weights.
@@ -150,7 +152,8 @@ def train(
         KeyboardInterrupt: after Ctrl-C; the last state is saved, and the command line's `resume=` goes on from it.
     """
     if not isinstance(scene, Scene):
-        scene = load_scene(scene)
+        size = auto_resize(seconds, steps, the_device(device), torch.get_num_threads())
+        scene = open_scene(os.path.abspath(user_path(scene)), reading=Reading(size))
     now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     place = Path("outputs", scene.name, now) if folder is None else user_path(folder)
     given = [

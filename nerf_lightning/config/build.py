@@ -22,6 +22,7 @@ from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.config.literal import escape
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, from_photos
+from nerf_lightning.dataset.size import AUTO, auto_resize
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.refine import Corrections
@@ -111,7 +112,12 @@ def device_of(cfg: DictConfig) -> torch.device:
 
 def build_data(cfg: DictConfig, path: str | None = None) -> RayDataModule | PixelDataModule:
     """The data module, with its scene loaded; `path` names other photos than the configuration does."""
-    return make(cfg if path is None else with_photos(cfg, path), "dataset", RayDataModule, PixelDataModule)
+    chosen = {}
+    if cfg.dataset.get("resize") == AUTO:
+        limits = build_budget(cfg)
+        chosen["resize"] = auto_resize(limits.limit_seconds, limits.steps, device_of(cfg), torch.get_num_threads())
+    source = cfg if path is None else with_photos(cfg, path)
+    return make(source, "dataset", RayDataModule, PixelDataModule, **chosen)
 
 
 def with_photos(cfg: DictConfig, path: str) -> DictConfig:

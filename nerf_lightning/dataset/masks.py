@@ -105,7 +105,8 @@ def match_mask(
 
 
 def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.ndarray, "H W"]:
-    """A mask in the size of its photo: 255 where the photo is kept, 0 where it is masked.
+    """A mask in the size of its photo: 255 where the photo is kept, 0 where it is masked, and between where a pixel of the
+    photo is of several of the mask.
 
     Raises:
         InputError: no picture.
@@ -114,7 +115,8 @@ def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.nda
     grey = pixels[..., 3] if pixels.shape[2] == 4 else pixels.max(axis=2)
     mask = np.where(grey >= KEPT, 255, 0).astype(np.uint8)
     mask = 255 - mask if invert else mask
-    return np.asarray(cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
+    way = cv2.INTER_AREA if mask.shape[1] >= width and mask.shape[0] >= height else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(mask, (width, height), interpolation=way), np.uint8)
 
 
 def cut_out(image: UInt8[np.ndarray, "H W C"], kept: Bool[np.ndarray, "H W"]) -> bool:

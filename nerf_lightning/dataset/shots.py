@@ -16,9 +16,10 @@ from nerf_lightning.cameras import Cameras, Lenses
 from nerf_lightning.dataset.formats.decode import THREADS, image_header, read_pixels
 from nerf_lightning.dataset.formats.exif import stated_exposure
 from nerf_lightning.dataset.lens import Lens, rectify
-from nerf_lightning.dataset.masks import SURE, cut_out, read_mask, seem_inverted
+from nerf_lightning.dataset.masks import KEPT, SURE, cut_out, read_mask, seem_inverted
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.dataset.resize import area_resize, fit_size
+from nerf_lightning.dataset.size import AutoResize, choose_resize, find_reduced
 from nerf_lightning.dataset.views import Runs, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.evenly import evenly
@@ -34,8 +35,8 @@ ROOM = 0.8
 """Share of the free memory that photos may take."""
 SMALLEST = 16
 """A photo may be reduced that many times against its camera's size."""
-LOOKED = 8
-"""Photos, evenly chosen, that tell what their masks mean."""
+LOOKED, LOOKED_SIDE_PX = 8, 1000
+"""Photos, evenly chosen, that tell what their masks mean, and the size at which that shows."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Reading:
     """How posed photos are read.
 
     Args:
-        resize: longest side in pixels after averaging, for photos that are larger.
+        resize: longest side in pixels after averaging, for photos that are larger, or what chooses it; None keeps their size.
         holdout: every N-th photo is held out, in the order of their names, where the format has no split of its own.
         masked: what masks and alpha leave out is "unknown" (a passer-by: not drawn, not scored) or "empty" (the subject is
             cut out); "auto" takes alpha as empty, and masks as empty where what they leave out is of one colour.
@@ -53,7 +54,7 @@ class Reading:
         orientation: "stored", "exif", or "auto", see `dataset.orientation`.
     """
 
-    resize: int | None = None
+    resize: int | AutoResize | None = None
     holdout: int = 8
     masked: str = "auto"
     invert_masks: bool = False
@@ -105,11 +106,16 @@ def read_shots(source: Path, shots: Sequence[Shot], reading: Reading) -> Views:
         alpha |= has_alpha
     masked = what_masks_mean(shots, reading)
     channels = 4 if masked == "empty" or (alpha and reading.masked != "unknown") else 3
+    files = [shot.photo for shot in shots]
+    longest = choose_resize(source, sizes, channels, reading.resize)
+    small = [fit_size(*size, longest) for size in sizes]
+    if longest is not None:
+        files = [find_reduced(shot.photo, size, shot.upright) for shot, size in zip(shots, small, strict=True)]
+        sizes = [image_header(file, shot.upright)[:2] for file, shot in zip(files, shots, strict=True)]
     undistort = lru_cache(maxsize=4)(rectify)  # one lens, or one a photo: keep the maps of a few
     lenses = [
         _pinhole(source, shot, size) if reading.undistort else None for shot, size in zip(shots, sizes, strict=True)
     ]
-    small = [fit_size(*size, reading.resize) for size in sizes]
     starts = np.cumsum([0] + [width * height for width, height in small])
     _check_memory(source, shots, int(starts[-1]) * channels, small)
     pixels = np.empty((starts[-1], channels), np.uint8)
@@ -118,11 +124,13 @@ def read_shots(source: Path, shots: Sequence[Shot], reading: Reading) -> Views:
 
     def read(i: int) -> None:
         shot, size, lens = shots[i], small[i], lenses[i]
-        image = read_pixels(shot.photo, shot.upright)
-        if image.shape[1::-1] != sizes[i]:
-            found = f"{image.shape[1]}x{image.shape[0]} pixels"
-            raise InputError(shot.photo, "", found, f"{sizes[i][0]}x{sizes[i][1]}, as its header says", "save it again")
-        mask = None if shot.mask is None else read_mask(shot.mask, *sizes[i], reading.invert_masks)
+        image = read_pixels(files[i], shot.upright, size if lens is None else None)
+        height, width = image.shape[:2]
+        factor = sizes[i][0] // width  # of decoding
+        if (factor * width, factor * height) != sizes[i]:
+            expected = f"{sizes[i][0]}x{sizes[i][1]}, as its header says"
+            raise InputError(files[i], "", f"{width}x{height} pixels", expected, "save it again")
+        mask = None if shot.mask is None else read_mask(shot.mask, width, height, reading.invert_masks)
         if image.shape[2] == 4 and channels == 3:
             mask = image[..., 3] if mask is None else np.minimum(mask, image[..., 3])
             image = np.ascontiguousarray(image[..., :3])
@@ -168,13 +176,12 @@ def what_masks_mean(shots: Sequence[Shot], reading: Reading) -> str | None:
     cut = []
     for shot in (having[i] for i in evenly(len(having), LOOKED)):
         assert shot.mask is not None
-        image = read_pixels(shot.photo, shot.upright)
-        kept.append(read_mask(shot.mask, image.shape[1], image.shape[0], reading.invert_masks) > 0)
+        size, other = image_header(shot.photo, shot.upright)[:2], image_header(shot.mask)[:2]
+        image = read_pixels(shot.photo, shot.upright, fit_size(*size, LOOKED_SIDE_PX))
+        kept.append(read_mask(shot.mask, image.shape[1], image.shape[0], reading.invert_masks) >= KEPT)
         cut.append(cut_out(image, kept[-1]))
-        other = image_header(shot.mask)[:2]
-        if other != (image.shape[1], image.shape[0]) and len(kept) == 1:
-            size = f"{image.shape[1]}x{image.shape[0]}"
-            log.info("masks of %dx%d pixels are enlarged or reduced to their photos' %s", *other, size)
+        if other != size and len(kept) == 1:
+            log.info("masks of %dx%d pixels are enlarged or reduced to their photos' %dx%d", *other, *size)
     if seem_inverted(kept):
         todo = "false" if reading.invert_masks else "true"
         text = "most masks leave out one spot in the middle: are they inverted? dataset.invert_masks=%s takes them so"

@@ -20,6 +20,7 @@ from nerf_lightning.dataset.rays import FOCUS, RAYS, SAMPLES, RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
 from nerf_lightning.dataset.shots import Reading
+from nerf_lightning.dataset.size import AutoResize, parse_resize
 from nerf_lightning.utils.files import atomic, user_path
 from nerf_lightning.utils.options import AtLeast, Count
 
@@ -32,7 +33,7 @@ DOWNLOAD_TIMEOUT = 10.0
 def from_photos(
     path: str,
     name: str | None = None,
-    resize: Count | None = None,
+    resize: Count | str | AutoResize | None = None,
     holdout: Annotated[int, AtLeast(2)] = 8,
     masked: str = "auto",
     invert_masks: bool = False,
@@ -47,7 +48,7 @@ def from_photos(
     focus: float = FOCUS,
 ) -> RayDataModule:
     """Posed photos in any supported format, see `open_scene` and `RayDataModule`."""
-    reading = Reading(resize, holdout, masked, invert_masks, undistort, str(bounded).lower(), orientation)
+    reading = Reading(parse_resize(resize), holdout, masked, invert_masks, undistort, str(bounded).lower(), orientation)
     scene = open_scene(path, name, reading, near, far)
     return RayDataModule(scene, rays, samples, seed, focus)
 
@@ -70,7 +71,7 @@ def from_download(
     folder: str,
     download: bool = True,
     path: str | None = None,
-    resize: Count | None = None,
+    resize: Count | str | AutoResize | None = None,
     bounded: str | bool = "auto",
     near: float | None = None,
     far: float | None = None,
@@ -100,7 +101,9 @@ def from_download(
                 problem += f" and {url} could not be fetched ({error})"
         if problem:
             log.warning("%s: the built-in scene 'bricks' stands in for it", problem)
-            return from_bricks(size=resize or 200, rays=rays, samples=samples, seed=seed, focus=focus)
+            return from_bricks(
+                size=resize if isinstance(resize, int) else 200, rays=rays, samples=samples, seed=seed, focus=focus
+            )
         path = str(local)
     return from_photos(
         path, None, resize, bounded=bounded, near=near, far=far, rays=rays, samples=samples, seed=seed, focus=focus

@@ -15,6 +15,7 @@ from nerf_lightning.config.build import SceneFrame, build_data, target_of
 from nerf_lightning.config.literal import escape
 from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
 from nerf_lightning.dataset.formats import checks
+from nerf_lightning.dataset.size import AUTO
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.scene_file import frame_from, numbers
 
@@ -87,6 +88,8 @@ def data_again(
         at_hand.dataset.download = False
         if at_hand.dataset.get("path") is None and source != BUILT_IN:
             at_hand.dataset.path = escape(source)
+    if at_hand.dataset.get("resize") == AUTO and "longest" in scene:
+        at_hand.dataset.resize = scene["longest"]
     data = build_data(at_hand, photos)
     if isinstance(data, RayDataModule):
         data.scene = in_frame_of(data.scene, scene)

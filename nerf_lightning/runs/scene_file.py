@@ -47,6 +47,8 @@ def scene_content(data: RayDataModule | PixelDataModule) -> dict[str, Any]:
         content["source"] = os.path.abspath(scene.source)
     if isinstance(scene, Scene) and isinstance(frame, SceneFrame):
         content |= {
+            # Of any photo: `resize=auto` chooses by the budget, device and memory, which differ when the run is opened again.
+            "longest": max(views.cameras.longest for views in (scene.train, scene.val)),
             "background": list(frame.background),
             "aabb": frame.bounds.aabb.tolist(),
             "unbounded": frame.bounds.unbounded,

@@ -80,17 +80,6 @@ def test_photos_without_a_place_and_places_without_a_photo_are_named(
     assert "1 photos have no place in the model, 9999.png" in caplog.text
 
 
-def test_reduced_photos_are_used_where_they_are_large_enough(views: Views, tmp_path: Path):
-    folder = colmap(tmp_path, views)
-    (folder / "images_2").mkdir()
-    for file in (folder / "images").iterdir():
-        imageio.imwrite(folder / "images_2" / file.name, np.full((20, 24, 3), 77, np.uint8))
-    large, small = (open_scene(str(folder), reading=Reading(resize=side)) for side in (25, 24))
-    assert large.train.channels == 4 and (small.train.pixels == 77).all()
-    assert small.train.cameras.size(0) == (24, 20)
-    torch.testing.assert_close(small.train.cameras.K[0], views.cameras.resized((24, 20)).K[0], atol=1e-4, rtol=0)
-
-
 def test_photos_of_a_model_below_its_own_folder(views: Views, tmp_path: Path):
     names = [f"left/{name}" for name in photos(tmp_path / "input" / "left", views)]
     write_colmap(tmp_path / "sparse", views.cameras.c2w.numpy(), names, cameras_of(views), text=True)

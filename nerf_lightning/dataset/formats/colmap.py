@@ -9,23 +9,19 @@ import numpy as np
 
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.colmap_model import FILES, Image, Model, count_images, holds_model, read_model
-from nerf_lightning.dataset.formats.decode import image_header
 from nerf_lightning.dataset.formats.names import ImageFinder, list_images, walk_images
 from nerf_lightning.dataset.masks import find_masks
-from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.dataset.orientation import OrientationChooser
 from nerf_lightning.dataset.posed import Hints, build_scene
-from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
+from nerf_lightning.dataset.size import REDUCED
 from nerf_lightning.errors import InputError
 
 log = logging.getLogger(__name__)
 
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse", "")
 PHOTO_FOLDERS = ("images", "input", "")
-REDUCED = (8, 4, 2)
-"""Folders `images_8`, `images_4`, `images_2` hold the same photos at these fractions of their size."""
 REDUCED_NAME = re.compile(r"(images|input)_\d+$")
 PLACED_FOLDER = "placed"
 """Beside plain photos: the model that this package has made of them."""
@@ -64,8 +60,8 @@ def load_colmap(
 ) -> Scene:
     """Reads a COLMAP model, binary or text, with the photos it places.
 
-    Photos are looked for in `images`, `input` or beside the model, in each folder from the model's up; `images_2`, `images_4`
-    or `images_8` stand in for them where `resize` asks for no more pixels. Masks are found by `find_masks`.
+    Photos are looked for in `images`, `input` or beside the model, in each folder from the model's up. Masks are found by
+    `find_masks`.
 
     Args:
         place: the scene's folder, or the model's.
@@ -102,18 +98,15 @@ def load_colmap(
         log.warning("%s: %d of %d photos are not there, %s: left out", root, len(missing), len(images), _named(missing))
     found_files = [(image, file) for image, file in zip(images, files, strict=True) if file is not None]
     report_unplaced(root, [file for _, file in found_files])
-    small = _reduced(root, [model.cameras[image.camera] for image, _ in found_files], reading.resize)
     scene_folder = root.parent if root.name in PHOTO_FOLDERS or REDUCED_NAME.match(root.name) else root
     masks = find_masks([file for _, file in found_files], scene_folder)
     orientation = OrientationChooser(reading.orientation)
     shots = []
     for (image, file), mask in zip(found_files, masks, strict=True):
-        reduced = small / file.relative_to(root)
         optics = model.cameras[image.camera]
-        path = reduced if _is_file(reduced) else file
-        turned = upright or orientation.choose(path, (optics.width, optics.height))[2]
+        turned = upright or orientation.choose(file, (optics.width, optics.height))[2]
         c2w = checks.rigid_pose(folder, image.name, np.linalg.inv(image.w2c))
-        shots.append(Shot(image.name, path, c2w, optics, mask, turned))
+        shots.append(Shot(image.name, file, c2w, optics, mask, turned))
     orientation.report(folder)
     named = place if scene_folder.resolve().is_relative_to(place.resolve()) else scene_folder
     return build_scene(place, name or named.resolve().name, shots, reading, hints=Hints(points=model.points))
@@ -169,18 +162,3 @@ def report_unplaced(root: Path, placed: list[Path]) -> None:
 
 def _named(names: list[str]) -> str:
     return ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
-
-
-def _reduced(root: Path, cameras: list[Optics], resize: int | None) -> Path:
-    """A folder with the same photos reduced, still as large as asked for; the folder itself where there is none."""
-    if resize is None:
-        return root
-    for factor in REDUCED:
-        folder = root.parent / f"{root.name}_{factor}"
-        first = next(iter(sorted(folder.glob("*"))), None) if folder.is_dir() else None
-        if first is None or not _is_file(first):
-            continue
-        side = max(image_header(first)[:2])
-        if all(side >= max(fit_size(one.width, one.height, resize)) for one in cameras):
-            return folder
-    return root

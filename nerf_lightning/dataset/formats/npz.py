@@ -19,6 +19,7 @@ from nerf_lightning.dataset.posed import Hints, PosedViews, assemble_scene, spli
 from nerf_lightning.dataset.resize import fit_size, resize_views
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, Reading
+from nerf_lightning.dataset.size import choose_resize
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.arrays import Headers, read_npz
@@ -76,13 +77,14 @@ def load_npz(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -
         log.warning("%s: no held-out photos: every %d-th training photo is held out", path, reading.holdout)
         split = split_shots(path, len(train.c2w), reading.holdout)
         train, val = (PosedViews(train.views[torch.tensor(part)], train.c2w[part]) for part in (split.train, split.val))
-    if reading.resize is not None:
-        train, val, test = (None if one is None else _resize(one, reading.resize) for one in (train, val, test))
+    longest = choose_resize(path, [(width, height)] * len(data["c2ws_train"]), train.views.channels, reading.resize)
+    if longest is not None:
+        train, val, test = (None if one is None else _resize(one, longest) for one in (train, val, test))
         assert train is not None and val is not None
     path_poses = poses.get("c2ws_test") if "images_test" not in data else None
     hints = Hints(
         keep_frame=True,
-        path=None if path_poses is None else cameras(path_poses).resized(fit_size(width, height, reading.resize)),
+        path=None if path_poses is None else cameras(path_poses).resized(fit_size(width, height, longest)),
         background=checks.colour(path, "background", data["background"]) if "background" in data else None,
         bounds=_bounds(path, data, reading),
         to_source=checks.similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,

@@ -18,7 +18,12 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
 
 def has_photos(folder: Path) -> bool:
     """Whether a folder holds photos itself."""
-    return folder.is_dir() and any(file.suffix.lower() in EXTENSIONS and file.is_file() for file in folder.iterdir())
+    return folder.is_dir() and any(_is_photo(file) for file in folder.iterdir())
+
+
+def _is_photo(file: Path) -> bool:
+    """By its name; hidden files, such as macOS's `._0001.jpg`, are none."""
+    return file.suffix.lower() in EXTENSIONS and not file.name.startswith(".") and file.is_file()
 
 
 def find_photos(folder: Path, key: str) -> list[Path]:
@@ -33,8 +38,8 @@ def find_photos(folder: Path, key: str) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError("config", key, f"{folder}, which is no folder", "a folder of photos")
-    files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
-    photos = sorted((file for file in files if file.suffix.lower() in EXTENSIONS), key=natural)
+    files = list(folder.iterdir())
+    photos = sorted(filter(_is_photo, files), key=natural)
     if not photos:
         others = sorted({file.suffix.lower() for file in files} & UNREAD)
         found = f"only {', '.join(others)} files" if others else "no photo"

@@ -1,0 +1,127 @@
+"""The size at which photos are trained on: what the budget, the device and the memory can use."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerf_lightning.dataset.formats.decode import image_header
+from nerf_lightning.dataset.resize import fit_size
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.device import CPU
+from nerf_lightning.utils.memory import free_memory
+
+log = logging.getLogger(__name__)
+
+AUTO = "auto"
+LONGEST_PX, CORE_SECONDS, GROWTH = 1000, 360.0, 1 / 3
+"""What 180 s on two cores can use, and how the longest side grows with the work."""
+MIN_LONGEST_PX = 800
+"""Smaller photos save little work, however short the training."""
+SECONDS = 90.0
+"""Of training, where nobody says."""
+CORE_SECONDS_PER_STEP = 0.06
+"""Of the experiment `capture` on a CPU."""
+ACCELERATOR_CORES = 64
+"""Cores that an accelerator stands for; an estimate."""
+MEMORY_SHARE = 0.2
+"""Of the free memory that photos may take; twice that while they are read."""
+REDUCED = (8, 4, 2)
+"""Folders `images_8`, `images_4`, `images_2` hold the same photos at these fractions of their size."""
+MAX_DEPTH = 3
+"""Folders above a photo that may be the one with reduced copies beside it."""
+
+
+@dataclass(frozen=True)
+class AutoResize:
+    """The size that suits a training, see `auto_resize`."""
+
+    longest: int
+    """In pixels."""
+    budget: str
+    """That it is for, in words."""
+
+
+def auto_resize(seconds: float | None, steps: int | None, device: torch.device, threads: int) -> AutoResize:
+    """The size for a training of so many seconds or steps, whichever ends first; for one of 90 s where neither is given.
+
+    The longest side is LONGEST_PX * (work / CORE_SECONDS) ** GROWTH, at least MIN_LONGEST_PX; work is seconds times cores.
+    """
+    cores, where = threads, f"{threads} thread{'s' if threads > 1 else ''}"
+    if device.type != "cpu":
+        cores, where = ACCELERATOR_CORES, device.type
+    limits = [] if seconds is None else [(seconds * cores, f"{seconds:g} s on {where}")]
+    limits += [] if steps is None else [(steps * CORE_SECONDS_PER_STEP, f"{steps} steps")]
+    work, budget = min(limits, default=(SECONDS * cores, f"{SECONDS:g} s on {where}"))
+    longest = LONGEST_PX * (work / CORE_SECONDS) ** GROWTH
+    return AutoResize(round(max(longest, MIN_LONGEST_PX)), budget)
+
+
+def choose_resize(
+    source: object, sizes: Sequence[tuple[int, int]], channels: int, resize: int | AutoResize | None
+) -> int | None:
+    """The longest side that photos of these sizes are read at; None keeps them. Tells what was chosen.
+
+    The largest photo is divided by the whole number that comes nearest to the size that suits: pixels are then means of
+    whole pixels, and JPEGs are decoded at that scale. A larger number is taken where the memory has no room.
+
+    Args:
+        source: what the user named, for the message.
+        sizes: widths and heights.
+        channels: bytes a pixel.
+        resize: longest side, or what chooses it.
+    """
+    if not isinstance(resize, AutoResize):
+        return resize
+    width, height = max(sizes, key=max)
+    largest = max(width, height)
+    suited = divisor = max(1, round(largest / resize.longest))
+    room = MEMORY_SHARE * free_memory()
+    while divisor < largest and channels * _pixels(sizes, round(largest / divisor)) > room:
+        divisor += 1
+    if divisor == 1:
+        return None
+    longest = round(largest / divisor)
+    w, h = fit_size(width, height, longest)
+    reason = f"as much as {resize.budget} can use" if divisor == suited else "the memory has no room for more"
+    text = "%s: photos of %dx%d are read at %dx%d: %s; dataset.resize=null keeps the size"
+    log.info(text, source, width, height, w, h, reason)
+    return longest
+
+
+def _pixels(sizes: Sequence[tuple[int, int]], longest: int) -> int:
+    return sum(width * height for width, height in (fit_size(*size, longest) for size in sizes))
+
+
+def parse_resize(resize: Any) -> int | AutoResize | None:
+    """An option `resize`; `auto` without a training is for one of 90 s on this process's threads.
+
+    Raises:
+        InputError: for what is neither a size, nor auto or None.
+    """
+    if resize == AUTO:
+        return auto_resize(None, None, CPU, torch.get_num_threads())
+    if not isinstance(resize, int | AutoResize | None):
+        raise InputError("config", "dataset.resize", repr(resize), "auto, null or the longest side in pixels")
+    return resize
+
+
+def find_reduced(photo: Path, size: tuple[int, int], upright: bool) -> Path:
+    """The same photo in `images_8`, `images_4` or `images_2` beside its folder `images`, where that is large enough for `size`
+    and has the same shape and channels; else the photo itself."""
+    width, height, alpha = image_header(photo, upright)
+    for factor in REDUCED:
+        for folder in photo.parents[:MAX_DEPTH]:
+            if not folder.name:
+                continue
+            file = folder.with_name(f"{folder.name}_{factor}") / photo.relative_to(folder)
+            if not file.is_file():
+                continue
+            w, h, has_alpha = image_header(file, upright)
+            same_shape = abs(w * height / width - h) <= 1.5
+            if w >= size[0] and h >= size[1] and same_shape and has_alpha == alpha:
+                return file
+    return photo

@@ -1,0 +1,155 @@
+"""The size at which photos are read where nobody says, and reduced copies that others made."""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.config.build import build_data
+from nerf_lightning.config.compose import composed
+from nerf_lightning.dataset import RayDataModule, Views, open_scene, save_npz
+from nerf_lightning.dataset import size as size_module
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.dataset.shots import Reading, Shot, read_shots
+from nerf_lightning.dataset.size import AutoResize, auto_resize, choose_resize, find_reduced, parse_resize
+from nerf_lightning.errors import InputError
+from nerf_lightning.runs.data import data_again
+from nerf_lightning.runs.folder import load_config, save_config
+from nerf_lightning.runs.scene_file import load_scene, save_scene
+from nerf_lightning.utils.device import CPU
+from tests.dataset.colmap_files import cameras_of, photos, write_colmap, write_llff, write_transforms
+
+
+@pytest.fixture(scope="module")
+def views(ball_views_of: Callable[..., Views]) -> Views:
+    return ball_views_of(6)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "steps", "threads", "longest"),
+    [
+        (180, None, 2, 1000),
+        (180, None, 16, 2000),
+        (1440, None, 2, 2000),
+        (60, None, 2, 800),  # no smaller
+        (180, 10, 2, 800),  # whichever ends first
+        (None, 48000, 1, 2000),
+        (None, None, 32, 2000),  # 90 s
+    ],
+)
+def test_work_decides_the_longest_side(seconds: float | None, steps: int | None, threads: int, longest: int):
+    assert auto_resize(seconds, steps, CPU, threads).longest == longest
+
+
+def test_an_accelerator_counts_as_many_cores():
+    found = auto_resize(180, None, torch.device("cuda"), 1)
+    assert found.longest == auto_resize(180, None, CPU, 64).longest and found.budget == "180 s on cuda"
+
+
+@pytest.mark.parametrize(
+    ("size", "longest"),
+    [((4032, 3024), 1008), ((1080, 1920), 960), ((800, 600), None), ((1440, 1080), None), ((1600, 1200), 800)],
+)
+def test_the_largest_photo_is_divided_by_a_whole_number(
+    size: tuple[int, int], longest: int | None, caplog: pytest.LogCaptureFixture
+):
+    with caplog.at_level(logging.INFO):
+        assert choose_resize("here", [(300, 200), size], 3, AutoResize(1000, "180 s on 2 threads")) == longest
+    assert (longest is None) == (not caplog.text)
+    if longest == 1008:
+        expected = "here: photos of 4032x3024 are read at 1008x756: as much as 180 s on 2 threads can use"
+        assert f"{expected}; dataset.resize=null keeps the size" in caplog.text
+
+
+def test_photos_are_smaller_where_the_memory_has_no_room(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(size_module, "free_memory", lambda: 5 * 100 * 3 * 700 * 525)
+    with caplog.at_level(logging.INFO):
+        assert choose_resize("here", [(4000, 3000)] * 100, 3, AutoResize(1000, "much time")) == 667  # a sixth
+    assert "the memory has no room for more" in caplog.text
+
+
+def test_what_is_said_is_what_happens():
+    assert choose_resize("", [(4000, 3000)], 3, 123) == 123
+    assert choose_resize("", [(4000, 3000)], 3, None) is None
+    for wrong in ("automatic", 0.5, {"longest": 3}):
+        with pytest.raises(InputError, match="dataset.resize: found .*, expected auto, null or the longest side"):
+            parse_resize(wrong)
+
+
+@pytest.mark.parametrize("format", ["colmap", "llff", "transforms"])
+def test_reduced_photos_stand_in_for_whole_ones(format: str, views: Views, tmp_path: Path):
+    """In any format; where they are large enough, and have alpha too."""
+    names = photos(tmp_path / "images", views)
+    if format == "colmap":
+        write_colmap(tmp_path / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
+    elif format == "llff":
+        write_llff(tmp_path / "poses_bounds.npy", views)
+    else:
+        write_transforms(tmp_path / "transforms.json", views, [f"images/{name}" for name in names])
+    for factor in (2, 4):
+        (tmp_path / f"images_{factor}").mkdir()
+        for name in names:
+            pixels = np.full((40 // factor, 48 // factor, 4), 70 + factor, np.uint8)
+            imageio.imwrite(tmp_path / f"images_{factor}" / name, pixels)
+    half = open_scene(str(tmp_path), reading=Reading(24))
+    assert (half.train.pixels == 72).all() and half.train.cameras.size(0) == (24, 20)
+    torch.testing.assert_close(half.train.cameras.K[0], views.cameras.resized((24, 20)).K[0], atol=1e-4, rtol=0)
+
+
+def test_reduced_photos_are_large_enough_and_have_the_same_channels(tmp_path: Path):
+    for folder, factor in (("images", 1), ("images_2", 2), ("images_4", 4)):
+        (tmp_path / folder / "left").mkdir(parents=True)
+        imageio.imwrite(tmp_path / folder / "left" / "a.png", np.zeros((40 // factor, 48 // factor, 4), np.uint8))
+    photo = tmp_path / "images" / "left" / "a.png"
+    for size, folder in (((25, 21), "images"), ((24, 20), "images_2"), ((13, 11), "images_2"), ((12, 10), "images_4")):
+        assert find_reduced(photo, size, False) == tmp_path / folder / "left" / "a.png"
+    imageio.imwrite(tmp_path / "images_4" / "left" / "a.png", np.zeros((10, 12, 3), np.uint8))
+    assert find_reduced(photo, (12, 10), False).parts[-3] == "images_2", "without alpha it is another photo"
+    imageio.imwrite(tmp_path / "images_2" / "left" / "a.png", np.zeros((24, 24, 4), np.uint8))
+    assert find_reduced(photo, (12, 10), False) == photo, "of another shape"
+
+
+def test_masks_and_colours_of_a_reduced_jpeg_are_averages(tmp_path: Path):
+    """As of a PNG, which is decoded whole."""
+    y, x = np.mgrid[:96, :160]
+    pixels = np.stack([x, 2 * y, 255 - x], axis=-1).astype(np.uint8)
+    mask = np.where((x - 70) ** 2 + (y - 50) ** 2 < 900, 255, 0).astype(np.uint8)
+    imageio.imwrite(tmp_path / "mask.png", mask)
+    optics = Optics(160, 96, 100.0, 100.0, 80.0, 48.0)
+    found = {}
+    for suffix in ("png", "jpg"):
+        file = tmp_path / f"a.{suffix}"
+        imageio.imwrite(file, pixels)
+        shots = [Shot("a", file, np.eye(4), optics, tmp_path / "mask.png")]
+        found[suffix] = read_shots(tmp_path, shots, Reading(resize=40, masked="unknown"))
+    a, b = found["png"], found["jpg"]
+    whole = cv2.resize(mask, (40, 24), interpolation=cv2.INTER_AREA) >= 250
+    assert a.cameras.size(0) == b.cameras.size(0) == (40, 24)
+    assert np.array_equal(a.mask_of(0), whole) and np.array_equal(b.mask_of(0), whole) and 0.1 < whole.mean() < 0.3
+    assert (a.pixels.int() - b.pixels.int()).abs().max() <= 8
+
+
+def test_a_run_that_is_opened_again_has_its_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Whatever its budget, the threads and the memory are by then."""
+    save_npz(bricks(size=48, train_views=4, val_views=2, cache=""), tmp_path / "scene.npz")
+    monkeypatch.setattr(size_module, "MIN_LONGEST_PX", 16)
+    monkeypatch.setattr(size_module, "LONGEST_PX", 400)
+    options = ["dataset=photos", f"dataset.path={tmp_path / 'scene.npz'}", "budget.steps=1", "threads=2"]
+    cfg = composed(options, tmp_path)
+    data = build_data(cfg)
+    assert isinstance(data, RayDataModule)
+    resolution = data.scene.resolution
+    assert resolution == (24, 24), "auto is the default"
+    save_scene(data, tmp_path)
+    cfg.budget.steps = 10**6
+    save_config(cfg, tmp_path)
+    assert build_data(cfg).scene.resolution == (48, 48)
+    assert data_again(load_config(tmp_path), load_scene(tmp_path)).scene.resolution == resolution
