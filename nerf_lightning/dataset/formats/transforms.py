@@ -343,11 +343,11 @@ def read_optics(frame: Frame, width: int, height: int) -> Optics:
         if any(value) if isinstance(value, list) else value not in (None, False, 0, "0"):
             expected = "at most k1, k2, k3, k4" if fisheye else "at most k1, k2, k3, p1, p2"
             raise InputError(file, name_key(key), repr(value)[:60], expected, "calibrate or export with these alone")
-    fx = read_focal(frame, "x", width, fisheye)
-    if fx is None:
+    found_x, found_y = read_focal(frame, "x", width, fisheye), read_focal(frame, "y", height, fisheye)
+    fx, fy = found_x or found_y, found_y or found_x
+    if fx is None or fy is None:
         found = f"no focal length among [{', '.join(sorted({**frame.content, **frame.entry}))}]"
         raise InputError(file, name_key("fl_x"), found, "fl_x in pixels or camera_angle_x in radians")
-    fy = read_focal(frame, "y", height, fisheye) or fx
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2")
     distortion = Distortion(**{key: frame.number(key) or 0.0 for key in names})
     cx, cy = read_place(frame, "cx", width), read_place(frame, "cy", height)
