@@ -68,7 +68,7 @@ def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, turn: Float[ndarray, "4 4"
     Args:
         mesh: with a colour at each vertex.
         suffix: of the file.
-        turn: the rotation of a GLB file's node to z up.
+        turn: the rotation of a GLB file's node to z up, about the offset.
 
     Returns:
         The file's content, and the offset that its coordinates lack: STL has single precision. GLB has too, but its node's
@@ -91,9 +91,8 @@ def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, turn: Float[ndarray, "4 4"
         return header[:STL_HEADER_BYTES] + content[STL_HEADER_BYTES:], offset
     import trimesh
 
-    scene = trimesh.Scene()
-    shift = np.eye(4)
-    shift[:3, 3] = offset
-    scene.add_geometry(moved, transform=Y_UP @ turn @ shift)
+    scene, node = trimesh.Scene(), Y_UP @ turn
+    node[:3, 3] = Y_UP[:3, :3] @ offset  # a turn about an origin that is far away would move the mesh
+    scene.add_geometry(moved, transform=node)
     content = scene.export(file_type="glb")
     return content, offset

@@ -80,8 +80,9 @@ def test_georeferenced_vertices_are_as_exact_as_at_the_origin(suffix: str):
     near, words, _ = written("ply", torch.zeros(3))
     far, words, content = written(suffix, UTM)
     shift = UTM.numpy()
-    if suffix == "glb":  # y is up, and the turn that leads to that is undone
-        far = np.stack([far[:, 0], -far[:, 2], far[:, 1]], axis=1) @ TURN.T.numpy()
+    if suffix == "glb":  # y is up, by a turn about the offset
+        offset = np.array([500005, 5411199, 302])
+        far = (np.stack([far[:, 0], -far[:, 2], far[:, 1]], axis=1) - offset) @ TURN.T.numpy() + offset
         assert "the node's transform holds the offset 500005, 5411199, 302" in words
     if suffix == "stl":
         assert "coordinates lack the offset 500005, 5411199, 302" in words
