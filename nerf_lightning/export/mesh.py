@@ -21,8 +21,8 @@ from nerf_lightning.system import NeRF3D
 if TYPE_CHECKING:
     import trimesh
 
-OFFSETS = {"stl": "coordinates lack the offset {}", "glb": "the node's transform holds the offset {}"}
-"""What to say of it, by format: single precision does not hold coordinates that are large for the mesh's size."""
+OFFSETS = {"stl": "offset {} subtracted, see the header", "glb": "offset {} in the node's transform"}
+"""How messages state it, by format: single precision does not hold coordinates that are large for the mesh's size."""
 
 
 @dataclass(frozen=True)

@@ -83,9 +83,9 @@ def test_georeferenced_vertices_are_as_exact_as_at_the_origin(suffix: str):
     if suffix == "glb":  # y is up, by a turn about the offset
         offset = np.array([500005, 5411199, 302])
         far = (np.stack([far[:, 0], -far[:, 2], far[:, 1]], axis=1) - offset) @ TURN.T.numpy() + offset
-        assert "the node's transform holds the offset 500005, 5411199, 302" in words
+        assert "offset 500005, 5411199, 302 in the node's transform" in words
     if suffix == "stl":
-        assert "coordinates lack the offset 500005, 5411199, 302" in words
+        assert "offset 500005, 5411199, 302 subtracted" in words
         assert b"offset 500005, 5411199, 302 " in content[:80]
         shift = shift - [500005, 5411199, 302]
     size = np.ptp(near, axis=0).max()
