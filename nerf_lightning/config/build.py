@@ -11,7 +11,7 @@ from typing import Any
 import hydra
 import lightning as L
 import torch
-from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
@@ -36,6 +36,9 @@ from nerf_lightning.utils.options import check_options
 
 KNOWN = ("cpu", "cuda", "mps")
 """Devices that Lightning knows; for any other it would silently take the CPU."""
+
+PRECISIONS = ("32-true", "16-mixed", "bf16-mixed", 32, "32", 16, "16", "bf16")
+"""Lightning's that training takes: the kernels, and what the renderer integrates, are in single precision."""
 
 MOST_DEVICES = 1024
 """Lightning lists all, and starts a process for each: no machine has as many."""
@@ -254,6 +257,7 @@ def build_logger(cfg: DictConfig, folder: Path) -> Logger:
 
         own = {"_target_", *inspect.signature(TensorBoardLogger).parameters}
         check_options("logger", SummaryWriter, {k: v for k, v in resolved(cfg.logger).items() if k not in own})
+    if isinstance(logger, CSVLogger | TensorBoardLogger):
         output_path(logger.log_dir)
     return logger
 
@@ -273,6 +277,9 @@ def build_trainer(cfg: DictConfig, folder: Path, device: torch.device, results: 
         raise InputError(
             "config", "trainer.devices", devices[:60], f"at most {MOST_DEVICES}, the processes of one machine"
         )
+    precision = OmegaConf.select(cfg, "trainer.precision")
+    if precision not in (None, *PRECISIONS):
+        raise InputError("config", "trainer.precision", repr(precision), f"one of {', '.join(map(str, PRECISIONS))}")
     where: dict[str, Any] = {"accelerator": device.type, "enable_checkpointing": False}  # callbacks/checkpoints does it
     if device.type not in KNOWN:
         where["strategy"] = SingleDeviceStrategy(device)

@@ -19,7 +19,7 @@ RUN = ("config.yaml", "results.json", "checkpoints")
 """Any of these says that a folder holds a run."""
 MADE = (
     *RUN, "scene.json", "error.txt", "hparams.yaml", "events.out.tfevents.*", "snapshots", "final.png", "orbit.gif",
-    "training.gif", "error.png", "spectrum.png", "curve.png", "baselines.json", "enlarged.*", "enlarged_*",
+    "training.gif", "error.png", "spectrum.png", "curve.png", "csv", "wandb", "baselines.json", "enlarged.*", "enlarged_*",
     "compact.npz", "field.html", "mesh.ply", "mesh.obj", "mesh.glb", "mesh.stl", "points.ply", "voxels.npz", "posed",
     "render_*", "evaluation",
 )  # fmt: skip

@@ -14,7 +14,7 @@ TRUST = "NERF_LIGHTNING_TRUST"
 
 TARGETS = {
     "lightning": ("Trainer",),
-    "lightning.pytorch.loggers": ("TensorBoardLogger",),
+    "lightning.pytorch.loggers": ("CSVLogger", "TensorBoardLogger"),
     "nerf_lightning.callbacks": (
         *("Baselines", "Checkpoints", "Enlarge", "Guard", "HeldOut", "Live", "Orbit", "PictureCharts", "Progress"),
         *("Snapshots", "Throughput", "TrainingGif"),
@@ -31,6 +31,7 @@ TARGETS = {
         "suited_sampler",
     ),
     "nerf_lightning.system": ("constant", "cosine", "exponential"),
+    "nerf_lightning.training.loggers": ("mlflow", "wandb"),
     "torch.optim": ("Adam", "AdamW"),
 }
 """What a run folder may name, by module. Anything else could be called with a stranger's arguments."""

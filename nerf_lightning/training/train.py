@@ -42,6 +42,7 @@ from nerf_lightning.runs.owner import clear
 from nerf_lightning.runs.scene_file import load_scene, save_scene
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND, check_compiler
+from nerf_lightning.training.loggers import finishing_wandb
 from nerf_lightning.training.room import check_room
 from nerf_lightning.utils.allocator import keep_freed_memory
 from nerf_lightning.utils.listing import first_few
@@ -53,7 +54,7 @@ from nerf_lightning.utils.quiet import quiet
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
-"""Figures shown beside the options in TensorBoard's HParams tab."""
+"""Figures logged beside the options, as in TensorBoard's HParams tab."""
 NAMED = 10
 """Photos that do not fit which are printed; all stand in results.json."""
 log = logging.getLogger(__name__)
@@ -78,6 +79,7 @@ class Described(L.Callback):
         save_scene(self.data, self.folder)
 
 
+@finishing_wandb()
 def train(
     cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None = None, scene: Scene | None = None
 ) -> float:
@@ -160,7 +162,7 @@ def train(
             print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}")
         if trainer.logger is not None:
             log_hyperparameters(trainer.logger, cfg, results.summary)
-        report(results.summary, folder)
+        report(results.summary, folder, trainer.logger)
     quality: float | None = results.summary["psnr"]
     return math.nan if quality is None else quality  # views of a field that has broken down may have none
 
@@ -259,17 +261,20 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
 
 
 def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, results: dict) -> None:
-    """Writes the run's options and final figures to TensorBoard's HParams tab."""
+    """Writes the run's options and final figures, for TensorBoard to its HParams tab."""
     plain = resolved(cfg)
     options = {group: plain[group] for group in GROUPS if plain.get(group) is not None}
     params = {**options, "method": cfg.method, "scene": results["scene"]["name"], "seed": cfg.seed}
     metrics = {f"final/{key}": results[key] or 0.0 for key in SCORES}
     if isinstance(logger, L.pytorch.loggers.TensorBoardLogger):
         logger.log_hyperparams(params, metrics)
-        logger.finalize("success")
+    else:
+        logger.log_hyperparams(params)
+        logger.log_metrics(metrics, results["steps"])
+    logger.finalize("success")
 
 
-def report(results: dict, folder: Path) -> None:
+def report(results: dict, folder: Path, logger: L.pytorch.loggers.Logger | None) -> None:
     """Prints the outcome."""
     for one in results["recoveries"]:
         print(f"guard: at step {one['step']}: {one['cause']}; {one['action']}")
@@ -283,4 +288,5 @@ def report(results: dict, folder: Path) -> None:
         print(f"the machine was busy with something else, which took {crowded:.0%} of this run's threads")
     with suppress(ValueError):  # a folder elsewhere is printed with its full path
         folder = folder.relative_to(Path.cwd())
-    print(f"everything is in {folder}; curves: tensorboard --logdir {folder.parent}")
+    shown = isinstance(logger, L.pytorch.loggers.TensorBoardLogger)
+    print(f"everything is in {folder}" + (f"; curves: tensorboard --logdir {folder.parent}" if shown else ""))

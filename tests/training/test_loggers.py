@@ -1,0 +1,66 @@
+"""Where curves go: each logger gets the figures of training, the options and the final figures."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import yaml
+
+from nerf_lightning.training import loggers
+
+SMALL = ("+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3", "callbacks=null", "hydra.run.dir=run")
+
+
+def test_csv(inside, tmp_path: Path):
+    code, out, err = inside(*SMALL, "logger=csv", "seed=3")
+    assert code == 0 and "tensorboard" not in out, err
+    results = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
+    folder = tmp_path / "run" / "csv" / "version_0"
+    with (folder / "metrics.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    figures = {key: float(value) for row in rows for key, value in row.items() if value}
+    assert [figures["test/psnr"], figures["final/psnr"]] == pytest.approx([results["psnr"]] * 2, abs=1e-4)
+    assert figures["final/artifact_bytes"] == results["artifact_bytes"] and figures["step"] == 3
+    options = yaml.safe_load((folder / "hparams.yaml").read_text(encoding="utf-8"))
+    assert (options["seed"], options["budget"]["steps"]) == (3, 3)
+
+
+@pytest.mark.parametrize("extra", ["wandb", "mlflow"])
+def test_a_service_whose_package_is_missing_is_told_in_a_line(
+    extra: str, inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setitem(sys.modules, extra, None)
+    code, _, err = inside(*SMALL, f"logger={extra}")
+    assert code == 2 and err.count("\n") == 1 and f"pip install 'nerf_lightning[{extra}]', or logger=csv" in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_where_services_are_asked_to_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = SimpleNamespace(WandbLogger=lambda *a, **k: (a, k), MLFlowLogger=lambda *a, **k: (a, k))
+    for name in ("wandb", "mlflow"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    for name, make in vars(made).items():
+        monkeypatch.setattr(loggers, name, make)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    wandb, mlflow = (getattr(loggers, name).__wrapped__ for name in ("wandb", "mlflow"))
+    assert wandb(tmp_path, "mine", "first", True) == (("first", tmp_path), {"project": "mine", "offline": True})
+    assert mlflow(tmp_path, "mine", "first") == (("mine", "first"), {"tracking_uri": "sqlite:///mlflow.db"})
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://tracking.example")
+    assert mlflow(tmp_path)[1] == {"tracking_uri": "http://tracking.example"}
+
+
+def test_each_training_has_a_run_of_its_own_at_weights_and_biases(monkeypatch: pytest.MonkeyPatch):
+    finished: list[str] = []
+    module = ModuleType("wandb")
+    module.run = own = SimpleNamespace(finish=lambda: finished.append("the user's"))
+    monkeypatch.setitem(sys.modules, "wandb", module)
+    with loggers.finishing_wandb():
+        pass
+    assert module.run is own and finished == []
+    with pytest.raises(RuntimeError), loggers.finishing_wandb():
+        module.run = SimpleNamespace(finish=lambda: finished.append("training's"))
+        raise RuntimeError
+    assert finished == ["training's"]
