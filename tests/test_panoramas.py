@@ -13,7 +13,7 @@ from export.balls import CENTRE, RADIUS, ball_run
 
 import nerf_lightning as nl
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at, orbit_around
-from nerf_lightning.dataset import RayDataModule, Scene, Views
+from nerf_lightning.dataset import RayDataModule, Scene, Views, load_transforms
 from nerf_lightning.dataset.optics import equirectangular
 from nerf_lightning.dataset.shots import Reading, Shot, read_shots
 from nerf_lightning.errors import InputError
@@ -125,3 +125,22 @@ def test_photos_are_written_with_the_name_of_their_projection(scene: Scene, tmp_
     frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
     assert frame["camera_model"] == "EQUIRECTANGULAR" and (frame["w"], frame["h"]) == (WIDTH, HEIGHT)
     assert [frame[key] for key in ("fl_x", "fl_y", "cx", "cy")] == [HEIGHT, HEIGHT, WIDTH / 2, HEIGHT / 2]
+    again = load_transforms(tmp_path)
+    directions = [
+        one.train.cameras.view_rays(1).directions
+        @ one.to_source[:3, :3].float().T
+        / torch.linalg.det(one.to_source[:3, :3]).float() ** (1 / 3)
+        for one in (again, scene)
+    ]
+    torch.testing.assert_close(*directions, atol=1e-5, rtol=0)
+
+
+def test_photos_of_all_directions_are_twice_as_wide_as_high(scene: Scene, tmp_path: Path):
+    write_photos(scene, tmp_path)
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    for frame in content["frames"]:
+        frame["h"] = HEIGHT + 8
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="EQUIRECTANGULAR of 64x40 pixels, expected photos twice as wide as high"):
+        load_transforms(tmp_path)

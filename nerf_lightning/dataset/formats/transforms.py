@@ -333,6 +333,9 @@ def read_optics(frame: Frame, width: int, height: int) -> Optics:
     file, name_key = frame.file, frame.name_key
     model = frame.get("camera_model") or "OPENCV"
     if model == EQUIRECTANGULAR:
+        if abs(width - 2 * height) > 2:
+            found, expected = f"{model} of {width}x{height} pixels", "photos twice as wide as high, of all directions"
+            raise InputError(file, name_key("camera_model"), found, expected)
         return equirectangular(width, height)
     if model not in (*PERSPECTIVE, *FISHEYE):
         expected = f"one of {', '.join((*PERSPECTIVE, *FISHEYE, EQUIRECTANGULAR))}"
