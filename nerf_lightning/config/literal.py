@@ -69,9 +69,8 @@ def _quoted(argument: str, keys: Sequence[str], sweep: bool) -> str:
         return override_of(key, value)
     if parsed and (value[0] in "'\"[" or (sweep and _is_function(parsed))):
         return argument
-    if (
-        len(values) > 1 and all(values) and (sweep or all(map(_exists, values)))
-    ):  # an experiment may be a sweep without -m
+    # An experiment may be a sweep without -m.
+    if len(values) > 1 and all(values) and (sweep or all(map(_exists, values))):
         if sweep:
             print(f"{key}: {len(values)} values to sweep: {' | '.join(values)}")
         return f"{key}={','.join(_quoted(f'{key}={one}', keys, False).partition('=')[2] for one in values)}"
