@@ -41,6 +41,11 @@ def test_pictures_have_their_sizes(run: Path):
         assert len(STEPS) <= gif.n_frames <= len(STEPS) + 2 and gif.width <= 640
 
 
+def test_the_last_state_is_kept_once_where_it_is_the_best(run: Path):
+    """Of a picture of 100 megapixels it takes 900 MB."""
+    assert (run / "checkpoints" / "best.ckpt").samefile(run / "checkpoints" / "last.ckpt")
+
+
 def test_figures_agree_with_each_other(run: Path):
     results, baselines, enlarged = (read(run / f"{name}.json") for name in ("results", "baselines", "enlarged"))
     assert (results["method"], results["steps"], results["scene"]["name"]) == ("hashgrid2d", 20, "sunset")

@@ -18,7 +18,7 @@ from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.system import System
 from nerf_lightning.utils.ending import Interrupted, asked, held, interrupt, listen_again
 from nerf_lightning.utils.evenly import evenly
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import atomic, link_file
 
 COPIES = 3
 """Of all parameters in a checkpoint: themselves and Adam's two means. Other optimisers keep less."""
@@ -150,8 +150,7 @@ class Checkpoints(L.Callback):
         final = fmean(self._tested[view] for view in views)
         if last.exists() and (self.best is None or final > self.best):
             self.best = final
-            with atomic(folder / "best.ckpt") as temporary:
-                shutil.copyfile(last, temporary)
+            link_file(last, folder / "best.ckpt")  # of a large picture's field each is 900 MB
 
     def state_dict(self) -> dict[str, Any]:
         return {"best": self.best}

@@ -24,7 +24,9 @@ QUALITY = 90
 """Of a WebP, out of 100."""
 
 WIDEST = 2048
-"""Pixels across of a picture that stands beside others."""
+"""Pixels across of a chart's picture."""
+PANEL_PX = 1024
+"""Pixels across of a picture that stands beside others: a run keeps dozens, and `final.png` is whole."""
 
 
 def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[ndarray, "*shape"]:
@@ -68,14 +70,14 @@ def stacked(panels: list[UInt8[ndarray, "H W 3"]]) -> UInt8[ndarray, "H2 W2 3"]:
 
 
 def result_panel(result: ViewResult, caption: str) -> UInt8[ndarray, "H2 W2 3"]:
-    """Truth, render, and depth (3D) or error times four (2D), each at most `WIDEST` pixels across."""
+    """Truth, render, and depth (3D) or error times four (2D), each at most `PANEL_PX` pixels across."""
     if result.depth is not None and result.opacity is not None:
         third = depth_colours(result.depth, result.opacity)
         names = "truth | render | depth"
     else:
         third = to_bytes(result.errors * 4)
         names = "truth | render | 4 x error"
-    shown = [narrowed(one, WIDEST) for one in (to_bytes(result.truth), to_bytes(result.rgb), third)]
+    shown = [narrowed(one, PANEL_PX) for one in (to_bytes(result.truth), to_bytes(result.rgb), third)]
     return panel(shown, f"{names}    {caption}")
 
 

@@ -55,6 +55,28 @@ def atomic(path: Path) -> Iterator[Path]:
                 temporary.unlink()
 
 
+def link_file(source: Path, target: Path) -> None:
+    """Gives a file a second name, which keeps its content when `source` is replaced; copies it where the file system has no
+    links.
+
+    Raises:
+        NoRoom, Unwritable: see `atomic`.
+    """
+    if target.exists() and target.samefile(source):
+        return
+    temporary = target.with_name(f".{target.stem}-link{target.suffix}")
+    with held():
+        try:
+            temporary.unlink(missing_ok=True)
+            os.link(source, temporary)
+            os.replace(temporary, target)
+            return
+        except OSError:
+            pass  # no links here, or no more to this file
+    with atomic(target) as copy:
+        shutil.copyfile(source, copy)
+
+
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Yields a temporary folder beside `path`; replaces `path` with it if the block succeeds.

@@ -94,7 +94,7 @@ def test_a_result_shows_truth_render_and_depth_or_error(with_depth):
 
 
 def test_large_pictures_are_shrunk_to_stand_beside_others(monkeypatch):
-    monkeypatch.setattr("nerf_lightning.drawing.panels.WIDEST", 50)
+    monkeypatch.setattr("nerf_lightning.drawing.panels.PANEL_PX", 50)
     rgb = torch.zeros(400, 100, 3)
     rgb[::2] = 1.0
     made = result_panel(ViewResult(rgb, rgb, 20.0, 1.0), "caption")

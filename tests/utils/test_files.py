@@ -8,7 +8,15 @@ import pytest
 import torch
 
 from nerf_lightning.errors import InputError, NoRoom
-from nerf_lightning.utils.files import atomic, atomic_folder, output_path, remove_empty, user_path, write_json
+from nerf_lightning.utils.files import (
+    atomic,
+    atomic_folder,
+    link_file,
+    output_path,
+    remove_empty,
+    user_path,
+    write_json,
+)
 
 
 def test_a_finished_block_replaces_the_file(tmp_path: Path):
@@ -20,6 +28,25 @@ def test_a_finished_block_replaces_the_file(tmp_path: Path):
             assert not path.exists() or path.read_text() == "first", "untouched until the end"
         assert path.read_text() == content
     assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_second_name_keeps_its_content(links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    last, best = tmp_path / "last.txt", tmp_path / "best.txt"
+    best.write_text("old")
+    write_json(last, "one")
+    if not links:
+
+        def refuse(*_: object) -> None:
+            raise OSError("no links here")
+
+        monkeypatch.setattr(os, "link", refuse)
+    for _ in range(2):
+        link_file(last, best)
+    assert best.samefile(last) == links
+    write_json(last, "two")
+    assert json.loads(best.read_text()) == "one" and json.loads(last.read_text()) == "two"
+    assert sorted(tmp_path.iterdir()) == [best, last]
 
 
 def test_who_reads_meanwhile_reads_the_old_file_to_its_end(tmp_path: Path):
