@@ -1,5 +1,6 @@
 """From posed photos to a scene: one frame and one unit, split, bounds and an orbit, the same for every format."""
 
+import itertools
 import logging
 import math
 from collections.abc import Sequence
@@ -49,6 +50,13 @@ class Split:
     """Held out: measured on while training and at its end."""
     test: list[int] = field(default_factory=list)
     """Held out and measured on at the end alone, where a format has both."""
+
+    def renumber(self) -> "Split":
+        """The same split of the photos laid out part after part."""
+        first, second = len(self.train), len(self.train) + len(self.val)
+        ends = (0, first, second, second + len(self.test))
+        train, val, test = (list(range(*pair)) for pair in itertools.pairwise(ends))
+        return Split(train, val, test)
 
 
 @dataclass(frozen=True)
@@ -117,6 +125,9 @@ def build_scene(
         split = split_shots(source, len(shots), reading.holdout)
     checks.split_size(source, "train split", len(split.train))
     checks.split_size(source, "val split", len(split.val))
+    # Part after part, so that none of them needs a copy of its pixels.
+    shots = [shots[i] for i in (*split.train, *split.val, *split.test)]
+    split = split.renumber()
     poses = np.stack([shot.c2w for shot in shots])
     views = read_shots(source, shots, reading)
     check_visible(source, views)

@@ -219,10 +219,10 @@ def _pinhole(source: Path, shot: Shot, size: tuple[int, int]) -> Lens:
 
 
 def _check_memory(source: Path, shots: Sequence[Shot], size: int, sides: Sequence[tuple[int, int]]) -> None:
-    """Photos must fit into the free memory, twice: they are split into training and held-out ones once."""
+    """Photos must fit into the free memory."""
     free = ROOM * free_memory()
-    if 2 * size > free:
+    if size > free:
         longest = max(max(side) for side in sides)
-        fits = max(1, int(longest * math.sqrt(max(free, 0) / (2 * size))))
-        found = f"{len(shots)} photos that take {size / 2**30:.1f} GiB, twice while they are read"
+        fits = max(1, int(longest * math.sqrt(max(free, 0) / size)))
+        found = f"{len(shots)} photos that take {size / 2**30:.1f} GiB"
         raise InputError(source, "", found, f"at most {free / 2**30:.1f} GiB", f"dataset.resize={fits} would fit")

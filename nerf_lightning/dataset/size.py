@@ -27,8 +27,8 @@ CORE_SECONDS_PER_STEP = 0.06
 """Of the experiment `capture` on a CPU."""
 ACCELERATOR_CORES = 64
 """Cores that an accelerator stands for; an estimate."""
-MEMORY_SHARE = 0.2
-"""Of the free memory that photos may take; twice that while they are read."""
+MEMORY_SHARE = 0.4
+"""Of the free memory that photos may take."""
 REDUCED = (8, 4, 2)
 """Folders `images_8`, `images_4`, `images_2` hold the same photos at these fractions of their size."""
 MAX_DEPTH = 3

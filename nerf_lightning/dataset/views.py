@@ -126,14 +126,19 @@ class Views:
         return self.mask[start : start + width * height].view(height, width)
 
     def __getitem__(self, index: Tensor) -> "Views":
-        """Some of the views."""
-        chosen = [slice(self._cuts[view], self._cuts[view + 1]) for view in index.tolist()]
-        pixels = torch.cat([self.pixels[part] for part in chosen]) if chosen else self.pixels[:0]
-        known = None
-        if self.known is not None:
-            known = Runs.of(torch.cat([self.mask[part] for part in chosen]) if chosen else self.mask[:0])
-        names = tuple(self.names[view] for view in index.tolist()) if self.names else ()
-        exposures = tuple(self.exposures[view] for view in index.tolist()) if self.exposures else ()
+        """Some of the views; no copy of pixels where they follow each other."""
+        chosen = index.tolist()
+        parts = [slice(self._cuts[view], self._cuts[view + 1]) for view in chosen]
+        if chosen and chosen == list(range(chosen[0], chosen[0] + len(chosen))):
+            parts = [slice(parts[0].start, parts[-1].stop)]
+
+        def take(values: Tensor) -> Tensor:
+            return values[parts[0]] if len(parts) == 1 else torch.cat([values[:0], *(values[part] for part in parts)])
+
+        pixels = take(self.pixels)
+        known = None if self.known is None else Runs.of(take(self.mask))
+        names = tuple(self.names[view] for view in chosen) if self.names else ()
+        exposures = tuple(self.exposures[view] for view in chosen) if self.exposures else ()
         return Views(pixels, self.cameras[index], known, names, exposures)
 
     def spread(self, count: int) -> "Views":

@@ -70,7 +70,7 @@ def test_the_largest_photo_is_divided_by_a_whole_number(
 def test_photos_are_smaller_where_the_memory_has_no_room(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(size_module, "free_memory", lambda: 5 * 100 * 3 * 700 * 525)
+    monkeypatch.setattr(size_module, "free_memory", lambda: 2.5 * 100 * 3 * 700 * 525)
     with caplog.at_level(logging.INFO):
         assert choose_resize("here", [(4000, 3000)] * 100, 3, AutoResize(1000, "much time")) == 667  # a sixth
     assert "the memory has no room for more" in caplog.text
