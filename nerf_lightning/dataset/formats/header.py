@@ -32,7 +32,7 @@ class Header:
     height: int
     alpha: bool
     tags: Mapping[int, Any]
-    """EXIF tags by their numbers; none where there are none, or broken ones."""
+    """EXIF tags by their numbers, but for those of raw bytes, as makers' notes; none where there are none, or broken ones."""
 
     @property
     def orientation(self) -> int:
@@ -74,6 +74,7 @@ def _read_header(path: Path, size: int, mtime_ns: int) -> Header | None:
 def _tags(image: Image.Image) -> dict[int, Any]:
     try:
         exif = image.getexif()
-        return {**exif, **exif.get_ifd(DETAILS)}
+        tags = {**exif, **exif.get_ifd(DETAILS)}
+        return {tag: value for tag, value in tags.items() if not isinstance(value, bytes)}
     except DAMAGED:
         return {}
