@@ -118,7 +118,7 @@ def test_pictures_that_are_no_numbers_are_told(
         return replace(rendered, rgb=rendered.rgb * torch.nan)
 
     monkeypatch.setattr(NeRF3D, "render", render_badly)
-    monkeypatch.setattr(results, "aligned_psnr", lambda system, views: [math.nan] * len(views))  # takes long
+    monkeypatch.setattr(results, "aligned_psnr", lambda system, views, share: [math.nan] * len(views))  # takes long
     options = [*QUICK, "refine=both"] if cameras_too else QUICK
     run = nl.train(nl.load_scene(folder), steps=4, seed=1, device="cpu", folder=tmp_path / "run", options=options)
     found = run.results

@@ -112,8 +112,8 @@ def test_what_a_run_leaves(tmp_path: Path):
     assert set(results) == {
         "scene", "background", "method", "seed", "device", "threads", "machine", "load", "versions", "parameters",
         "artifact_bytes", "train_seconds", "steps", "rays_per_second", "psnr", "psnr_aligned", "ssim", "psnr_worst_view",
-        "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "plateau", "misfits", "corrections", "recoveries",
-        "status", "diagnosis",
+        "rows_measured", "test", "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "plateau", "misfits",
+        "corrections", "recoveries", "status", "diagnosis",
     }  # fmt: skip
     assert set(results["scene"]) == {"name", "source", "sha256", "views", "resolution"}
     assert results["scene"]["name"] == "bricks"

@@ -4,7 +4,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from statistics import fmean
 from typing import Any
 
@@ -13,15 +13,20 @@ import torch
 
 from nerf_lightning.callbacks.attached import agreed, attached, data_of
 from nerf_lightning.callbacks.plateau import HALF_AGAIN, Plateau
+from nerf_lightning.callbacks.render_plan import MIN_SECONDS, RenderPlan
+from nerf_lightning.dataset.subset import thin
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU, synchronize
+from nerf_lightning.utils.ending import interruptible
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.machine import Load, work_clocks
 from nerf_lightning.utils.untrusted import count, number
 
-LOOK_AT = 3
-"""Held-out views rendered to look for a plateau."""
+LOOK_AT, LOOK_PIXELS = 3, 1 << 16
+"""Held-out views rendered to look for a plateau, and about the most pixels of each."""
+AT_ROW = "stopping after this row"
+"""What a signal is answered with while a view is rendered."""
 RECENT, UNDISTURBED = 20, 0.1
 """With `alone`: steps that are looked back on, and the share of them that other work never disturbs: each time it has a core in
 between, it leaves this process's data out of the caches too."""
@@ -79,6 +84,8 @@ class Budget(L.Callback):
         self._alone = alone
         self._worked = (0.0, 0.0)  # `work_clocks` when the step began
         self._took: deque[float] = deque(maxlen=RECENT)  # work of the last steps, seconds
+        self.plan = RenderPlan()
+        """Of what is rendered beside training."""
         self.load = Load()
         """CPU use of this process and of others while the clock ran."""
 
@@ -122,10 +129,17 @@ class Budget(L.Callback):
         start, reached, slope = self._line
         return min(1.0, max(spent, reached + slope * (spent - start)))
 
-    def drawing_seconds(self, step: int) -> float:
-        """Seconds that pictures and measurements may take by default: as long as training is expected to take, judged after
-        `step` steps, and at least half a minute."""
-        return max(30.0, self.seconds / max(self.progress(step), 1e-3))
+    def render_seconds(self, step: int) -> float:
+        """Seconds that rendering beside training may take: as long as training is expected to take, judged after `step` steps,
+        and at least `MIN_SECONDS`."""
+        return max(MIN_SECONDS, self.seconds + (self.seconds_left(step) or 0.0))
+
+    def seconds_left(self, step: int) -> float | None:
+        """Seconds of training still to come, judged after `step` steps; None before the first."""
+        spent = self.spent(step)
+        start, reached, slope = self._line
+        end = min(1.0, start + (1 - reached) / slope)
+        return max(0.0, end - spent) * self.seconds / spent if spent else None
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -137,6 +151,13 @@ class Budget(L.Callback):
         finally:
             if running:
                 self._start()
+
+    @contextmanager
+    def rendering(self, trainer: L.Trainer, subject: str) -> Iterator[None]:
+        """Stops the clock for a block that renders, which a signal ends: it must change nothing that a checkpoint keeps."""
+        alone = trainer.world_size == 1  # several processes leave together, at the end of a step
+        with self.paused(), self.plan.rendering(subject), interruptible(AT_ROW) if alone else nullcontext():
+            yield
 
     def _start(self) -> None:
         synchronize(self._device)
@@ -179,10 +200,12 @@ class Budget(L.Callback):
         spent = agreed(trainer, self.spent(step))
         if not plateau.due(spent):
             return
-        with self.paused():
-            data = data_of(trainer)
-            chosen = evenly(data.held_out_views, LOOK_AT)
-            flat = plateau.note(spent, fmean(view.psnr for view in system.evaluate_held_out(data, chosen)))
+        data = data_of(trainer)
+        chosen = evenly(data.held_out_views, LOOK_AT)
+        some = thin(max(map(data.pixels_held_out, chosen)), LOOK_PIXELS)
+        with self.rendering(trainer, "views to look for a plateau"):
+            quality = fmean(view.psnr for view in system.evaluate_held_out(data, chosen, some))
+        flat = plateau.note(spent, quality)
         if not agreed(trainer, flat):
             return
         if system.progress < system.field.grown_after:

@@ -97,7 +97,7 @@ class Checkpoints(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._saved = time.monotonic()
         listen_again()  # Lightning has taken SIGTERM, and would end with 0
-        self._steps.enter_context(held())
+        self._steps.enter_context(held("stopping after this step"))
         self._stepping = True
 
     def on_train_batch_end(

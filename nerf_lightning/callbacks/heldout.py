@@ -6,8 +6,11 @@ from typing import Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import data_of
+from nerf_lightning.callbacks.attached import agreed, data_of
 from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.callbacks.render_plan import Need, Renders
+from nerf_lightning.callbacks.rendering import share_of
+from nerf_lightning.dataset.subset import WHOLE, PixelSubset, thin
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.ending import leave_if_asked
@@ -16,17 +19,22 @@ from nerf_lightning.utils.untrusted import count, number
 
 LARGE = 1 << 21
 """Pixels of a view beyond which SSIM, which takes some ten times as long as rendering, is left to the test."""
+MIN_PIXELS = 1 << 12
+"""Of a view, that are rendered for the curve however little time there is."""
+MIN_ROWS = 0.05
+"""Share of each view's rows, likewise for the test."""
 
 
-class HeldOut(L.Callback):
+class HeldOut(Renders):
     """Measures held-out PSNR, and SSIM up to `LARGE` pixels, at fractions of the budget, with the training clock stopped.
 
-    The last point of the curve, at the end of the budget, comes from the test over all views.
+    The last point of the curve, at the end of the budget, comes from the test over all views. Where rendering would take
+    longer than training (see `RenderPlan`), the others are measured on every n-th row and column, without SSIM, and, if all
+    views alone take longer, the test on strips of rows that lie evenly in each view.
 
     Args:
         at: fractions of the budget, ascending, in (0, 1).
-        views: how many held-out views, evenly chosen. None takes all, or fewer if measuring them would take longer than
-            training and longer than half a minute. The last point always uses all views.
+        views: how many held-out views, evenly chosen; None takes all. The last point always uses all views.
 
     Raises:
         InputError: for fractions outside (0, 1) or less than one view.
@@ -41,31 +49,30 @@ class HeldOut(L.Callback):
         self.views = views
         self.curve: list[list[float]] = []
         """[training seconds, step, PSNR], a row for each measurement; nan where there was no figure."""
-        self.view_seconds: float | None = None
-        """Rendering time of a view at the last measurement."""
+        self.rows = 1.0
+        """The share of each view's rows that the test measures."""
+        self._tested = 0  # views
 
     @property
     def latest(self) -> float | None:
         """The last PSNR, or None before the first."""
         return self.curve[-1][2] if self.curve else None
 
-    def planned(self, trainer: L.Trainer) -> int:
-        """Views still to be rendered in measurements during training."""
-        total = data_of(trainer).held_out_views
-        return (len(self.at) - len(self.curve)) * len(evenly(total, self.count(trainer)))
-
-    def count(self, trainer: L.Trainer) -> int | None:
-        """How many views a measurement takes; None for all."""
-        if self.views is not None or not self.view_seconds:
-            return self.views
-        allowed = Budget.of(trainer).drawing_seconds(trainer.global_step) / len(self.at)
-        return max(1, int(allowed / self.view_seconds))
+    def needs(self, trainer: L.Trainer) -> dict[str, Need]:
+        data, training = data_of(trainer), Budget.of(trainer).progress(trainer.global_step) < 1
+        points = len(self.at) - len(self.curve) if training else 0
+        chosen = evenly(data.held_out_views, self.views)
+        measured = points * sum(map(data.pixels_held_out, chosen))
+        tested = self.rows * sum(map(data.pixels_held_out, range(self._tested, data.held_out_views)))
+        return {
+            "curve": Need(measured, points * len(chosen) * MIN_PIXELS, scored=trainer.logger is not None),
+            "final": Need(tested, MIN_ROWS * tested, scored=True),
+        }
 
     def record(self, trainer: L.Trainer, views: list[dict[str, float]]) -> None:
         """Adds a point to the curve and to the log; views of which no pixel is known do not count."""
         counted = [view["psnr"] for view in views if math.isfinite(view["psnr"])]
         quality = fmean(counted) if counted else math.nan
-        self.view_seconds = fmean(view["seconds"] for view in views)
         self.curve.append([round(Budget.of(trainer).seconds, 3), trainer.global_step, round(quality, 4)])
         if trainer.logger is not None:
             figures = {"heldout/psnr": quality}
@@ -88,30 +95,46 @@ class HeldOut(L.Callback):
         due = sum(progress >= fraction for fraction in self.at)
         if due <= len(self.curve) or progress >= 1.0:
             return
-        with Budget.of(trainer).paused():
-            data = data_of(trainer)
-            if self.views is None and self.view_seconds is None:  # not yet known: how many views there is time for
-                self.view_seconds = next(pl_module.evaluate_held_out(data, [0])).seconds
-            chosen = evenly(data.held_out_views, self.count(trainer))
-            if self.views is None and len(chosen) < data.held_out_views and not self.curve:
-                print(
-                    f"{len(chosen)} of {data.held_out_views} held-out views are measured while training, as one takes "
-                    f"{self.view_seconds:.1f} s; callbacks.heldout.views={data.held_out_views} takes all"
-                )
-            views: list[dict[str, float]] = []  # not their pictures, which would be held together
-            for result in pl_module.evaluate_held_out(data, chosen):
-                views.append({"psnr": result.psnr, "seconds": result.seconds})
-                if trainer.logger is not None and result.truth.shape[:2].numel() <= LARGE:
+        data, budget = data_of(trainer), Budget.of(trainer)
+        chosen = evenly(data.held_out_views, self.views)
+        pixels = fmean(map(data.pixels_held_out, chosen))
+        subset = thin(pixels, max(MIN_PIXELS, agreed(trainer, share_of(trainer, pl_module, "curve")) * pixels))
+        views: list[dict[str, float]] = []  # not their pictures, which would be held together
+        for done, view in enumerate(chosen):
+            with budget.rendering(trainer, f"held-out view {done + 1} of {len(chosen)}"):
+                (result,) = pl_module.evaluate_held_out(data, [view], subset)
+                budget.plan.note(result.pixels, result.seconds)
+                views.append({"psnr": result.psnr})
+                if trainer.logger is not None and subset == WHOLE and result.pixels <= LARGE:
                     views[-1]["ssim"] = result.ssim
-                if trainer.world_size == 1:  # several processes leave together, at the end of a step
-                    leave_if_asked()
-            while len(self.curve) < due:  # one step may pass several marks: one measurement counts for all
-                self.record(trainer, views)
+            if trainer.world_size == 1:  # several processes leave together, at the end of a step
+                leave_if_asked()
+        while len(self.curve) < due:  # one step may pass several marks: one measurement counts for all
+            self.record(trainer, views)
+
+    def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
+        self.rows, self._tested = 1.0, 0
+
+    def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        self.rows = agreed(trainer, share_of(trainer, pl_module, "final"))
+        data_of(trainer).test_on(PixelSubset(rows=self.rows))
+
+    def on_test_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
+        Budget.of(trainer).plan.start(f"held-out view {batch_idx + 1} of {data_of(trainer).held_out_views}")
+
+    def on_test_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        plan = Budget.of(trainer).plan
+        plan.stop()
+        plan.note(batch.height * batch.width, outputs["seconds"])
+        self._tested += 1
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        data_of(trainer).test_on(WHOLE)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"curve": self.curve, "view_seconds": self.view_seconds}
+        return {"curve": self.curve}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.curve = [[number(spent), count(step), float(quality)] for spent, step, quality in state_dict["curve"]]
-        seconds = state_dict["view_seconds"]
-        self.view_seconds = None if seconds is None else number(seconds)

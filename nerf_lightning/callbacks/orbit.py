@@ -1,7 +1,6 @@
 """Orbit: a turn around the subject as an animated GIF."""
 
 import math
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,9 +8,11 @@ import lightning as L
 import numpy as np
 from jaxtyping import UInt8
 
-from nerf_lightning.callbacks.attached import attached, data_of
+from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.progress import Progress
+from nerf_lightning.callbacks.render_plan import Need, Renders
+from nerf_lightning.callbacks.rendering import share_of
+from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.panels import panel, to_bytes, write_animation
 from nerf_lightning.errors import InputError
@@ -20,17 +21,20 @@ from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.options import FramesPerSecond
 
-MOST, FEWEST, SMALLEST = 60, 12, 0.25
-"""By default: most and fewest frames of an orbit, and the smallest factor on their size."""
+MAX_FRAMES, MIN_FRAMES = 60, 12
+MAX_SIDE = 800
+"""Pixels along a frame's longer side by default."""
+MIN_SCALE = 0.25
+"""Smallest factor on the size of frames."""
 
 
-class Orbit(L.Callback):
+class Orbit(Renders):
     """Renders the scene's orbit after the test.
 
     Args:
         path: the GIF, below the run folder.
-        frames: how many of the orbit's views, evenly chosen; 0 makes no GIF. None takes 60, or fewer and smaller ones if
-            drawing them would take longer than training took and longer than half a minute.
+        frames: how many of the orbit's views, evenly chosen, at their full size; 0 makes no GIF. None takes 60 of at most
+            `MAX_SIDE` pixels, or fewer and smaller ones where there is not time for them (see `RenderPlan`).
         fps: frames a second.
 
     Raises:
@@ -46,55 +50,58 @@ class Orbit(L.Callback):
         self.frames = frames
         self.fps = fps
 
+        self._drawn = 0
+
+    def needs(self, trainer: L.Trainer) -> dict[str, Need]:
+        cameras = self.cameras(trainer)
+        count = self.count(cameras)
+        pixels = int(cameras.sizes[evenly(len(cameras), count)][self._drawn :].prod(1).sum())
+        least = min(1.0, MIN_FRAMES / max(count, 1)) * MIN_SCALE**2 * pixels
+        return {"orbit": Need(pixels, least, asked=self.frames is not None)}
+
+    def cameras(self, trainer: L.Trainer) -> Cameras:
+        """The path, at the size for which there may be time."""
+        scene = data_of(trainer).scene
+        assert isinstance(scene, Scene)  # NeRF3D trains on nothing else
+        return scene.orbit if self.frames is not None else scene.orbit.scaled(min(1.0, MAX_SIDE / scene.orbit.longest))
+
+    def count(self, cameras: Cameras) -> int:
+        """Frames, likewise."""
+        return min(MAX_FRAMES if self.frames is None else self.frames, len(cameras))
+
     def setup(self, trainer: L.Trainer, pl_module: NeRF3D, stage: str) -> None:
-        progress = attached(trainer, Progress)
-        if progress is not None and stage == "fit":
-            progress.later_views += MOST if self.frames is None else self.frames
+        self._drawn = 0
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF3D) -> None:
         if self.frames == 0 or not trainer.is_global_zero:
             return
-        scene = data_of(trainer).scene
-        assert isinstance(scene, Scene)  # NeRF3D trains on nothing else
-        cameras = scene.orbit.to(pl_module.device)
-        progress = attached(trainer, Progress)
-
-        def picture(view: int) -> UInt8[np.ndarray, "H W 3"]:
-            rgb = pl_module.render(cameras.view_rays(view)).rgb
-            image = to_bytes(rgb.view(cameras.height, cameras.width, 3).cpu())
-            return panel([image], f"{scene.name}, step {trainer.global_step}")
-
-        count, start = min(MOST if self.frames is None else self.frames, len(cameras)), time.perf_counter()
-        drawn = [picture(evenly(len(cameras), count)[0])]
-        if self.frames is None:
-            one = time.perf_counter() - start
-            fitting, shrink = affordable(count, one, Budget.of(trainer).drawing_seconds(trainer.global_step))
-            if fitting < count or shrink < 1:
-                smaller = cameras.scaled(shrink)
-                print(
-                    f"{self.path}: {fitting} frames of {smaller.width}x{smaller.height}, as one of "
-                    f"{cameras.width}x{cameras.height} takes {one:.1f} s; callbacks.orbit.frames={count} draws all"
-                )
-                count, cameras, drawn = fitting, smaller, []
-
-        def frames() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-            yield from drawn
-            for number, view in enumerate(evenly(len(cameras), count)[len(drawn) :], len(drawn) + 1):
-                yield picture(view)
-                if progress is not None:
-                    progress.frame(number, count)
-
+        full = self.cameras(trainer)
+        most = self.count(full)
+        count, scale = fit_orbit(most, share_of(trainer, pl_module, "orbit"))
+        cameras = full.scaled(scale).to(pl_module.device)
+        if count < most or scale < 1:
+            print(
+                f"{self.path}: {count} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
+                f" training; callbacks.orbit.frames={most} draws all at full size"
+            )
         with atomic(Path(trainer.default_root_dir) / self.path) as temporary:
-            write_animation(temporary, frames(), 1 / self.fps)
+            write_animation(temporary, self._frames(trainer, pl_module, cameras, count), 1 / self.fps)
+
+    def _frames(
+        self, trainer: L.Trainer, system: NeRF3D, cameras: Cameras, count: int
+    ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+        plan, caption = Budget.of(trainer).plan, f"{data_of(trainer).scene.name}, step {trainer.global_step}"
+        for number, view in enumerate(evenly(len(cameras), count), 1):
+            before = plan.spent
+            with plan.rendering(f"orbit, frame {number} of {count}"):
+                rgb = system.render(cameras.view_rays(view)).rgb
+                image = to_bytes(rgb.view(cameras.height, cameras.width, 3))
+            plan.note(len(rgb), plan.spent - before)
+            self._drawn = number * self.count(cameras) // count
+            yield panel([image], caption)
 
 
-def affordable(frames: int, seconds: float, allowed: float) -> tuple[int, float]:
-    """How many frames to draw, and the factor on their size, so that all fit into the time allowed.
-
-    Args:
-        frames: at most this many.
-        seconds: for one at full size; proportional to its pixels.
-        allowed: seconds for all of them.
-    """
-    count = min(frames, max(int(allowed / seconds), FEWEST))
-    return count, min(1.0, max(SMALLEST, math.sqrt(allowed / (count * seconds))))
+def fit_orbit(frames: int, share: float) -> tuple[int, float]:
+    """How many frames to draw, and the factor on their size, where so large a share of all their pixels may be rendered."""
+    count = min(frames, max(int(frames * share), MIN_FRAMES))
+    return count, min(1.0, max(MIN_SCALE, math.sqrt(frames * share / count)))

@@ -1,6 +1,7 @@
-"""Progress: a bar with quality, speed and the time left."""
+"""Progress: a bar with quality, speed, the time left and what is being rendered."""
 
 import time
+from functools import partial
 from typing import Any
 
 import lightning as L
@@ -11,8 +12,12 @@ from rich.progress import Progress as RichProgress
 from nerf_lightning.callbacks.attached import attached, data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
+from nerf_lightning.callbacks.rendering import render_seconds_left
 from nerf_lightning.system import System
-from nerf_lightning.utils.progress import animates
+from nerf_lightning.utils.progress import animates, sweep_left
+
+FIRST_SECONDS = 10.0
+"""Of training, before which nobody can tell how long the rest takes: an early field is full of fog."""
 
 
 def clock(seconds: float) -> str:
@@ -25,8 +30,8 @@ def clock(seconds: float) -> str:
 class Progress(L.Callback):
     """Shows how far the run is: a bar on a terminal or in a notebook (with ipywidgets), elsewhere a line from time to time.
 
-    The time left is the rest of the budget plus the rendering still to come (measurements, test, orbit), at the speed of the
-    last view rendered.
+    The time left is the rest of the budget plus the rendering still to come (snapshots, measurements, test, orbit; see
+    `RenderPlan`), at the speed of the last views.
 
     Args:
         every_seconds: between lines, when there is no bar.
@@ -37,49 +42,42 @@ class Progress(L.Callback):
         self.console = Console()
         self.bar: RichProgress | None = None
         self.task: TaskID | None = None
-        self.later_views = 0
-        """Views rendered after the test; the callback that renders them adds them in its `setup`."""
         self._shown = 0.0
-        self._start = (0.0, 0)  # seconds and steps when this process began to train
         self._recent = 0.0  # seconds at the last display, and rays since
         self._rays = 0
 
-    def rendering_left(self, trainer: L.Trainer) -> float:
-        """Seconds of rendering still to come; 0 until a first view has been rendered."""
-        held_out = attached(trainer, HeldOut)
-        if held_out is None or held_out.view_seconds is None:
-            return 0.0
-        views = data_of(trainer).held_out_views + held_out.planned(trainer) + self.later_views
-        return views * held_out.view_seconds
-
-    def training_left(self, trainer: L.Trainer) -> float | None:
-        """Seconds of training still to come; None before the first step."""
-        budget, step = Budget.of(trainer), trainer.global_step
-        seconds, steps = budget.seconds - self._start[0], step - self._start[1]
-        left = []
-        if budget.steps is not None and steps > 0:
-            left.append((budget.steps - step) * seconds / steps)
-        if budget.limit_seconds is not None:
-            left.append(budget.limit_seconds - budget.seconds)
-        return max(0.0, min(left)) if left else None
-
-    def status(self, trainer: L.Trainer, pl_module: System) -> str:
-        """One line: step, loss as dB, held-out dB, rays a second, time left."""
+    def left(self, trainer: L.Trainer) -> tuple[float | None, str]:
+        """Seconds to the end of the run, None while they cannot be told; words for them and for what is being rendered."""
         budget = Budget.of(trainer)
+        training, rendering = budget.seconds_left(trainer.global_step), render_seconds_left(trainer)
+        subject = budget.plan.subject
+        if training is None or rendering is None or (training and budget.seconds < FIRST_SECONDS):
+            return None, subject
+        seconds = training + rendering
+        sweep = sweep_left(seconds)
+        words = f"left {clock(seconds)}" + ("" if sweep is None else f", sweep {clock(sweep)}")
+        return seconds, f"{words}: {subject}" if subject else words
+
+    def status(self, trainer: L.Trainer) -> str:
+        """Step, held-out dB, rays a second."""
         held_out = attached(trainer, HeldOut)
-        seconds = budget.seconds
+        seconds = Budget.of(trainer).seconds
         speed = self._rays / max(seconds - self._recent, 1e-9)
         self._recent, self._rays = seconds, 0
         parts = [f"step {trainer.global_step}", f"{speed:,.0f} rays/s"]
         if held_out is not None and held_out.latest is not None:
             parts.insert(1, f"held out {held_out.latest:.2f} dB")
-        training = self.training_left(trainer)
-        if training is not None:
-            parts.append(f"left {clock(training + self.rendering_left(trainer))}")
         return "  ".join(parts)
 
     def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
         self.console.quiet = not trainer.is_global_zero  # only the first of several processes prints
+        if stage == "fit":
+            Budget.of(trainer).plan.subscribe(partial(self.on_rendering, trainer, pl_module))
+
+    def on_rendering(self, trainer: L.Trainer, pl_module: System) -> None:
+        """Called when something else is being rendered."""
+        if self.due():
+            self.show(trainer, pl_module, f"step {trainer.global_step}")
 
     def open(self, name: str) -> None:
         if self.bar is None and animates(self.console) and not self.console.quiet:
@@ -94,8 +92,14 @@ class Progress(L.Callback):
         if self.bar is not None:
             self.task = self.bar.add_task(name, total=1.0, status="")
 
-    def show(self, fraction: float, status: str) -> None:
+    def show(self, trainer: L.Trainer, system: System, status: str) -> None:
+        """Shows how far the run is, rendering included, and a few words."""
         self._shown = time.monotonic()
+        seconds, left = self.left(trainer)
+        budget = Budget.of(trainer)
+        done = budget.seconds + budget.plan.spent
+        fraction = system.progress if seconds is None else done / max(done + seconds, 1e-9)
+        status = "  ".join(filter(None, (status, left)))
         if self.bar is not None and self.task is not None:
             self.bar.update(self.task, completed=fraction, status=status)
         else:
@@ -112,17 +116,16 @@ class Progress(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self.open(f"train {data_of(trainer).scene.name}")
         self._recent = Budget.of(trainer).seconds
-        self._start = (self._recent, trainer.global_step)
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         self._rays += pl_module.stats.rays * trainer.world_size
         if self.due():
-            self.show(pl_module.progress, self.status(trainer, pl_module))
+            self.show(trainer, pl_module, self.status(trainer))
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        self.show(pl_module.progress, self.status(trainer, pl_module))
+        self.show(trainer, pl_module, self.status(trainer))
 
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self.open("test")
@@ -132,12 +135,7 @@ class Progress(L.Callback):
     ) -> None:
         views = data_of(trainer).held_out_views
         if self.due() or batch_idx + 1 == views:
-            self.show((batch_idx + 1) / views, f"view {batch_idx + 1} of {views}: {outputs['psnr']:.2f} dB")
-
-    def frame(self, done: int, frames: int) -> None:
-        """Called by the orbit after each of its frames."""
-        if self.due() or done == frames:
-            self.show(done / frames, f"frame {done} of {frames}")
+            self.show(trainer, pl_module, f"view {batch_idx + 1} of {views}: {outputs['psnr']:.2f} dB")
 
     def teardown(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
         self.close()

@@ -3,7 +3,7 @@
 import math
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import version
@@ -17,14 +17,26 @@ import torch
 import nerf_lightning
 from nerf_lightning.callbacks.attached import attached, data_of
 from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.callbacks.diagnosis import gap, wild_between
 from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
+from nerf_lightning.callbacks.render_plan import Need, Renders
+from nerf_lightning.callbacks.rendering import share_of
 from nerf_lightning.callbacks.throughput import Throughput
-from nerf_lightning.dataset import PictureBatch, Scene
+from nerf_lightning.dataset import Picture, Scene, Views
+from nerf_lightning.dataset.rays import view_batch
 from nerf_lightning.errors import NoRoom
 from nerf_lightning.refine import summary
-from nerf_lightning.system import NeRF2D, NeRF3D, System, aligned_psnr, misfits, mse_to_psnr, psnr_of_photos
+from nerf_lightning.system import (
+    RENDERED_PIXELS,
+    NeRF3D,
+    System,
+    aligned_psnr,
+    misfits,
+    psnr_of_photos,
+)
 from nerf_lightning.utils.ending import Interrupted
+from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import known, write_json
 from nerf_lightning.utils.machine import describe_machine
 
@@ -37,10 +49,6 @@ NO_BETTER = 1.0
 """A run has learned nothing if it is less than this many dB better than one plain colour ..."""
 SEEN_AS_EQUAL = 40.0
 """... unless it reaches this many dB: then one colour may be all there is to learn."""
-WIDE_GAP = 8.0
-"""A field has learned its photos rather than the scene if held-out views are this many dB worse than training pixels ..."""
-GOOD = 30.0
-"""... unless they reach this many dB: then there is little to improve."""
 
 
 def peak_memory_bytes(device: torch.device) -> int | None:
@@ -58,40 +66,17 @@ def peak_memory_bytes(device: torch.device) -> int | None:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-def gap(trainer: L.Trainer, system: System, quality: float) -> str:
-    """Explains a held-out PSNR far below that of the training pixels; "" if it is not, is unknown, or for a picture."""
-    if isinstance(system, NeRF2D):
-        return ""
-    guard = attached(trainer, Guard)
-    level = guard.watch.level if guard is not None else None
-    if not level:
-        return ""
-    trained = mse_to_psnr(level)
-    if trained < quality + WIDE_GAP or quality >= GOOD:
-        return ""
-    return (
-        f"training pixels {trained:.1f} dB, held-out views {quality:.1f} dB: too few views for this model,"
-        " or poses that do not fit their photos"
-    )
+def statistic_of(views: Sequence[Mapping[str, float]], statistic: Callable[..., float], key: str) -> float | None:
+    """A statistic over the views that have a finite figure; None where no view has."""
+    values = [view[key] for view in views if math.isfinite(view[key])]
+    return round(statistic(values), 4) if values else None
 
 
-def wild_between(trainer: L.Trainer, system: System, nothing: float) -> str:
-    """Explains a 2D field that is below `nothing` (dB) between its pixels; "" if it is not."""
-    if not isinstance(system, NeRF2D):
-        return ""
-    view = data_of(trainer).held_out(0).to(system.device)
-    assert isinstance(view, PictureBatch)  # what a NeRF2D is fed
-    between = system.between(view)
-    if between is None or between >= nothing:
-        return ""
-    return (
-        f"between its pixels the field is no better than one plain colour ({between:.1f} dB):"
-        " it holds frequencies that the pixels do not show"
-    )
-
-
-class Results(L.Callback):
+class Results(Renders):
     """Writes results.json after the test, and also when the run fails or is interrupted.
+
+    Where the scene has a test split beside the held-out views, it is evaluated too: all of it, or as many views, evenly
+    chosen, as there is time for.
 
     Args:
         path: the file, below the run folder.
@@ -106,6 +91,8 @@ class Results(L.Callback):
         self.seed = seed
         self.warnings = list(warnings)
         self.views: list[dict[str, float]] = []
+        self.test_views: list[dict[str, float]] | None = None
+        """Figures of the test split; None before it is evaluated."""
         self.aligned: list[float] = []
         """PSNR of held-out photos with their own corrections, where training photos had such."""
         self.misfits: list[dict[str, Any]] | None = None
@@ -113,8 +100,30 @@ class Results(L.Callback):
         self.summary: dict[str, Any] = {}
         """What was written last."""
 
+    def needs(self, trainer: L.Trainer) -> dict[str, Need]:
+        scene, system = data_of(trainer).scene, trainer.lightning_module
+        if not isinstance(scene, Scene):
+            return {}
+        pixels = 0 if scene.test is None or self.test_views is not None else len(scene.test.pixels)
+        corrected = isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.since
+        aligned = RENDERED_PIXELS * len(scene.val) if corrected and not self.aligned else 0
+        one_view = pixels / len(scene.test) if scene.test is not None else 0
+        return {"test": Need(pixels, one_view, scored=True), "aligned": Need(aligned, aligned / 8)}
+
+    def evaluate_test(self, trainer: L.Trainer, system: System, views: Views) -> None:
+        """Renders the test split."""
+        share, plan = share_of(trainer, system, "test"), Budget.of(trainer).plan
+        chosen = evenly(len(views), max(1, int(share * len(views))))
+        found = []
+        for number, view in enumerate(chosen, 1):
+            with plan.rendering(f"test view {number} of {len(chosen)}"):
+                (result,) = system.evaluate_views([view_batch(views, view)])
+                found.append({"psnr": result.psnr, "ssim": result.ssim})
+            plan.note(result.pixels, result.seconds)
+        self.test_views = found
+
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        self.views = []
+        self.views, self.test_views = [], None
 
     def on_test_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
@@ -129,7 +138,11 @@ class Results(L.Callback):
         scene = data_of(trainer).scene
         if isinstance(pl_module, NeRF3D) and isinstance(scene, Scene):
             if pl_module.corrections is not None and pl_module.corrections.since:
-                self.aligned = aligned_psnr(pl_module, scene.val)
+                share = share_of(trainer, pl_module, "aligned")
+                with Budget.of(trainer).plan.rendering("aligned held-out photos"):
+                    self.aligned = aligned_psnr(pl_module, scene.val, share)
+            if scene.test is not None:
+                self.evaluate_test(trainer, pl_module, scene.test)
             by_photo = psnr_of_photos(pl_module, scene.train)
             self.misfits = [
                 {"photo": scene.train.name(i), "number": i, "psnr": round(by_photo[i], 2)} for i in misfits(by_photo)
@@ -162,6 +175,18 @@ class Results(L.Callback):
             with suppress(NoRoom):  # on a full disk what happened first is to be told
                 self.write(trainer, pl_module, "failed", " ".join(f"{type(exception).__name__}: {exception}".split()))
 
+    def test_figures(self, scene: Scene | Picture) -> dict[str, float | int | None] | None:
+        """Of the test split: means, the worst view, and how many views they are of; None without one."""
+        if self.test_views is None or not isinstance(scene, Scene) or scene.test is None:
+            return None
+        return {
+            "psnr": statistic_of(self.test_views, fmean, "psnr"),
+            "ssim": statistic_of(self.test_views, fmean, "ssim"),
+            "psnr_worst_view": statistic_of(self.test_views, min, "psnr"),
+            "views": len(self.test_views),
+            "views_in_split": len(scene.test),
+        }
+
     def write(self, trainer: L.Trainer, pl_module: System, status: str, diagnosis: str) -> None:
         """Writes the file with what is known so far; what was not measured is null."""
         scene, budget = data_of(trainer).scene, Budget.of(trainer)
@@ -169,11 +194,7 @@ class Results(L.Callback):
         guard = attached(trainer, Guard)
         curve = [] if held_out is None else [point for point in held_out.curve if math.isfinite(point[2])]
 
-        def over_views(statistic: Any, key: str) -> float | None:
-            values = [view[key] for view in self.views if math.isfinite(view[key])]
-            return round(statistic(values), 4) if values else None
-
-        quality = over_views(fmean, "psnr")
+        quality = statistic_of(self.views, fmean, "psnr")
         if quality is not None:
             curve = [*curve, [round(budget.seconds, 3), trainer.global_step, quality]]
         state = pl_module.state_dict().values()
@@ -202,9 +223,11 @@ class Results(L.Callback):
             "rays_per_second": round(throughput.rays / budget.seconds, 1) if throughput and budget.seconds else None,
             "psnr": quality,
             "psnr_aligned": round(fmean(self.aligned), 4) if self.aligned else None,
-            "ssim": over_views(fmean, "ssim"),
-            "psnr_worst_view": over_views(min, "psnr"),
-            "render_seconds_per_view": over_views(median, "seconds"),
+            "ssim": statistic_of(self.views, fmean, "ssim"),
+            "psnr_worst_view": statistic_of(self.views, min, "psnr"),
+            "rows_measured": None if held_out is None else round(held_out.rows, 4),
+            "test": self.test_figures(scene),
+            "render_seconds_per_view": statistic_of(self.views, median, "seconds"),
             "peak_memory_bytes": peak_memory_bytes(pl_module.device),
             "curve": curve,
             "warnings": self.warnings,

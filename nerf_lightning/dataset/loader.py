@@ -8,6 +8,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
+from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.utils.device import CPU, fits
 
@@ -54,7 +55,7 @@ class StepLoader:
 
 
 class HeldOutLoader:
-    """The held-out views in order, one whole view a batch."""
+    """The held-out views in order, one a batch."""
 
     def __init__(self, view: Callable[[int], Batch], views: int):
         self.view = view
@@ -79,6 +80,8 @@ class StepDataModule(L.LightningDataModule, Generic[Photos]):
     def __init__(self, seed: int):
         super().__init__()
         self.seed = seed
+        self.tested = WHOLE
+        """What `test_dataloader` gives of each held-out view."""
         self._near: Photos | None = None
         """The photos, on the device where batches are drawn."""
 
@@ -97,15 +100,23 @@ class StepDataModule(L.LightningDataModule, Generic[Photos]):
         """A part of the batch of a step."""
         raise TypeError(f"{type(self).__name__} must define draw_from(photos, step, part)")
 
-    def held_out(self, view: int) -> Any:
-        """One held-out view, whole."""
-        raise TypeError(f"{type(self).__name__} must define held_out(view)")
+    def held_out(self, view: int, subset: PixelSubset = WHOLE) -> Any:
+        """One held-out view."""
+        raise TypeError(f"{type(self).__name__} must define held_out(view, subset)")
+
+    def pixels_held_out(self, view: int) -> int:
+        """Of one held-out view."""
+        raise TypeError(f"{type(self).__name__} must define pixels_held_out(view)")
+
+    def test_on(self, subset: PixelSubset) -> None:
+        """The next test loads only these pixels of each held-out view."""
+        self.tested = subset
 
     def train_dataloader(self) -> StepLoader:
         return StepLoader(self.draw, lambda: self.trainer.global_step if self.trainer else 0)
 
     def test_dataloader(self) -> HeldOutLoader:
-        return HeldOutLoader(self.held_out, self.held_out_views)
+        return HeldOutLoader(lambda view: self.held_out(view, self.tested), self.held_out_views)
 
     def teardown(self, stage: str) -> None:
         self._near = None  # the next trainer may use another device

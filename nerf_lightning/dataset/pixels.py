@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.dataset.loader import StepDataModule
+from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.options import Count
 from nerf_lightning.utils.seeding import Stream, step_generator
@@ -71,15 +72,17 @@ class PixelBatch:
 
 @dataclass(frozen=True)
 class PictureBatch(PixelBatch):
-    """All pixels of a picture, row by row; N = height * width."""
+    """Pixels of a picture, row by row; N = height * width."""
 
     height: int
     width: int
+    strip: int | None = None
+    """See `PixelSubset.strip`."""
     known: ClassVar[None] = None
     """All pixels count."""
 
     def to(self, device: torch.device | str) -> "PictureBatch":
-        return PictureBatch(self.uv.to(device), self.rgb.to(device), self.height, self.width)
+        return replace(self, uv=self.uv.to(device), rgb=self.rgb.to(device))
 
 
 def centres(height: int, width: int, index: Int[Tensor, "N"]) -> Float[Tensor, "N 2"]:
@@ -139,8 +142,16 @@ class PixelDataModule(StepDataModule[Tensor]):
         """As in `RayDataModule`; here, all pixels."""
         return self.held_out(0)
 
-    def held_out(self, view: int) -> PictureBatch:
-        """The whole picture."""
+    def pixels_held_out(self, view: int) -> int:
+        width, height = self.scene.size
+        return width * height
+
+    def held_out(self, view: int, subset: PixelSubset = WHOLE) -> PictureBatch:
+        """The picture."""
         height, width, _ = self.scene.image.shape
-        rgb = self.scene.image.view(-1, 3).float().div_(255)  # in place: large pictures
-        return PictureBatch(pixel_grid(height, width), rgb, height, width)
+        if subset is WHOLE:
+            rgb = self.scene.image.view(-1, 3).float().div_(255)  # in place: large pictures
+            return PictureBatch(pixel_grid(height, width), rgb, height, width)
+        rows, columns = subset.grid(width, height)
+        some = pixels_at(self.scene.image, (rows[:, None] * width + columns).flatten())
+        return PictureBatch(some.uv, some.rgb, len(rows), len(columns), subset.strip)

@@ -1,6 +1,6 @@
 """RayDataModule: rays and their pixels, drawn from all training photos."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -11,6 +11,7 @@ from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset.focus import Focus, checked_state
 from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.seeding import Stream, step_generator
@@ -49,16 +50,18 @@ class RayBatch:
 
 @dataclass(frozen=True)
 class ViewBatch(RayBatch):
-    """All rays of one view, row by row; R = height * width."""
+    """Rays of one view, row by row; R = height * width."""
 
     height: int
     width: int
     known: Bool[Tensor, "R"] | None = None
     """Which pixels count; None for all."""
+    strip: int | None = None
+    """See `PixelSubset.strip`."""
 
     def to(self, device: torch.device | str) -> "ViewBatch":
         known = None if self.known is None else self.known.to(device)
-        return ViewBatch(self.rays.to(device), self.pixels.to(device), self.height, self.width, known)
+        return replace(self, rays=self.rays.to(device), pixels=self.pixels.to(device), known=known)
 
 
 def rays_through(views: Views, places: Int[Tensor, "R"]) -> tuple[Rays, Int[Tensor, "R"]]:
@@ -67,6 +70,15 @@ def rays_through(views: Views, places: Int[Tensor, "R"]) -> tuple[Rays, Int[Tens
     view = torch.searchsorted(views.starts, places, right=True) - 1
     pixel, width = places - views.starts[view], views.widths[view]
     return views.cameras.rays(view, pixel // width, pixel % width), view
+
+
+def view_batch(views: Views, view: int, subset: PixelSubset = WHOLE) -> ViewBatch:
+    """One view, or some of its pixels."""
+    rows, columns = subset.grid(*views.cameras.size(view))
+    row, column = (x.flatten() for x in torch.meshgrid(rows, columns, indexing="ij"))
+    rays = views.cameras.rays(torch.full_like(row, view), row, column)
+    known = None if views.known is None else views.mask_of(view)[row, column]
+    return ViewBatch(rays, views.image(view)[row, column], len(rows), len(columns), known, subset.strip)
 
 
 def plainness(views: Views, places: Int[Tensor, "R"], view: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
@@ -213,11 +225,12 @@ class RayDataModule(StepDataModule[Views]):
     def held_out_views(self) -> int:
         return len(self.scene.val)
 
-    def held_out(self, view: int) -> ViewBatch:
-        views = self.scene.val
-        width, height = views.cameras.size(view)
-        known = None if views.known is None else views.mask_of(view).flatten()
-        return ViewBatch(views.cameras.view_rays(view), views.image(view).flatten(0, 1), height, width, known)
+    def pixels_held_out(self, view: int) -> int:
+        width, height = self.scene.val.cameras.size(view)
+        return width * height
+
+    def held_out(self, view: int, subset: PixelSubset = WHOLE) -> ViewBatch:
+        return view_batch(self.scene.val, view, subset)
 
     def state_dict(self) -> dict[str, Any]:
         focus = self._focus_state if self._focus is None else self._focus.state_dict()

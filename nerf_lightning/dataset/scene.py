@@ -65,7 +65,7 @@ class Scene:
             "name": self.name,
             "source": self.source,
             "sha256": self.sha256(),
-            "views": {"train": len(self.train), "val": len(self.val)},
+            "views": {name: len(getattr(self, name) or ()) for name in ("train", "val", "test")},
             "resolution": list(self.resolution),
             "bounded": not self.bounds.unbounded,
             "kind": self.kind,

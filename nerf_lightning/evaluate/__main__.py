@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 
-def options(run: str, output: str | None, worst: Count, device: str, photos: str | None) -> None:
+def options(run: str, output: str | None, worst: Count, device: str, split: str, photos: str | None) -> None:
     """The keys of conf/evaluate.yaml, for checking; `photos` is its dataset.path."""
 
 

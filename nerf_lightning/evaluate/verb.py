@@ -1,6 +1,6 @@
 """The evaluate verb: every held-out view rendered and measured, a table, and pictures of the worst."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
@@ -8,7 +8,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.drawing.panels import result_panel, stacked, write_png
+from nerf_lightning.errors import InputError
 from nerf_lightning.evaluate.perceptual import SMALLEST, TOO_SMALL, perceptual_distance
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.open import beside, open_run
@@ -32,7 +34,7 @@ class ViewMetrics:
     """Of rendering."""
 
 
-def evaluate(run: str, output: str | None, worst: int, device: str, photos: str | None) -> None:
+def evaluate(run: str, output: str | None, worst: int, device: str, split: str, photos: str | None) -> None:
     """Measures a run on held-out views, those of another file where one is given.
 
     Args:
@@ -40,15 +42,22 @@ def evaluate(run: str, output: str | None, worst: int, device: str, photos: str 
         output: folder for the results; None puts them into `evaluation/` beside the run.
         worst: how many of the worst views are pictured.
         device: see `the_device`.
+        split: val or test.
         photos: another file or folder of photos.
 
     Raises:
-        InputError: where the device, the run or the photos are no good, or do not fit each other.
+        InputError: where the device, the run or the photos are no good, or do not fit each other, or have no such split.
     """
     where = the_device(device)
     source = user_path(run)
     found = open_run(source, where)
     data = data_again(found.cfg, found.scene, photos)
+    if split not in ("val", "test"):
+        raise InputError("config", "split", split, "val or test")
+    if split == "test":
+        if not isinstance(data, RayDataModule) or data.scene.test is None:
+            raise InputError("config", "split", "test", "val: these photos have no test split")
+        data.scene = replace(data.scene, val=data.scene.test)
     folder = beside(source) / "evaluation" if output is None else output_path(output)
     distance, why = perceptual_distance()
     metrics: list[ViewMetrics] = []
@@ -69,7 +78,7 @@ def evaluate(run: str, output: str | None, worst: int, device: str, photos: str 
     write_png(folder / "worst.png", stacked(panels))
     Console(highlight=False, soft_wrap=True).print(table(metrics))
     mean = fmean(one.psnr for one in metrics)
-    over = f"{len(metrics)} held-out views on {device_in_words(where)}"
+    over = f"{len(metrics)} {'test' if split == 'test' else 'held-out'} views on {device_in_words(where)}"
     print(f"{data.scene.name}: {mean:.2f} dB over {over}; {folder}/worst.png, views.json")
     if why:
         print(f"no LPIPS: {why}")

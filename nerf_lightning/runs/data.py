@@ -41,8 +41,14 @@ def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
     def placed(cameras: Cameras) -> Cameras:
         return replace(cameras, c2w=in_other_frame(cameras.c2w, moved).float())
 
-    train, val = (replace(views, cameras=placed(views.cameras)) for views in (scene.train, scene.val))
-    return replace(scene, train=train, val=val, orbit=placed(scene.orbit), bounds=frame.bounds, to_source=to_source)
+    train, val, test = (
+        None if views is None else replace(views, cameras=placed(views.cameras))
+        for views in (scene.train, scene.val, scene.test)
+    )
+    assert train is not None and val is not None  # every scene has them
+    return replace(
+        scene, train=train, val=val, test=test, orbit=placed(scene.orbit), bounds=frame.bounds, to_source=to_source
+    )
 
 
 def seen_by_corrected(scene: Scene, content: Mapping[str, Any]) -> Scene:

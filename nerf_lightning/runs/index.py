@@ -144,8 +144,8 @@ def _follows(key: str, other: str, options: Sequence[dict[str, Any]]) -> bool:
 FIGURES = (
     "scene", "background", "method", "seed", "device", "threads", "machine", "load", "versions", "parameters",
     "artifact_bytes", "train_seconds", "steps", "rays_per_second", "psnr", "ssim", "psnr_worst_view",
-    "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "plateau", "recoveries", "status",
-    "diagnosis",
+    "rows_measured", "test", "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "plateau", "recoveries",
+    "status", "diagnosis",
 )  # fmt: skip
 """The keys of every results.json."""
 

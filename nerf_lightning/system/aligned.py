@@ -18,10 +18,14 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 
 COLUMNS = (0.0, 0.5), (0.5, 1.0)
 """Shares of them that make the left and the right half."""
-PIXELS = 2048
-"""Of each photo's half, that decide in a step."""
+PIXELS, MIN_PIXELS = 2048, 256
+"""Of each photo's half, that decide in a step: usually, and where there is little time."""
+SCORED_PIXELS = 1 << 15
+"""Most of each photo's half that are scored, evenly spaced."""
 TOGETHER, APART = 4, 6
 """Least-squares steps of all cameras together, and then of each alone. More would follow the faults of the field there."""
+RENDERED_PIXELS = 2 * ((TOGETHER + APART) * PIXELS * 5 + SCORED_PIXELS)
+"""Rendering a photo's pixels so often takes as long as all that is done for it: derivatives take as long as three."""
 
 
 def halves(views: Views, view: int) -> tuple[Int[Tensor, "L"], Int[Tensor, "R"]]:
@@ -33,15 +37,15 @@ def halves(views: Views, view: int) -> tuple[Int[Tensor, "L"], Int[Tensor, "R"]]
     return first, second
 
 
-def fitted(system: NeRF3D, views: Views, half: int, corrections: Corrections) -> None:
-    """Finds corrections with which a field, that stays as it is, fits this half of the photos best."""
+def fitted(system: NeRF3D, views: Views, half: int, corrections: Corrections, count: int) -> None:
+    """Finds corrections with which a field, that stays as it is, fits `count` pixels of this half of each photo best."""
     see, behind = system.as_it_is(), system.renderer.colour
     generator = step_generator(system.seed, Stream.STUDY, 1, system.device)
     poses, light = ("poses" in corrections.since), ("light" in corrections.since)
     together = TOGETHER if poses else 0
     for step in tracked(range(together + APART), together + APART, "aligning held-out photos"):
         # Photo by photo, as there may be many of them.
-        photos = [some_pixels(views, [i], PIXELS, behind, generator, COLUMNS[half]) for i in range(len(views))]
+        photos = [some_pixels(views, [i], count, behind, generator, COLUMNS[half]) for i in range(len(views))]
         found = [derivatives(see, corrections, pixels, 1) for pixels in photos]
         left, jacobian = (torch.cat(parts) for parts in zip(*found, strict=True))
         change = torch.zeros_like(jacobian[:, 0])
@@ -68,19 +72,24 @@ def fitted(system: NeRF3D, views: Views, half: int, corrections: Corrections) ->
 
 @torch.inference_mode(False)  # a trainer's test is without gradients
 @torch.enable_grad()
-def aligned_psnr(system: NeRF3D, views: Views) -> list[float]:
+def aligned_psnr(system: NeRF3D, views: Views, share: float = 1.0) -> list[float]:
     """PSNR of each held-out photo in dB, by a camera and gains that were found on the half that is not scored.
 
     Cameras that were corrected may together stand a little apart from where held-out ones are said to be: this figure asks
     how good the field is, and not whether both agree.
+
+    Args:
+        system: with corrections.
+        views: the held-out photos.
+        share: of the pixels that usually decide, as far as `MIN_PIXELS`, for less time.
     """
     assert system.corrections is not None  # else there is nothing to align
     views = views.to(system.device)
-    parts = [halves(views, view) for view in range(len(views))]
+    parts = [[half[:: -(-len(half) // SCORED_PIXELS)] for half in halves(views, view)] for view in range(len(views))]
     squares, counts = torch.zeros(len(views), dtype=torch.float64), torch.zeros(len(views))
     for side in (0, 1):
         corrections = system.corrections.alike(views.cameras, system.sampler.bounds).to(system.device)
-        fitted(system, views, side, corrections)
+        fitted(system, views, side, corrections, max(MIN_PIXELS, round(share * PIXELS)))
         with torch.no_grad():
             for view, part in enumerate(parts):
                 given, of = rays_through(views, part[1 - side])

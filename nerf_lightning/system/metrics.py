@@ -37,21 +37,29 @@ SSIM_ROWS = 32
 
 
 def ssim(
-    image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], known: Bool[Tensor, "H W"] | None = None
+    image: Float[Tensor, "H W 3"],
+    truth: Float[Tensor, "H W 3"],
+    known: Bool[Tensor, "H W"] | None = None,
+    strip: int | None = None,
 ) -> float:
     """Structural similarity (Wang et al. 2004) of pictures in [0, 1]; nan if they are smaller than its window.
 
     Where only some pixels are known, it is the mean over windows around these; what is not known counts as equal in them.
+
+    Args:
+        image, truth: to compare.
+        known: which pixels count; None for all.
+        strip: rows that belong together; each such strip is compared as a picture of its own. None: all do.
     """
     height, width, _ = image.shape
-    if min(height, width) < SSIM_WINDOW:
+    if min(height, width, strip or height) < SSIM_WINDOW:
         return math.nan
     first, second = (x.permute(2, 0, 1)[None] for x in (image, truth))
-    margin, total = SSIM_WINDOW // 2, 0.0
+    margin, together, total = SSIM_WINDOW // 2 if strip is None else 0, strip or SSIM_ROWS, 0.0
     counted = torch.ones(height, width, dtype=torch.bool) if known is None else known
     second = torch.where(counted, second, first)
-    for start in range(0, height, SSIM_ROWS):
-        end = min(start + SSIM_ROWS, height)
+    for start in range(0, height, together):
+        end = min(start + together, height)
         top, bottom = max(0, start - margin), min(height, end + margin)
         _, scores = structural_similarity_index_measure(
             first[:, :, top:bottom], second[:, :, top:bottom], data_range=1.0, return_full_image=True

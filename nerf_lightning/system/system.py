@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.dataset.loader import StepDataModule
+from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system.metrics import psnr, ssim
 from nerf_lightning.utils.allocator import give_back_freed_memory
@@ -61,11 +62,18 @@ class ViewResult:
     opacity: Float[Tensor, "H W"] | None = None
     known: Bool[Tensor, "H W"] | None = None
     """Pixels that are scored; None for all."""
+    strip: int | None = None
+    """See `PixelSubset.strip`."""
+
+    @property
+    def pixels(self) -> int:
+        """How many were rendered."""
+        return self.rgb.shape[:2].numel()
 
     @cached_property
     def ssim(self) -> float:
         """Structural similarity: where nobody asks, its time is saved."""
-        return ssim(self.rgb, self.truth, self.known)
+        return ssim(self.rgb, self.truth, self.known, self.strip)
 
     @property
     def comparable(self) -> Float[Tensor, "H W 3"]:
@@ -171,17 +179,22 @@ class System(L.LightningModule):
 
         rgb, truth = image(rgb.clamp_(0, 1)), image(self.truth(view))
         depth, opacity, known = (None if x is None else image(x) for x in (depth, opacity, view.known))
-        return ViewResult(rgb, truth, psnr(rgb, truth, known), seconds, depth, opacity, known)
+        return ViewResult(rgb, truth, psnr(rgb, truth, known), seconds, depth, opacity, known, view.strip)
 
-    def evaluate_held_out(self, data: StepDataModule, views: Iterable[int]) -> Iterator[ViewResult]:
-        """Evaluates some of the held-out views, one after the other, in memory that training has given back."""
+    def evaluate_views(self, views: Iterable[Any]) -> Iterator[ViewResult]:
+        """Evaluates views one after the other, in memory that training has given back."""
         self.zero_grad()  # which the next step does in any case
         give_back_freed_memory()
         try:
-            for view in views:
-                yield self.evaluate(data.held_out(view))
+            yield from map(self.evaluate, views)
         finally:
             give_back_freed_memory()
+
+    def evaluate_held_out(
+        self, data: StepDataModule, views: Iterable[int], subset: PixelSubset = WHOLE
+    ) -> Iterator[ViewResult]:
+        """Evaluates some of the held-out views, or some of their pixels."""
+        return self.evaluate_views(data.held_out(view, subset) for view in views)
 
     def on_test_start(self) -> None:
         give_back_freed_memory()

@@ -18,6 +18,7 @@ from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.runs.index import FINISHED, Run, failed_results, find_runs, read_run, varied
 from nerf_lightning.utils.ending import AGAIN, listen_again
 from nerf_lightning.utils.files import atomic, full_disk, write_json
+from nerf_lightning.utils.progress import set_sweep
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -168,9 +169,11 @@ class SweepReport(Callback):
     def on_job_start(self, config: "DictConfig", **kwargs: Any) -> None:
         if self.progress is not None:
             print(self.progress.begin(config.hydra.job.num), flush=True)
+            set_sweep(self.progress.seconds_left)
 
     def on_job_end(self, config: "DictConfig", **kwargs: Any) -> None:
         if self.progress is not None:
+            set_sweep(None)
             self.progress.end(config.hydra.job.num)
 
     def on_multirun_end(self, config: "DictConfig", **kwargs: Any) -> None:

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -91,32 +92,36 @@ class SweepProgress:
 
     root: Path
     jobs: Sequence[PlannedJob]
-    spent: list[tuple[float | None, float]] = field(default_factory=list)
-    """Budget and wall-clock seconds of the jobs that this process ran."""
+    extra: list[float] = field(default_factory=list)
+    """Wall-clock seconds of the jobs that this process ran, beyond their budgets: starting and rendering."""
     _since: float = 0.0
     _open: bool = True
+    _job: PlannedJob | None = None
+    _later: Sequence[PlannedJob] = ()
 
     def begin(self, number: int) -> str:
         """Called before a job. Returns a line on how far the sweep is."""
-        self._since = time.monotonic()
-        self._open = read_run(self.root / self.jobs[number].folder).status not in FINISHED
-        left = self.seconds_left(number)
-        told = "" if left is None else f", about {clock(left)} left"
+        self._since, self._job = time.monotonic(), self.jobs[number]
+        self._open, *later = (not self._finished(job) for job in self.jobs[number:])
+        self._later = list(itertools.compress(self.jobs[number + 1 :], later))
+        told = ""
+        if self.extra:
+            job_left = (self._job.seconds or 0.0) + fmean(self.extra) if self._open else 0.0
+            told = f", about {clock(self.seconds_left(job_left))} left"
         return f"job {number + 1} of {len(self.jobs)}{told}"
 
     def end(self, number: int) -> None:
         """Called after a job; the time of a failed or skipped one does not count."""
-        if self._open and read_run(self.root / self.jobs[number].folder).status in FINISHED:
-            self.spent.append((self.jobs[number].seconds, time.monotonic() - self._since))
+        if self._open and self._finished(self.jobs[number]):
+            self.extra.append(time.monotonic() - self._since - (self.jobs[number].seconds or 0.0))
 
-    def seconds_left(self, number: int) -> float | None:
-        """Seconds that this job and the later ones will take; None if nothing is known yet.
+    def _finished(self, job: PlannedJob) -> bool:
+        return read_run(self.root / job.folder).status in FINISHED
 
-        A job takes its budget plus the average overhead so far; without a budget, the average time of a job.
-        """
-        left = [job for job in self.jobs[number:] if read_run(self.root / job.folder).status not in FINISHED]
-        extra = [wall - (seconds or 0.0) for seconds, wall in self.spent]
-        if not extra and any(job.seconds is None for job in left):
-            return None
-        besides = sum(extra) / len(extra) if extra else 0.0
-        return sum((job.seconds or 0.0) + besides for job in left)
+    def seconds_left(self, job_left: float) -> float:
+        """Seconds that this job and the later ones will take, from those that this one will: the later ones take their budgets
+        and, on average, as long beside as those so far and this one; without budgets, the average time of a job."""
+        extra = list(self.extra)
+        if self._job is not None and self._open:
+            extra.append(time.monotonic() - self._since + job_left - (self._job.seconds or 0.0))
+        return job_left + sum((job.seconds or 0.0) + fmean(extra) for job in self._later)

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from nerf_lightning.callbacks import Budget, Checkpoints, Results
 from nerf_lightning.callbacks.attached import ChecksData, attached
+from nerf_lightning.callbacks.budget import AT_ROW
 from nerf_lightning.callbacks.checkpoints import check_disk
 from nerf_lightning.config.build import (
     build_data,
@@ -45,6 +46,7 @@ from nerf_lightning.system.compiled import BACKEND, check_compiler
 from nerf_lightning.training.loggers import finishing_wandb
 from nerf_lightning.training.room import check_room
 from nerf_lightning.utils.allocator import keep_freed_memory
+from nerf_lightning.utils.ending import interruptible
 from nerf_lightning.utils.listing import first_few
 from nerf_lightning.utils.machine import CROWDED, crowding
 from nerf_lightning.utils.memory import check_memory, out_of_memory
@@ -147,7 +149,8 @@ def train(
         # Nothing but the state has been at work yet.
         found = f"{type(error).__name__}: {error}"
         raise InputError(checkpoint, "", found, "a state of this run to go on from", "start the run anew") from error
-    trainer.test(system, data, verbose=False)
+    with interruptible(AT_ROW):
+        trainer.test(system, data, verbose=False)
     if trainer.is_global_zero:
         if isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.finite:
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
@@ -274,13 +277,27 @@ def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, resul
     logger.finalize("success")
 
 
+def test_words(test: dict | None) -> str:
+    """The figure of the test split beside that of the held-out views."""
+    if test is None or test["psnr"] is None:
+        return ""
+    of = "" if test["views"] == test["views_in_split"] else f" of {test['views_in_split']}"
+    return f" (val), {test['psnr']:.2f} dB on {test['views']}{of} test views,"
+
+
 def report(results: dict, folder: Path, logger: L.pytorch.loggers.Logger | None) -> None:
     """Prints the outcome."""
     for one in results["recoveries"]:
         print(f"guard: at step {one['step']}: {one['cause']}; {one['action']}")
     scene, seconds = results["scene"]["name"], results["train_seconds"]
     quality = "no PSNR" if results["psnr"] is None else f"{results['psnr']:.2f} dB"
-    print(f"{scene}: {quality} held out after {seconds:.0f} s of training ({results['status']})")
+    quality += f" held out{test_words(results['test'])}"
+    print(f"{scene}: {quality} after {seconds:.0f} s of training ({results['status']})")
+    if (results["rows_measured"] or 1.0) < 1.0:
+        share = (
+            f"{results['rows_measured']:.0%} of the rows of each held-out photo, as all would take longer than training"
+        )
+        print(f"measured on {share}; python -m nerf_lightning.evaluate run={folder} measures all")
     if results["diagnosis"]:
         print(results["diagnosis"])
     crowded = crowding(results)

@@ -1,7 +1,8 @@
 """How a process ends when it is asked to: Ctrl-C (SIGINT) and SIGTERM do the same. Imports nothing heavy.
 
 A signal raises `Interrupted` wherever the process is, so that blocks are left and temporary files go; inside `held` it only is
-noted, until the block ends or `leave_if_asked` says that here is a good place. Exit codes are those of shells, 128 + signal.
+noted, until the block ends, an `interruptible` one begins, or `leave_if_asked` says that here is a good place. Exit codes are
+those of shells, 128 + signal.
 """
 
 import os
@@ -18,6 +19,7 @@ AGAIN = "the same command goes on"
 _asked: int | None = None
 _pending = False  # not raised yet
 _holding = 0
+_answer = ""  # told at once, where the process cannot end at once
 _tell = sys.unraisablehook
 
 
@@ -94,16 +96,35 @@ def leave_if_asked() -> None:
 
 
 @contextmanager
-def held() -> Iterator[None]:
-    """Holds signals back for a block that must be done whole or not at all; raises `Interrupted` after it."""
-    global _holding
-    _holding += 1
+def held(answer: str = "") -> Iterator[None]:
+    """Holds signals back for a block that must be done whole or not at all; raises `Interrupted` after it.
+
+    Args:
+        answer: what the first signal is answered with on standard error, as soon as it comes; "" keeps what holds around it.
+    """
+    with _signals_in(_holding + 1, answer):
+        yield
+    if _pending and not _holding:
+        leave_if_asked()
+
+
+@contextmanager
+def interruptible(answer: str) -> Iterator[None]:
+    """Lets signals raise `Interrupted` in a block inside `held` that may be left at any point, such as rendering."""
+    with _signals_in(0, answer):
+        if _pending:
+            leave_if_asked()
+        yield
+
+
+@contextmanager
+def _signals_in(holding: int, answer: str) -> Iterator[None]:
+    global _holding, _answer
+    before, _holding, _answer = (_holding, _answer), holding, answer or _answer
     try:
         yield
     finally:
-        _holding -= 1
-    if _pending and not _holding:
-        leave_if_asked()
+        _holding, _answer = before
 
 
 def be_deaf() -> None:
@@ -126,6 +147,8 @@ def _take(handler: object) -> None:
 
 def _raise(number: int, frame: FrameType | None) -> None:
     global _asked, _pending
+    if _asked is None and _answer:  # not printed, as a print may be going on
+        os.write(2, f"nerf_lightning: {signal.Signals(number).name}: {_answer}\n".encode())
     _asked, _pending = _asked or number, True
     if not _holding:
         interrupt(_asked)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from nerf_lightning.dataset import Picture, PixelDataModule
+from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.model import PictureField
 from nerf_lightning.system import NeRF2D, StepStats, ViewResult, constant
 
@@ -71,8 +72,17 @@ def system() -> Scripted:
 class Data(PixelDataModule):
     held_out_views = 10
 
-    def held_out(self, view: int) -> int:
+    def __init__(self, scene: Picture):
+        super().__init__(scene)
+        self.subsets: list[PixelSubset] = []
+        """What was asked of each view."""
+
+    def held_out(self, view: int, subset: PixelSubset = WHOLE) -> int:
+        self.subsets.append(subset)
         return view
+
+    def pixels_held_out(self, view: int) -> int:
+        return 12 * 16
 
 
 @pytest.fixture

@@ -5,22 +5,22 @@ from pathlib import Path
 import imageio.v3 as imageio
 import pytest
 
-from nerf_lightning.callbacks.orbit import affordable
+from nerf_lightning.callbacks.orbit import fit_orbit
 from nerf_lightning.config.compose import composed
 from nerf_lightning.training.train import train
 
 
 @pytest.mark.parametrize(
-    ("seconds", "expected"),
-    [(0.1, (60, 1.0)), (0.5, (60, 1.0)), (1.0, (30, 1.0)), (10.0, (12, 0.5)), (1e6, (12, 0.25))],
+    ("share", "expected"),
+    [(1.0, (60, 1.0)), (0.5, (30, 1.0)), (0.2, (12, 1.0)), (0.05, (12, 0.5)), (1e-6, (12, 0.25))],
 )
-def test_frames_become_fewer_and_then_smaller(seconds: float, expected: tuple[int, float]):
-    assert affordable(60, seconds, 30.0) == pytest.approx(expected)
+def test_frames_become_fewer_and_then_smaller(share: float, expected: tuple[int, float]):
+    assert fit_orbit(60, share) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("asked", "frames", "width"), [("null", 12, 8), ("3", 3, 32)])
 def test_a_slow_field_gets_a_small_orbit(asked: str, frames: int, width: int, tmp_path: Path, monkeypatch, capsys):
-    monkeypatch.setattr("nerf_lightning.callbacks.budget.Budget.drawing_seconds", lambda self, step: 1e-9)
+    monkeypatch.setattr("nerf_lightning.callbacks.budget.Budget.render_seconds", lambda self, step: 1e-9)
     off = ["callbacks.heldout=null", "callbacks.snapshots=null", "~logger"]
     train(composed(["+experiment=smoke_3d", "budget.steps=2", f"callbacks.orbit.frames={asked}", *off], tmp_path))
     assert imageio.imread(tmp_path / "orbit.gif").shape[0] == frames

@@ -88,7 +88,7 @@ def test_the_latest_render_stands_alone(clock, system, trainer_with, tmp_path: P
     for trainer.global_step in (1, 2):
         snapshots.on_train_batch_end(trainer, system, None, None, 0)
         assert np.array_equal(imageio.imread(tmp_path / "latest.png"), to_bytes(taken[-1].rgb))
-    assert len(taken) == 2 and len(list((tmp_path / "snapshots").iterdir())) == 2
+    assert len(taken) == 3 and len(list((tmp_path / "snapshots").iterdir())) == 2
 
 
 def test_tensorboard_gets_a_narrower_snapshot(clock, system, trainer_with, tmp_path: Path):

@@ -1,3 +1,5 @@
+from itertools import islice
+
 import pytest
 
 from nerf_lightning.callbacks import Budget, Snapshots
@@ -6,7 +8,7 @@ from nerf_lightning.errors import InputError
 
 
 def test_log_spaced():
-    assert [step for step in range(3000) if log_spaced(step)] == [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000]
+    assert list(islice(log_spaced(), 8)) == [10, 20, 50, 100, 200, 500, 1000, 2000]
 
 
 @pytest.mark.parametrize(("steps", "expected"), [(None, [10, 20, 50, 100]), ([1, 7], [1, 7]), ([], [])])
@@ -27,10 +29,10 @@ def test_pictures_are_written_when_due_and_at_the_end_without_costing_training_t
     snapshots.on_train_end(trainer, system)
     names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
     assert names == ["step_0000002.png", "step_0000004.png", "step_0000005.png"]
-    assert system.asked == [3, 3, 3] and budget.seconds == 5
+    assert system.asked == [0, 3, 3, 3] and budget.seconds == 5
     trainer.global_step = 4
     snapshots.on_train_end(trainer, system)
-    assert len(system.asked) == 3, "what is there already is not taken again"
+    assert len(system.asked) == 4, "what is there already is not taken again"
 
 
 @pytest.mark.parametrize("view", [-1, 10])

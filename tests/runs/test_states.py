@@ -44,7 +44,7 @@ def budget(learned: bool) -> tuple[Callable[[], dict], Callable[[dict], None]]:
 def held_out(learned: bool) -> tuple[Callable[[], dict], Callable[[dict], None]]:
     made = HeldOut([0.5])
     if learned:
-        made.curve, made.view_seconds = [[1.0, 5, 20.0]], 0.1
+        made.curve = [[1.0, 5, 20.0]]
     return made.state_dict, made.load_state_dict
 
 

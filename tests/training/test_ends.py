@@ -21,6 +21,7 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import NoRoom
 from nerf_lightning.model import TensoRFField
 from nerf_lightning.runs.folder import load_run
+from nerf_lightning.system import System
 from nerf_lightning.training.train import train
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -74,19 +75,21 @@ def at_step(
     """Does something at the beginning of a callback's hook, after some steps, once."""
     before, done = getattr(kind, hook), []
 
-    def hooked(self: Any, trainer: Any, *given: Any) -> Any:
-        if trainer.global_step == step and not done:
+    def hooked(self: Any, *given: Any) -> Any:
+        at = self if isinstance(self, System) else given[0]  # or a callback, which is given its trainer
+        if at.global_step == step and not done:
             done.append(True)
             action()
-        return before(self, trainer, *given)
+        return before(self, *given)
 
     monkeypatch.setattr(kind, hook, hooked)
 
 
 MOMENTS = {
-    "in a step": (Progress, "on_train_batch_end", STOP, STOP),
-    "while measuring": (HeldOut, "measure", STOP, STOP),
-    "in the test": (Checkpoints, "on_test_batch_end", 12, 12),
+    "in a step": (Progress, "on_train_batch_end", STOP, "stopping after this step"),
+    "while measuring": (HeldOut, "measure", STOP, "stopping after this step"),
+    "while a view is rendered": (System, "evaluate_held_out", STOP, "stopping after this row"),
+    "in the test": (Checkpoints, "on_test_batch_end", 12, "stopping after this row"),
 }
 
 
@@ -94,15 +97,15 @@ MOMENTS = {
 def test_asked_to_end_a_run_saves_what_it_has_and_goes_on(
     moment: str, number: int, undisturbed: Path, whole: State, inside, monkeypatch
 ):
-    kind, hook, step, saved = MOMENTS[moment]
+    kind, hook, step, answer = MOMENTS[moment]
     with monkeypatch.context() as patch:
         at_step(patch, kind, hook, lambda: signal.raise_signal(number), step)
         code, _, err = inside(*SMALL, "name=broken")
     assert code == 128 + number, err
     name = signal.Signals(number).name
     line = f"nerf_lightning: interrupted ({name}); go on with: python -m nerf_lightning resume=outputs/broken/"
-    assert err.startswith(line) and err.count("\n") == 1, err
-    assert status(run_of("broken")) == "interrupted" and weights(run_of("broken"))[0] == saved
+    assert err.startswith(f"nerf_lightning: {name}: {answer}\n{line}") and err.count("\n") == 2, err
+    assert status(run_of("broken")) == "interrupted" and weights(run_of("broken"))[0] == step
     assert not list(Path().rglob(".*"))
     resume = err.split()[-1]
     code, _, err = inside(resume)
@@ -122,7 +125,7 @@ def test_asked_again_while_it_saves_the_checkpoint_is_whole(whole, inside, monke
         at_step(patch, Progress, "on_train_batch_end", lambda: signal.raise_signal(signal.SIGINT))
         patch.setattr(InPlace, "save_checkpoint", impatient)
         code, _, err = inside(*SMALL, "name=broken")
-    assert code == 130 and err.count("\n") == 1
+    assert code == 130 and err.count("\n") == 2
     assert weights(run_of("broken"))[0] == STOP and not list(Path().rglob(".*"))
 
 

@@ -102,7 +102,8 @@ def test_a_sweep_that_is_interrupted_tells_so_and_goes_on_with_the_same_command(
     with monkeypatch.context() as patch:
         patch.setattr(Progress, "on_train_batch_end", stop)
         code, out, err = inside(*line)
-    assert (code, err) == (143, "nerf_lightning: interrupted (SIGTERM); the same command goes on\n")
+    told = "nerf_lightning: SIGTERM: stopping after this step\n"
+    assert (code, err) == (143, told + "nerf_lightning: interrupted (SIGTERM); the same command goes on\n")
     (root,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
     rows = table(root)
     assert rows["seed=1"]["status"] == "interrupted" and "step 2" in rows["seed=1"]["diagnosis"]

@@ -72,20 +72,24 @@ def test_time_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     finish("b")
     jobs = [PlannedJob("a", 10.0), PlannedJob("b", 10.0), PlannedJob("c", 60.0), PlannedJob("d", 60.0)]
     progress = SweepProgress(tmp_path, jobs)
-    assert progress.begin(0) == "job 1 of 4, about 2:10 left", "b was done before"
+    assert progress.begin(0) == "job 1 of 4", "nothing is known yet"
+    now[0] = 6.0
+    assert progress.seconds_left(8.0) == 8 + 2 * (60 + 4), "b was done before; 4 seconds beside training each"
     now[0] = 14.0
     finish("a")
     progress.end(0)
     progress.begin(1)
     progress.end(1)
-    assert progress.begin(2) == "job 3 of 4, about 2:08 left", "4 seconds beside training each"
+    assert progress.begin(2) == "job 3 of 4, about 2:08 left"
     now[0] = 15.0
+    assert progress.seconds_left(65.0) == 65 + 60 + 5, "this job seems to take 6 seconds beside training: 5 on average"
     finish("c", "failed")
     progress.end(2)
     assert progress.begin(3) == "job 4 of 4, about 1:04 left", "a failed job says nothing about time"
     steps = SweepProgress(tmp_path, [PlannedJob("e", None), PlannedJob("f", None)])
     assert steps.begin(0) == "job 1 of 2"
     now[0] = 40.0
+    assert steps.seconds_left(5.0) == 35, "both take 30 seconds"
     finish("e")
     steps.end(0)
     assert steps.begin(1) == "job 2 of 2, about 0:25 left"

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import imageio.v3 as imageio
 import lightning as L
 
@@ -42,6 +43,8 @@ class TrainingGif(L.Callback):
         files = sorted((Path(trainer.default_root_dir) / snapshots.folder).glob("step_*.png"))
         if not files:
             return
-        frames = (narrowed(imageio.imread(file), self.width) for file in [*files, files[-1], files[-1]])
+        pictures = (narrowed(imageio.imread(file), self.width) for file in [*files, files[-1], files[-1]])
+        height, width, _ = narrowed(imageio.imread(files[-1]), self.width).shape
+        frames = (cv2.resize(one, (width, height), interpolation=cv2.INTER_NEAREST) for one in pictures)
         with atomic(Path(trainer.default_root_dir) / self.path) as temporary:
             write_animation(temporary, frames, 1 / self.fps)
