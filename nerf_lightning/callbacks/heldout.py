@@ -10,7 +10,7 @@ from nerf_lightning.callbacks.attached import agreed, data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.render_plan import Need, Renders
 from nerf_lightning.callbacks.rendering import share_of
-from nerf_lightning.dataset.subset import WHOLE, PixelSubset, thin
+from nerf_lightning.dataset.subset import STRIP_ROWS, WHOLE, PixelSubset, thin
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.ending import leave_if_asked
@@ -19,10 +19,8 @@ from nerf_lightning.utils.untrusted import count, number
 
 LARGE = 1 << 21
 """Pixels of a view beyond which SSIM, which takes some ten times as long as rendering, is left to the test."""
-MIN_PIXELS = 1 << 12
+MIN_PIXELS = 1 << 10
 """Of a view, that are rendered for the curve however little time there is."""
-MIN_ROWS = 0.05
-"""Share of each view's rows, likewise for the test."""
 
 
 class HeldOut(Renders):
@@ -50,8 +48,8 @@ class HeldOut(Renders):
         self.curve: list[list[float]] = []
         """[training seconds, step, PSNR], a row for each measurement; nan where there was no figure."""
         self.rows = 1.0
-        """The share of each view's rows that the test measures."""
-        self._tested = 0  # views
+        """The share of each view's rows that the test may measure; after it, that it has measured."""
+        self._tested = self._measured = 0  # views, and pixels of them
 
     @property
     def latest(self) -> float | None:
@@ -63,10 +61,11 @@ class HeldOut(Renders):
         points = len(self.at) - len(self.curve) if training else 0
         chosen = evenly(data.held_out_views, self.views)
         measured = points * sum(map(data.pixels_held_out, chosen))
-        tested = self.rows * sum(map(data.pixels_held_out, range(self._tested, data.held_out_views)))
+        tested = [data.pixels_held_out(view) for view in range(self._tested, data.held_out_views)]
+        strips = sum(STRIP_ROWS * math.sqrt(pixels) for pixels in tested)
         return {
             "curve": Need(measured, points * len(chosen) * MIN_PIXELS, scored=trainer.logger is not None),
-            "final": Need(tested, MIN_ROWS * tested, scored=True),
+            "final": Need(self.rows * sum(tested), strips, scored=True),
         }
 
     def record(self, trainer: L.Trainer, views: list[dict[str, float]]) -> None:
@@ -113,7 +112,7 @@ class HeldOut(Renders):
             self.record(trainer, views)
 
     def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
-        self.rows, self._tested = 1.0, 0
+        self.rows, self._tested, self._measured = 1.0, 0, 0
 
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self.rows = agreed(trainer, share_of(trainer, pl_module, "final"))
@@ -129,6 +128,10 @@ class HeldOut(Renders):
         plan.stop()
         plan.note(batch.height * batch.width, outputs["seconds"])
         self._tested += 1
+        self._measured += batch.height * batch.width
+
+        if self._tested == data_of(trainer).held_out_views:
+            self.rows = self._measured / sum(map(data_of(trainer).pixels_held_out, range(self._tested)))
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         data_of(trainer).test_on(WHOLE)

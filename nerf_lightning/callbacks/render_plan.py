@@ -14,7 +14,7 @@ PRIORITY = {"final": 30.0, "aligned": 1.0, "test": 1.0, "curve": 1.0, "snapshots
 SMOOTHING = 0.7
 """Weight of the last view in the seconds that a pixel takes."""
 PROBE_PIXELS = 1 << 14
-"""Pixels from which the time that one takes is told; fewer do not fill a chunk."""
+"""Pixels whose time tells what others take; fewer count less."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,9 @@ class RenderPlan:
         """Called with the time that a view took."""
         if self.pixel_seconds is None:
             self.pixel_seconds = seconds / pixels
-        elif pixels >= PROBE_PIXELS:
-            self.pixel_seconds += SMOOTHING * (seconds / pixels - self.pixel_seconds)
+        else:
+            weight = SMOOTHING * min(1.0, pixels / PROBE_PIXELS)
+            self.pixel_seconds += weight * (seconds / pixels - self.pixel_seconds)
 
     def _allotted(self, needs: Mapping[str, Need], allowance: float) -> dict[str, float]:
         """Seconds of each job: what it renders in any case, and a share of the time beside."""

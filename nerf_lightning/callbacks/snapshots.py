@@ -19,7 +19,7 @@ from nerf_lightning.system import System
 
 LOGGED_WIDTH = 640
 """Widest picture for TensorBoard, in pixels: it takes 0.1 s for each megabyte."""
-MIN_PIXELS, MAX_PIXELS = 1 << 15, 800 * 800
+MIN_PIXELS, MAX_PIXELS = 1 << 13, 800 * 800
 """Of a snapshot of a scene, which is for looking at."""
 
 

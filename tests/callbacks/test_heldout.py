@@ -4,6 +4,7 @@ from types import SimpleNamespace
 import pytest
 
 from nerf_lightning.callbacks import Budget, HeldOut
+from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.evenly import evenly
 
@@ -77,6 +78,24 @@ def test_a_step_that_passes_several_marks_measures_once(clock, system, trainer_w
     resumed.load_state_dict(held_out.state_dict())
     resumed.on_train_batch_end(trainer, system, None, None, 0)
     assert len(resumed.curve) == 2, "what was measured before the pause is not measured again"
+
+
+def test_where_there_is_not_time_for_all_pixels_the_curve_takes_fewer(clock, system, trainer_with, monkeypatch):
+    monkeypatch.setattr("nerf_lightning.callbacks.heldout.MIN_PIXELS", 0)
+    budget, held_out = Budget(seconds=1000), HeldOut([0.5], views=2)
+    trainer = trainer_with(budget, held_out)
+    budget.on_train_start(trainer, system)
+    clock.wait(500)
+    trainer.global_step = system.progress = 1
+    system.progress = 0.5
+    held_out.on_train_batch_end(trainer, system, None, None, 0)
+    # A view takes 50 s, the test 500, so that both are measured whole within 1000 s ...
+    assert trainer.datamodule.subsets[1:] == [WHOLE] * 2
+    held_out.curve, trainer.datamodule.subsets = [], []
+    budget.plan.spent = 450.0
+    held_out.on_train_batch_end(trainer, system, None, None, 0)
+    # ... and if 50 are left beside the test, on every second row and column.
+    assert trainer.datamodule.subsets == [PixelSubset(stride=2)] * 2
 
 
 def test_the_end_is_left_to_the_test(clock, system, trainer_with):

@@ -12,7 +12,16 @@ import pytest
 
 from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.utils import ending
-from nerf_lightning.utils.ending import Interrupted, asked, held, leave, leave_if_asked, listen, listening
+from nerf_lightning.utils.ending import (
+    Interrupted,
+    asked,
+    held,
+    interruptible,
+    leave,
+    leave_if_asked,
+    listen,
+    listening,
+)
 from nerf_lightning.utils.files import atomic, atomic_folder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,6 +53,26 @@ def test_a_signal_is_raised_where_it_comes_and_after_what_must_be_whole(number: 
         leave_if_asked()
     with pytest.raises(KeyError), held():  # what failed is told, and no signal instead
         raise KeyError
+
+
+def test_what_may_be_left_at_any_point_is_left_at_once_and_says_so(number: int, capfd: pytest.CaptureFixture[str]):
+    name = signal.Signals(number).name
+    with pytest.raises(Interrupted), held("after this step"), interruptible("after this row"):
+        with held():
+            signal.raise_signal(number)  # a file is written whole
+            done = True
+        raise AssertionError("the row does not end")
+    assert done and capfd.readouterr().err == f"nerf_lightning: {name}: after this row\n"
+    listen()
+    steps = []
+    with pytest.raises(Interrupted), held("after this step"):
+        signal.raise_signal(number)
+        signal.raise_signal(number)
+        steps.append("ends")
+        assert capfd.readouterr().err == f"nerf_lightning: {name}: after this step\n", "at once, and once"
+        with interruptible("after this row"):
+            steps.append("does not begin")
+    assert steps == ["ends"]
 
 
 def test_what_is_lost_in_a_clean_up_is_raised_later_and_prints_nothing(number: int, monkeypatch: pytest.MonkeyPatch):

@@ -1,0 +1,145 @@
+"""Rendering takes at most as long as training, and the time left that is shown comes true."""
+
+import json
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from nerf_lightning.callbacks.render_plan import Need, RenderPlan, allot
+from nerf_lightning.cameras import Rays
+from nerf_lightning.config.compose import composed
+from nerf_lightning.dataset import Views
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.renderer import Rendered
+from nerf_lightning.system import NeRF3D, StepStats
+from nerf_lightning.training.train import train
+
+
+@dataclass
+class Told:
+    """What a run showed, and what was true."""
+
+    times: list[tuple[float, float]]
+    """Seconds left, as shown and as they really were."""
+    subjects: set[str]
+    """What it said that it rendered, with N for each number."""
+    rendering: float
+    """Seconds of rendering."""
+    results: dict[str, Any]
+
+
+@pytest.mark.parametrize(
+    ("needs", "allowance", "expected"),
+    [
+        ({"final": 10.0, "orbit": 5.0}, 20.0, {"final": 10.0, "orbit": 5.0}),
+        ({"final": 10.0, "orbit": 50.0}, 20.0, {"final": 10.0, "orbit": 10.0}),
+        ({"final": 100.0, "orbit": 50.0}, 31.0, {"final": 30.0, "orbit": 1.0}),
+        ({"curve": 1.0, "snapshots": 50.0, "orbit": 60.0}, 21.0, {"curve": 1.0, "snapshots": 10.0, "orbit": 10.0}),
+        ({"final": 0.0, "orbit": 5.0}, -3.0, {"final": 0.0, "orbit": 0.0}),
+    ],
+)
+def test_what_a_job_does_not_need_is_for_the_others(needs: dict, allowance: float, expected: dict):
+    assert allot(needs, allowance) == pytest.approx(expected)
+
+
+def test_shares_leave_each_job_its_least_and_do_not_count_what_was_asked_for():
+    plan = RenderPlan()
+    assert plan.seconds_left({"final": Need(100)}, 10.0) is None, "nothing was rendered yet"
+    plan.note(1000, 1.0)
+    needs = {
+        "final": Need(30_000),
+        "orbit": Need(10_000, least=1000),
+        "curve": Need(5000, least=1000),
+        "snapshots": Need(7000, asked=True),
+    }
+    # Of 34 s two are taken beforehand: the rest is divided 30 : 1 : 1.
+    assert [plan.share(job, needs, 34.0) for job in needs] == pytest.approx([1.0, 0.2, 0.4, 1.0])
+    assert plan.seconds_left(needs, 34.0) == pytest.approx(30 + 2 + 2 + 7)
+    plan.score_seconds = 1e-3
+    assert plan.seconds_left({"final": Need(1000, scored=True)}, 34.0) == pytest.approx(2.0)
+
+
+def test_a_pixel_takes_as_long_as_in_the_last_views(clock):
+    plan = RenderPlan()
+    plan.note(1 << 14, 2.0 * (1 << 14))
+    plan.note(10, 1000.0)
+    assert plan.pixel_seconds == pytest.approx(2.0, abs=0.1), "few pixels say little"
+    plan.note(1 << 14, 1.0 * (1 << 14))
+    assert plan.pixel_seconds == pytest.approx(1.3, abs=0.1)
+    with plan.rendering("orbit"):
+        clock.wait(7)
+        assert plan.subject == "orbit"
+    assert plan.spent == 7 and plan.subject == ""
+
+
+@pytest.fixture
+def simulated(clock: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[int, float, float], Told]:
+    """Trains for 180 s of a clock that only steps and rendered pixels move: a step takes a second."""
+    monkeypatch.setattr(time, "monotonic", clock)
+    monkeypatch.setattr("nerf_lightning.training.train.warm_up", lambda *given: None)
+
+    def training_step(self: NeRF3D, batch: Any, batch_idx: int) -> Tensor:
+        clock.wait(1.0)
+        self.stats = StepStats(torch.tensor(0.01), 100, 100)
+        return sum(parameter.sum() for parameter in self.parameters())
+
+    def run(side: int, pixel_seconds: float, fog: float) -> Told:
+        """Args: of held-out photos; of a pixel, and how many times that at first."""
+        small = bricks(size=16, train_views=6, val_views=8, cache="")
+        cameras = small.val.cameras.resized((side, side))
+        photos = torch.zeros(8 * side * side, 3, dtype=torch.uint8)
+        scene = replace(small, val=Views(photos, cameras), orbit=small.orbit.resized((side, side)))
+        rendering = 0.0
+
+        def render(self: NeRF3D, rays: Rays, **given: Any) -> Rendered:
+            nonlocal rendering
+            seconds = len(rays) * pixel_seconds * (fog if self.progress < 0.03 else 1.0)
+            clock.wait(seconds)
+            rendering += seconds
+            return Rendered(torch.rand(len(rays), 3), torch.ones(len(rays)), torch.ones(len(rays)))
+
+        lines: list[tuple[float, str]] = []
+        off = [f"callbacks.{name}=null" for name in ("guard", "checkpoints")]
+        options = ["budget.seconds=180", "callbacks.orbit.frames=null", "callbacks.progress.every_seconds=1", "~logger"]
+        with monkeypatch.context() as patch:
+            patch.setattr(NeRF3D, "training_step", training_step)
+            patch.setattr(NeRF3D, "render", render)
+            patch.setattr(Console, "print", lambda self, *said, **given: lines.append((clock.now, said[0])))
+            train(composed(["+experiment=smoke_3d", *options, *off], tmp_path), scene=scene)
+        found = re.compile(r"left (\d+):(\d\d)(?:: (.*))?$")
+        left = [(at, match) for at, line in lines if (match := found.search(line))]
+        times = [(60 * int(match[1]) + int(match[2]), clock.now - at) for at, match in left]
+        subjects = {re.sub(r"\d+", "N", match[3]) for _, match in left if match[3]}
+        return Told(times, subjects, rendering, json.loads((tmp_path / "results.json").read_text()))
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("side", "pixel_seconds", "fog", "seconds", "rows"),
+    [
+        # 10 snapshots, 5 times 8 views, 8 views, 60 frames of the orbit, and the first look.
+        (32, 2e-5, 4.0, 119 * 32 * 32 * 2e-5, 1.0),
+        (256, 2e-4, 2.0, 180.0, 1.0),  # the held-out views take 105 s
+        (512, 2e-4, 1.0, 180.0, 0.25),  # and here 419 s
+    ],
+)
+def test_rendering_takes_as_long_as_training_at_most_and_its_end_is_told(
+    side: int, pixel_seconds: float, fog: float, seconds: float, rows: float, simulated: Callable[..., Told]
+):
+    told = simulated(side, pixel_seconds, fog)
+    assert told.rendering == pytest.approx(seconds, rel=0.1)
+    assert told.results["rows_measured"] == pytest.approx(rows, abs=0.01)
+    assert max(true for _, true in told.times) > 170, "told from the tenth second on"
+    assert not [(left, true) for left, true in told.times if abs(left - true) > max(0.25 * true, 2.0)]
+    if rows < 1:
+        names = {"snapshot", "held-out view N of N", "orbit, frame N of N"}
+        assert names <= told.subjects

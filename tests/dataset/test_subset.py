@@ -1,0 +1,55 @@
+"""Pixels of a view that stand for all of them."""
+
+import pytest
+import torch
+
+from nerf_lightning.dataset import Picture, PixelDataModule, RayDataModule
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.dataset.subset import WHOLE, PixelSubset, thin
+
+
+def test_strips_are_spread_over_the_height():
+    rows, columns = PixelSubset(rows=0.5).grid(7, 128)
+    assert rows.tolist() == [*range(32), *range(64, 96)] and columns.tolist() == list(range(7))
+    assert len(PixelSubset(rows=0.0).grid(7, 128)[0]) == 32, "at least one"
+    assert PixelSubset(rows=0.3).grid(5, 20)[0].tolist() == list(range(20)), "less than a strip is there"
+    assert PixelSubset(rows=0.99).grid(5, 128)[0].tolist() == list(range(128))
+
+
+def test_a_stride_takes_the_middle_of_what_it_leaves_out():
+    rows, columns = PixelSubset(stride=3).grid(7, 5)
+    assert rows.tolist() == [1, 4] and columns.tolist() == [1, 4]
+    assert [len(side) for side in PixelSubset(stride=9).grid(3, 2)] == [1, 1], "never nothing"
+
+
+@pytest.mark.parametrize(
+    ("pixels", "most", "stride"), [(100, 100, 1), (100, 99, 2), (100, 25, 2), (100, 24, 3), (9, 0, 3)]
+)
+def test_thin_leaves_at_most_so_many(pixels: int, most: int, stride: int):
+    assert thin(pixels, most).stride == stride
+    assert (thin(100, 100) == WHOLE) and thin(100, 25).strip == 1
+
+
+@pytest.mark.parametrize("subset", [PixelSubset(stride=3), PixelSubset(rows=0.5)])
+def test_some_pixels_of_a_view_are_those_of_the_whole_one(subset: PixelSubset):
+    scene = bricks(size=64, train_views=2, val_views=2, cache="")
+    data = RayDataModule(scene)
+    whole, some = data.held_out(1), data.held_out(1, subset)
+    rows, columns = subset.grid(64, 64)
+    expected = (rows[:, None] * 64 + columns).flatten()
+    assert (some.height, some.width, some.strip) == (len(rows), len(columns), subset.strip)
+    assert torch.equal(some.pixels, whole.pixels[expected]) and data.pixels_held_out(1) == len(whole.pixels)
+    assert torch.equal(some.rays.directions, whole.rays.directions[expected])
+    image = torch.randint(0, 256, (64, 40, 3), dtype=torch.uint8)
+    picture = PixelDataModule(Picture("noise", "test", image))
+    whole, some = picture.held_out(0), picture.held_out(0, subset)
+    expected = (rows[:, None] * 40 + columns[columns < 40]).flatten()
+    assert torch.equal(some.rgb, whole.rgb[expected]) and torch.allclose(some.uv, whole.uv[expected])
+
+
+def test_a_test_may_be_of_strips():
+    data = RayDataModule(bricks(size=64, train_views=2, val_views=2, cache=""))
+    data.test_on(PixelSubset(rows=0.5))
+    assert [batch.height for batch in data.test_dataloader()] == [32, 32]
+    data.test_on(WHOLE)
+    assert [batch.height for batch in data.test_dataloader()] == [64, 64]

@@ -1,0 +1,67 @@
+"""A scene's test split is evaluated beside the held-out views."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from nerf_lightning.callbacks.render_plan import RenderPlan
+from nerf_lightning.config.compose import composed
+from nerf_lightning.dataset import RayDataModule, Scene
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.evaluate import verb
+from nerf_lightning.evaluate.__main__ import task
+from nerf_lightning.training.train import train
+
+OPTIONS = ["+experiment=smoke_3d", "budget.steps=3", "callbacks.orbit=null", "callbacks.snapshots=null", "~logger"]
+
+
+@pytest.fixture
+def scene() -> Scene:
+    small = bricks(size=16, train_views=6, val_views=5, cache="")
+    return replace(small, val=bricks(size=16, train_views=6, val_views=2, cache="").val, test=small.val)
+
+
+def results(folder: Path) -> dict:
+    return json.loads((folder / "results.json").read_text())
+
+
+def test_its_figures_stand_beside_those_of_held_out_views(scene: Scene, tmp_path: Path, monkeypatch, capsys):
+    train(composed(OPTIONS, tmp_path), scene=scene)
+    found = results(tmp_path)
+    test = found["test"]
+    assert (test["views"], test["views_in_split"]) == (5, 5) and found["scene"]["views"] == {
+        "train": 6,
+        "val": 2,
+        "test": 5,
+    }
+    assert (
+        f"{found['psnr']:.2f} dB held out (val), {test['psnr']:.2f} dB on 5 test views, after"
+        in capsys.readouterr().out
+    )
+
+    monkeypatch.setattr(verb, "data_again", lambda *given: RayDataModule(scene))
+    for split, expected in (("val", found), ("test", test)):
+        task(composed([f"run={tmp_path}", f"split={split}"], tmp_path, "evaluate"))
+        judged = json.loads((tmp_path / "evaluation" / "views.json").read_text())
+        assert judged["mean"]["psnr"] == pytest.approx(expected["psnr"], abs=0.02)
+        assert judged["mean"]["ssim"] == pytest.approx(expected["ssim"], abs=1e-3)
+        worst = min(view["psnr"] for view in judged["views"])
+        assert worst == pytest.approx(expected["psnr_worst_view"], abs=0.02)
+
+
+def test_where_there_is_not_time_for_all_some_of_it_is_evaluated(scene: Scene, tmp_path: Path, monkeypatch, capsys):
+    share = RenderPlan.share
+    monkeypatch.setattr(
+        RenderPlan, "share", lambda self, job, *given: 0.5 if job == "test" else share(self, job, *given)
+    )
+    train(composed(OPTIONS, tmp_path), scene=scene)
+    assert (results(tmp_path)["test"]["views"], results(tmp_path)["test"]["views_in_split"]) == (2, 5)
+    assert "dB on 2 of 5 test views, after" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("split", "words"), [("test", "have no test split"), ("all", "expected val or test")])
+def test_another_split_is_refused(split: str, words: str, scene: Scene, small_run: Path, tmp_path: Path):
+    with pytest.raises(verb.InputError, match=words):
+        task(composed([f"run={small_run}", f"split={split}", f"output={tmp_path}"], tmp_path, "evaluate"))
