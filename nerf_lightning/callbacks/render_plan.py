@@ -113,13 +113,16 @@ class RenderPlan:
             weight = SMOOTHING * min(1.0, pixels / PROBE_PIXELS)
             self.pixel_seconds += weight * (seconds / pixels - self.pixel_seconds)
 
+    def _cost(self, need: Need) -> float:
+        """Seconds that a pixel of a job takes."""
+        return (self.pixel_seconds or 0.0) + need.scored * self.score_seconds
+
     def _allotted(self, needs: Mapping[str, Need], allowance: float) -> dict[str, float]:
         """Seconds of each job: what it renders in any case, and a share of the time beside."""
         least, more = {}, {}
         for job, need in needs.items():
-            each = (self.pixel_seconds or 0.0) + need.scored * self.score_seconds
-            least[job] = each * (need.pixels if need.asked else min(need.least, need.pixels))
-            more[job] = each * need.pixels - least[job]
+            least[job] = self._cost(need) * (need.pixels if need.asked else min(need.least, need.pixels))
+            more[job] = self._cost(need) * need.pixels - least[job]
         bounded = [job for job, need in needs.items() if not need.asked]
         rest = allowance - self.spent - sum(least[job] for job in bounded)
         shares = allot({job: more[job] for job in bounded}, rest)
@@ -133,8 +136,7 @@ class RenderPlan:
             needs: of all jobs.
             allowance: seconds for all rendering of the run.
         """
-        need = needs[job]
-        needed = need.pixels * ((self.pixel_seconds or 0.0) + need.scored * self.score_seconds)
+        needed = self._cost(needs[job]) * needs[job].pixels
         return min(1.0, self._allotted(needs, allowance)[job] / needed) if needed else 1.0
 
     def seconds_left(self, needs: Mapping[str, Need], allowance: float) -> float | None:

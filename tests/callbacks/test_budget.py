@@ -57,6 +57,35 @@ def test_progress_follows_the_limit_that_is_nearer(steps, seconds, step, spent, 
     assert budget.progress(step) == expected
 
 
+@pytest.mark.parametrize(
+    ("steps", "seconds", "step", "spent", "left", "rendering"),
+    [
+        (200, None, 50, 30, 90, 120),
+        (None, 60, 50, 20, 40, 60),
+        (200, 60, 50, 20, 40, 60),
+        (200, 90, 100, 30, 30, 60),
+        (None, 8, 50, 9, 0, 30),
+        (200, None, 0, 0, None, 30),
+    ],
+)
+def test_the_time_left_is_told_by_the_limit_that_is_nearer(
+    steps, seconds, step, spent, left, rendering, clock, system, trainer_with
+):
+    budget = Budget(steps, seconds)
+    budget.on_train_start(trainer_with(budget), system)
+    clock.wait(spent)
+    assert budget.seconds_left(step) == pytest.approx(left)
+    assert budget.render_seconds(step) == pytest.approx(rendering), "as long as training, and at least half a minute"
+
+
+def test_after_a_plateau_what_is_left_is_cooling_down(clock, system, trainer_with):
+    budget = Budget(seconds=100, patience=0.1)
+    budget.on_train_start(trainer_with(budget), system)
+    clock.wait(40)
+    budget._line = (0.4, 0.4, 0.6 / (0.15 * 0.4))
+    assert budget.seconds_left(1) == pytest.approx(0.15 * 40)
+
+
 def test_training_stops_when_the_budget_is_spent(clock, system, trainer_with):
     budget = Budget(steps=3, seconds=100)
     trainer = trainer_with(budget)

@@ -1,6 +1,8 @@
 import pytest
 
-from nerf_lightning.callbacks.progress import clock
+from nerf_lightning.callbacks import Budget, Progress
+from nerf_lightning.callbacks.progress import clock as in_words
+from nerf_lightning.utils.progress import set_sweep
 
 
 @pytest.mark.parametrize(
@@ -18,4 +20,22 @@ from nerf_lightning.callbacks.progress import clock
     ],
 )
 def test_clock(seconds, expected):
-    assert clock(seconds) == expected
+    assert in_words(seconds) == expected
+
+
+def test_the_time_left_comes_once_it_can_be_told_and_that_of_the_sweep_beside_it(clock, system, trainer_with):
+    budget, progress = Budget(seconds=100), Progress()
+    trainer = trainer_with(budget, progress)
+    budget.on_train_start(trainer, system)
+    budget.plan.note(100, 1.0)
+    trainer.global_step = 1
+    clock.wait(9)
+    assert progress.left(trainer) == (None, "")
+    clock.wait(11)
+    assert progress.left(trainer) == (80, "left 1:20")
+    set_sweep(lambda left: left + 600)
+    try:
+        with budget.rendering(trainer, "snapshot"):
+            assert progress.left(trainer) == (80, "left 1:20, sweep 11:20: snapshot")
+    finally:
+        set_sweep(None)
