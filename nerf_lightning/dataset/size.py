@@ -17,10 +17,10 @@ from nerf_lightning.utils.memory import free_memory
 log = logging.getLogger(__name__)
 
 AUTO = "auto"
-LONGEST_PX, CORE_SECONDS, GROWTH = 1000, 360.0, 1 / 3
-"""What 180 s on two cores can use, and how the longest side grows with the work."""
+LONGEST_PX, CORE_SECONDS, GROWTH = 800, 360.0, 1 / 3
+"""What 180 s on two cores can use, see `auto_resize`, and how the longest side grows with the work, which is an estimate."""
 MIN_LONGEST_PX = 800
-"""Smaller photos save little work, however short the training."""
+"""Smaller photos make no shorter training better, and at this size the field publishes."""
 SECONDS = 90.0
 """Of training, where nobody says."""
 CORE_SECONDS_PER_STEP = 0.06
@@ -49,6 +49,9 @@ def auto_resize(seconds: float | None, steps: int | None, device: torch.device, 
     """The size for a training of so many seconds or steps, whichever ends first; for one of 90 s where neither is given.
 
     The longest side is LONGEST_PX * (work / CORE_SECONDS) ** GROWTH, at least MIN_LONGEST_PX; work is seconds times cores.
+    On a phone capture of 1080x1920 (experiment `capture`, two cores, one seed, PSNR against held-out photos of full size),
+    trainings of 60 s at longest sides of 480, 960 and 1920 pixels reached 28.07, 27.99 and 27.55 dB, those of 180 s at 480 and
+    960 reached 29.17 and 29.06 dB: more pixels bring nothing so early, and views of them take longer to measure and to draw.
     """
     cores, where = threads, f"{threads} thread{'s' if threads > 1 else ''}"
     if device.type != "cpu":
@@ -65,8 +68,8 @@ def choose_resize(
 ) -> int | None:
     """The longest side that photos of these sizes are read at; None keeps them. Tells what was chosen.
 
-    The largest photo is divided by the whole number that comes nearest to the size that suits: pixels are then means of
-    whole pixels, and JPEGs are decoded at that scale. A larger number is taken where the memory has no room.
+    The largest photo is divided by the whole number that comes nearest to the size that suits, so that pixels are means of
+    whole ones where it divides the sides; a larger one where the memory has no room.
 
     Args:
         source: what the user named, for the message.

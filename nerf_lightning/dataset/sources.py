@@ -20,7 +20,7 @@ from nerf_lightning.dataset.rays import FOCUS, RAYS, SAMPLES, RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
 from nerf_lightning.dataset.shots import Reading
-from nerf_lightning.dataset.size import AutoResize, parse_resize
+from nerf_lightning.dataset.size import AUTO, AutoResize, parse_resize
 from nerf_lightning.utils.files import atomic, user_path
 from nerf_lightning.utils.options import AtLeast, Count
 
@@ -33,7 +33,7 @@ DOWNLOAD_TIMEOUT = 10.0
 def from_photos(
     path: str,
     name: str | None = None,
-    resize: Count | str | AutoResize | None = None,
+    resize: Count | str | AutoResize | None = AUTO,
     holdout: Annotated[int, AtLeast(2)] = 8,
     masked: str = "auto",
     invert_masks: bool = False,
@@ -71,7 +71,7 @@ def from_download(
     folder: str,
     download: bool = True,
     path: str | None = None,
-    resize: Count | str | AutoResize | None = None,
+    resize: Count | str | AutoResize | None = AUTO,
     bounded: str | bool = "auto",
     near: float | None = None,
     far: float | None = None,

@@ -27,7 +27,7 @@ POINT = 24
 def options(
     scene: str | None,
     run: str | None,
-    resize: Count | None,
+    resize: Count | str | None,
     holdout: Annotated[int, AtLeast(2)],
     photo_side: Count,
     rays: Count,
@@ -65,12 +65,13 @@ def task(cfg: "DictConfig") -> None:
 def page_of_scene(given: dict[str, Any], port: int) -> "Page":
     """The page about a scene."""
     from nerf_lightning.dataset import Reading, open_scene
+    from nerf_lightning.dataset.size import parse_resize
     from nerf_lightning.utils.memory import check_memory
     from nerf_lightning.view.scene_page import ScenePage
 
     points = given["rays"] * given["samples"]
     check_memory("config", "rays, samples", f"{points:,} samples to show", POINT * points)
-    scene = open_scene(given["scene"], reading=Reading(given["resize"], given["holdout"]))
+    scene = open_scene(given["scene"], reading=Reading(parse_resize(given["resize"]), given["holdout"]))
     return ScenePage(scene, given["host"], port, given["photo_side"], given["rays"], given["samples"])
 
 

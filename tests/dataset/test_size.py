@@ -34,13 +34,13 @@ def views(ball_views_of: Callable[..., Views]) -> Views:
 @pytest.mark.parametrize(
     ("seconds", "steps", "threads", "longest"),
     [
-        (180, None, 2, 1000),
-        (180, None, 16, 2000),
-        (1440, None, 2, 2000),
+        (180, None, 2, 800),
+        (180, None, 16, 1600),
+        (1440, None, 2, 1600),
         (60, None, 2, 800),  # no smaller
-        (180, 10, 2, 800),  # whichever ends first
-        (None, 48000, 1, 2000),
-        (None, None, 32, 2000),  # 90 s
+        (1440, 10, 2, 800),  # whichever ends first
+        (None, 48000, 1, 1600),
+        (None, None, 32, 1600),  # 90 s
     ],
 )
 def test_work_decides_the_longest_side(seconds: float | None, steps: int | None, threads: int, longest: int):
