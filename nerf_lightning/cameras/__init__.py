@@ -2,6 +2,7 @@
 
 from nerf_lightning.cameras.bounds import Bounds, InBounds
 from nerf_lightning.cameras.cameras import Cameras, Rays
+from nerf_lightning.cameras.layout import Layout, classify_layout, gaze_point
 from nerf_lightning.cameras.lenses import Distortion, Lenses, Projection
 from nerf_lightning.cameras.orbit import (
     axes_meet,
@@ -27,11 +28,14 @@ __all__ = [
     "Cameras",
     "Distortion",
     "InBounds",
+    "Layout",
     "Lenses",
     "Projection",
     "Rays",
     "axes_meet",
+    "classify_layout",
     "focus_point",
+    "gaze_point",
     "held",
     "in_other_frame",
     "look_at",

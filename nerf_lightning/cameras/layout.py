@@ -1,0 +1,175 @@
+"""How a capture's cameras are laid out: around a subject, on one side of it, turning on a spot, or along a walk."""
+
+from enum import StrEnum
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+MAX_FORWARD_SPREAD = 0.1
+"""Largest circular variance (1 - length of the mean axis) of forward-facing cameras: axes within about 35 degrees."""
+MIN_CONVERGENCE = 0.4
+"""See `convergence`."""
+MAX_SPOT = 0.05
+"""Largest spread of the centres of a camera that turns on a spot, as a share of the depth of what it sees."""
+MAX_STRIP = 1.5
+"""Largest spread of forward-facing cameras likewise; farther apart, they do not look at one thing."""
+ROUNDING = 1e-5
+"""Centres that spread by less than this share of their coordinates are the same."""
+MIN_SCATTER = 0.5
+"""Centres are noise where those of neighbours, in order and in direction, differ by at least this share of what any two do."""
+MIN_VIEWS_FOR_NOISE = 6
+DENSITY_SHARPNESS, MAX_DENSITY_WEIGHT = 8.0, 3.0
+"""Concentration of the kernel that estimates how densely directions are seen from, and the largest weight of a lone view."""
+MAX_POINTS = 4096
+
+
+class Layout(StrEnum):
+    """What a capture's poses say about how it was taken."""
+
+    INWARD = "inward"
+    """Around a subject, or an arc of more than about 70 degrees: axes meet in front of the cameras."""
+    FORWARD = "forward"
+    """From one side: axes nearly parallel, converging or slightly diverging."""
+    PAN = "pan"
+    """Turning on a spot, as on a tripod: centres differ by next to nothing."""
+    WALK = "walk"
+    """Anything else: rooms walked through, streets, fly-throughs."""
+
+
+def classify_layout(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"] | None = None) -> Layout:
+    """Classifies cameras by their poses (OpenCV, camera to world).
+
+    Poses alone do not tell the depth of the scene: a hand-held pan is then recognised by centres that depend neither on the
+    photos' order nor on their direction.
+
+    Args:
+        c2w: at least one pose; any similarity gives the same answer.
+        points: on surfaces, in the poses' frame; they tell the depth.
+    """
+    c2w = c2w.double()
+    centres, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
+    spread = centre_spread(c2w)
+    if spread == 0:
+        return Layout.PAN if len(c2w) > 1 else Layout.FORWARD
+    depth = None if points is None else median_depth(c2w, points)
+    if depth is not None and spread < MAX_SPOT * depth:
+        return Layout.PAN
+    if circular_variance(axes) <= MAX_FORWARD_SPREAD:
+        too_wide = depth is not None and spread > MAX_STRIP * depth
+        return Layout.WALK if too_wide or is_dolly(centres, axes) else Layout.FORWARD
+    if convergence(c2w, gaze_point(c2w)) >= MIN_CONVERGENCE:
+        return Layout.INWARD
+    if depth is None and len(c2w) >= MIN_VIEWS_FOR_NOISE and is_noise(centres, axes):
+        return Layout.PAN
+    return Layout.WALK
+
+
+def circular_variance(directions: Float[Tensor, "V 3"]) -> float:
+    """1 - the length of the mean of unit vectors: 0 where all are the same, 1 where they cancel out."""
+    return 1 - float(directions.mean(0).norm())
+
+
+def centre_spread(c2w: Float[Tensor, "V 4 4"]) -> float:
+    """Median distance of the centres from their median; 0 where they differ by rounding alone."""
+    centres = c2w[:, :3, 3].double()
+    distance = (centres - centres.median(0).values).norm(dim=1)
+    spread = float(distance.median()) or float(distance.mean())
+    return spread if spread > ROUNDING * float(centres.abs().max()) else 0.0
+
+
+def median_depth(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> float | None:
+    """Median distance, over the cameras, to the points within 45 degrees of the axis; None where no camera has any."""
+    some = points[:: -(-len(points) // MAX_POINTS)].double() if len(points) else points.double()
+    found = []
+    for pose in c2w.double():
+        local = (some - pose[:3, 3]) @ pose[:3, :3]
+        distance = local.norm(dim=1)
+        ahead = local[:, 2] > 0.7 * distance
+        if ahead.any():
+            found.append(distance[ahead].median())
+    return float(torch.stack(found).median()) if found else None
+
+
+def is_dolly(centres: Float[Tensor, "V 3"], axes: Float[Tensor, "V 3"]) -> bool:
+    """Whether centres spread along the mean axis more than across it."""
+    offset = centres - centres.mean(0)
+    along = offset @ normalize(axes.mean(0), dim=0)
+    return bool(2 * along.square().sum() > offset.square().sum())
+
+
+def is_noise(centres: Float[Tensor, "V 3"], axes: Float[Tensor, "V 3"]) -> bool:
+    """Whether centres depend neither on the photos' order nor on where they look."""
+    usual = 2 * (centres - centres.mean(0)).square().sum(1).mean()
+    in_order = (centres[1:] - centres[:-1]).square().sum(1).mean()
+    alike = (axes @ axes.T - 3 * torch.eye(len(axes)).to(axes)).argmax(1)
+    in_direction = (centres - centres[alike]).square().sum(1).mean()
+    return bool(torch.minimum(in_order, in_direction) > MIN_SCATTER * usual)
+
+
+def convergence(c2w: Float[Tensor, "V 4 4"], point: Float[Tensor, "3"]) -> float:
+    """How much better a point explains where cameras look than one direction does: 1 where all look at it, 0 or less where
+    they might look in one direction, or each in its own.
+
+    1 - (mean of 1 - cos of the angles between axes and the point) / (circular variance of the axes).
+    """
+    axes = normalize(c2w[:, :3, 2].double(), dim=1)
+    return 1 - (1 - float(gaze(c2w, point[None].double())[0].mean())) / max(circular_variance(axes), 1e-9)
+
+
+def gaze(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> Float[Tensor, "P V"]:
+    """Cosine of the angle between each camera's axis and its direction to each point."""
+    toward = normalize(points[:, None] - c2w[:, :3, 3].double(), dim=2)
+    return (toward * normalize(c2w[:, :3, 2].double(), dim=1)).sum(2)
+
+
+def gaze_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
+    """The point in front of the cameras that is nearest to their axes by angle; far away where axes do not converge.
+
+    Maximises the mean cosine between axes and directions to the point, each view weighted by how few others look from
+    its direction. For cameras all around that are framed to one side alike, that is the middle of their circle; the point
+    nearest to the axes' lines (`focus_point`) may be behind cameras, and follows the views' density.
+    """
+    c2w = c2w.double()
+    centres, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
+    size = max(float((centres - centres.mean(0)).norm(dim=1).mean()), 1e-9)
+    ahead = [centres + reach * size * axes for reach in (0.5, 1.0, 2.0, 4.0)]
+    start = torch.cat([centres.mean(0, keepdim=True), *ahead])
+    start = start[:: -(-len(start) // 512)]
+    weights = torch.full_like(centres[:, 0], 1 / len(centres))
+    point = start[(gaze(c2w, start) @ weights).argmax()]
+    for _ in range(3):
+        point = _climb(c2w, point, weights)
+        toward = normalize(point - centres, dim=1)
+        density = torch.exp(DENSITY_SHARPNESS * (toward @ toward.T - 1)).sum(1)
+        weights = (1 / density).clamp_max(MAX_DENSITY_WEIGHT / float(density.median()))
+        weights = weights / weights.sum()
+    return point
+
+
+def _climb(
+    c2w: Float[Tensor, "V 4 4"], point: Float[Tensor, "3"], weights: Float[Tensor, "V"], steps: int = 40
+) -> Float[Tensor, "3"]:
+    """The nearest maximum of the weighted mean cosine, by Levenberg-Marquardt on the chords between directions and axes."""
+    centres, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
+    eye = torch.eye(3, dtype=point.dtype, device=point.device)
+    damping, value = 1e-3, float(gaze(c2w, point[None])[0] @ weights)
+    for _ in range(steps):
+        offset = point - centres
+        distance = offset.norm(dim=1).clamp_min(1e-12)
+        toward = offset / distance[:, None]
+        J = (eye - toward[:, :, None] * toward[:, None, :]) / distance[:, None, None]
+        normal = (weights[:, None, None] * (J.mT @ J)).sum(0)
+        slope = (weights[:, None] * (J @ axes[:, :, None])[:, :, 0]).sum(0)
+        step = torch.linalg.solve(normal + (damping * normal.trace() + 1e-18) * eye, slope)
+        new = float(gaze(c2w, (point + step)[None])[0] @ weights)
+        if new > value:
+            point, value, damping = point + step, new, damping / 4
+            if float(step.norm()) < 1e-9 * float(distance.mean()):
+                break
+        else:
+            damping = 10 * max(damping, 1e-6)
+            if damping > 1e6:
+                break
+    return point
