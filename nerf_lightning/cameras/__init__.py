@@ -9,11 +9,10 @@ from nerf_lightning.cameras.orbit import (
     focus_point,
     look_at,
     orbit_around,
-    orbit_like,
-    spiral_like,
     typical_view,
     upward,
 )
+from nerf_lightning.cameras.paths import orbit_like, pivot_of, resample_path, spiral_like
 from nerf_lightning.cameras.transforms import (
     in_other_frame,
     pixel_to_camera,
@@ -43,6 +42,8 @@ __all__ = [
     "orbit_like",
     "pixel_to_camera",
     "pixel_to_ray",
+    "pivot_of",
+    "resample_path",
     "spiral_like",
     "transform",
     "transform_directions",

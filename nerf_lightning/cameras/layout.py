@@ -11,6 +11,8 @@ MAX_FORWARD_SPREAD = 0.1
 """Largest circular variance (1 - length of the mean axis) of forward-facing cameras: axes within about 35 degrees."""
 MIN_CONVERGENCE = 0.4
 """See `convergence`."""
+PARALLEL = 1e-5
+"""Circular variance below which axes are parallel: within a quarter of a degree."""
 MAX_SPOT = 0.05
 """Largest spread of the centres of a camera that turns on a spot, as a share of the depth of what it sees."""
 MAX_STRIP = 1.5
@@ -33,7 +35,7 @@ class Layout(StrEnum):
     FORWARD = "forward"
     """From one side: axes nearly parallel, converging or slightly diverging."""
     PAN = "pan"
-    """Turning on a spot, as on a tripod: centres differ by next to nothing."""
+    """Turning on a spot, as on a tripod: centres differ by next to nothing. A single camera, too."""
     WALK = "walk"
     """Anything else: rooms walked through, streets, fly-throughs."""
 
@@ -52,7 +54,7 @@ def classify_layout(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"] | 
     centres, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
     spread = centre_spread(c2w)
     if spread == 0:
-        return Layout.PAN if len(c2w) > 1 else Layout.FORWARD
+        return Layout.PAN
     depth = None if points is None else median_depth(c2w, points)
     if depth is not None and spread < MAX_SPOT * depth:
         return Layout.PAN
@@ -114,8 +116,10 @@ def convergence(c2w: Float[Tensor, "V 4 4"], point: Float[Tensor, "3"]) -> float
 
     1 - (mean of 1 - cos of the angles between axes and the point) / (circular variance of the axes).
     """
-    axes = normalize(c2w[:, :3, 2].double(), dim=1)
-    return 1 - (1 - float(gaze(c2w, point[None].double())[0].mean())) / max(circular_variance(axes), 1e-9)
+    variance = circular_variance(normalize(c2w[:, :3, 2].double(), dim=1))
+    if variance < PARALLEL:
+        return 0.0
+    return 1 - (1 - float(gaze(c2w, point[None].double())[0].mean())) / variance
 
 
 def gaze(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> Float[Tensor, "P V"]:
@@ -131,11 +135,13 @@ def gaze_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
     its direction. For cameras all around that are framed to one side alike, that is the middle of their circle; the point
     nearest to the axes' lines (`focus_point`) may be behind cameras, and follows the views' density.
     """
-    c2w = c2w.double()
+    c2w = c2w.double().clone()
+    middle = c2w[:, :3, 3].mean(0)
+    size = float((c2w[:, :3, 3] - middle).norm(dim=1).mean()) or 1.0
+    c2w[:, :3, 3] = (c2w[:, :3, 3] - middle) / size
     centres, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
-    size = max(float((centres - centres.mean(0)).norm(dim=1).mean()), 1e-9)
-    ahead = [centres + reach * size * axes for reach in (0.5, 1.0, 2.0, 4.0)]
-    start = torch.cat([centres.mean(0, keepdim=True), *ahead])
+    ahead = [centres + reach * axes for reach in (0.5, 1.0, 2.0, 4.0)]
+    start = torch.cat([torch.zeros_like(centres[:1]), *ahead])
     start = start[:: -(-len(start) // 512)]
     weights = torch.full_like(centres[:, 0], 1 / len(centres))
     point = start[(gaze(c2w, start) @ weights).argmax()]
@@ -145,7 +151,7 @@ def gaze_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
         density = torch.exp(DENSITY_SHARPNESS * (toward @ toward.T - 1)).sum(1)
         weights = (1 / density).clamp_max(MAX_DENSITY_WEIGHT / float(density.median()))
         weights = weights / weights.sum()
-    return point
+    return middle + size * point
 
 
 def _climb(

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.cameras import Cameras, Rays, focus_point, upward
+from nerf_lightning.cameras import Cameras, Rays, pivot_of, upward
 from nerf_lightning.drawing.panels import data_url
 from nerf_lightning.model import TensoRFField, VoxelField
 from nerf_lightning.model.layers.activation import SoftenableReLU, shifted_softplus
@@ -95,7 +95,7 @@ def described(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
             "cells": sampler.resolution,
             "stop": sampler.early_stop_eps,
         },
-        "focus": focus_point(orbit.c2w).tolist(),
+        "focus": pivot_of(orbit).tolist(),
         "up": upward(orbit).tolist(),
         "orbit": poses(orbit),
     }

@@ -12,6 +12,7 @@ class RenderOptions:
 
     run: str
     path: str
+    path_frame: str
     frames: Annotated[Count, AtMost(99_999)] | None
     """Files of frames are numbered with five digits, which keep them in order."""
     fps: FramesPerSecond

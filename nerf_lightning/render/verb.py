@@ -86,7 +86,7 @@ def the_route(options: RenderOptions, found: SceneRun) -> Route:
         data = data_again(found.cfg, found.scene, options.photos)
         assert isinstance(data, RayDataModule)  # of a scene's run
         scene = data.scene
-    route = find_route(options.path, options.frames, found.orbit, scene)
+    route = find_route(options.path, options.frames, found.orbit, scene, found.to_source, options.path_frame)
     if options.scale == 1:
         return route
     return Route(route.cameras.scaled(options.scale), route.views)

@@ -10,7 +10,7 @@ import torch
 import viser
 from viser.transforms import SO3
 
-from nerf_lightning.cameras import Cameras, Rays, focus_point, upward
+from nerf_lightning.cameras import Cameras, Rays, pivot_of, upward
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.frame import CHANNELS
 from nerf_lightning.renderer.renderer import NAMED
@@ -222,7 +222,7 @@ class FieldPage(Page):
 
 def home_of(orbit: Cameras) -> tuple[Viewpoint, float]:
     """The first view of an orbit, as a viewer's camera, and its distance from the subject."""
-    focus = focus_point(orbit.c2w)
+    focus = pivot_of(orbit)
     up = upward(orbit)
     distance = float((orbit.centres - focus).norm(dim=1).mean())
     fov = 2 * math.atan(orbit.height / (2 * float(orbit.K[0, 1, 1])))

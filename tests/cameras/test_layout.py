@@ -13,7 +13,7 @@ EVERY = [
     ("half a ring", ring(yaw=10, degrees=180), Layout.INWARD),
     ("dome", dome(), Layout.INWARD),
     *((f"forward {k}", forward(k), Layout.FORWARD) for k in (-0.3, -0.1, 0.0, 0.1, 0.3)),
-    ("one", ring(1), Layout.FORWARD),
+    ("one", ring(1), Layout.PAN),
     ("pure pan", pan(), Layout.PAN),
     ("half a pure pan", pan(degrees=180), Layout.PAN),
     *((f"pan {seed}", pan(0.02, seed=seed), Layout.PAN) for seed in range(3)),

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from nerf_lightning.cameras import Cameras, orbit_around, spiral_like
+from nerf_lightning.cameras import Cameras, orbit_around, resample_path, spiral_like
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
-from nerf_lightning.render.route import along, find_route, read_path
+from nerf_lightning.render.path_file import read_path
+from nerf_lightning.render.route import find_route
 
 UP = torch.tensor([0.0, 0.6, 0.8])
 CENTRE = torch.tensor([1.0, -2.0, 0.5])
@@ -22,7 +24,7 @@ def circle(frames: int = 12, elevation: float = 0.5) -> Cameras:
 
 
 def test_more_frames_stand_between_those_of_the_path():
-    path, fine = circle(12), along(circle(12), 24, closed=True)
+    path, fine = circle(12), resample_path(circle(12), 24, closed=True)
     torch.testing.assert_close(fine.c2w[::2], path.c2w, atol=1e-5, rtol=0)
     torch.testing.assert_close(fine.K, K.repeat(24, 1, 1))
     expected = circle(24).c2w
@@ -33,10 +35,10 @@ def test_more_frames_stand_between_those_of_the_path():
 
 def test_an_open_path_keeps_its_ends_and_fewer_frames_are_spread_over_it():
     path = circle(4)
-    fine = along(path, 9, closed=False)
+    fine = resample_path(path, 9, closed=False)
     torch.testing.assert_close(fine.c2w[[0, -1]], path.c2w[[0, -1]], atol=1e-6, rtol=0)
-    assert len(along(path[:1], 5, closed=True)) == 1
-    assert torch.equal(along(circle(12), 4, closed=True).c2w, circle(12).c2w[torch.tensor([1, 4, 7, 10])])
+    assert len(resample_path(path[:1], 5, closed=True)) == 1
+    assert torch.equal(resample_path(circle(12), 4, closed=True).c2w, circle(12).c2w[torch.tensor([1, 4, 7, 10])])
 
 
 @pytest.mark.parametrize("elevation", [0.0, 0.5, -0.3])
@@ -74,7 +76,7 @@ def test_own_files(tmp_path: Path):
     path = circle(3)
     own = {"width": 16, "height": 12, "K": K.tolist(), "c2w": path.c2w.tolist()}
     (tmp_path / "own.json").write_text(json.dumps(own))
-    read = read_path(tmp_path / "own.json")
+    read = read_path(tmp_path / "own.json", path, torch.eye(4))
     torch.testing.assert_close(read.c2w, path.c2w)
     torch.testing.assert_close(read.K, path.K)
     flip = torch.diag(torch.tensor([1.0, -1, -1, 1]))
@@ -84,9 +86,49 @@ def test_own_files(tmp_path: Path):
     ]
     theirs = {"render_width": 16, "render_height": 12, "camera_path": views}
     (tmp_path / "theirs.json").write_text(json.dumps(theirs))
-    read = read_path(tmp_path / "theirs.json")
+    read = read_path(tmp_path / "theirs.json", path, torch.eye(4))
     torch.testing.assert_close(read.c2w, path.c2w)
     torch.testing.assert_close(read.K, path.K)
+
+
+def test_the_frame_of_a_path(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """The file's frame is that of the run, turned, three times as large and shifted."""
+    path, to_source = circle(5), torch.eye(4)
+    to_source[:3, :3] = 3 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    to_source[:3, 3] = torch.tensor([10.0, -20, 30])
+    in_file = to_source @ path.c2w
+    in_file[:, :3, :3] /= 3
+    fov = math.degrees(2 * math.atan(6 / 50))
+    flip = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    theirs = [{"camera_to_world": (pose @ flip).flatten().tolist(), "fov": fov} for pose in in_file]
+    cycled = in_file[:, [1, 2, 0]].double()  # instant-ngp: (x, y, z) becomes 0.33 (y, z, x) + 0.5
+    R = Rotation.from_matrix(cycled[:, :, :3].numpy()).as_quat()
+    ngp = [
+        {"R": turn.tolist(), "T": (0.33 * place + 0.5).tolist(), "fov": fov}
+        for turn, place in zip(R, cycled[:, :, 3], strict=True)
+    ]
+    own = {"width": 16, "height": 12, "K": K.tolist(), "c2w": in_file.tolist()}
+    for name, content in {
+        "nerfstudio": {"render_width": 16, "render_height": 12, "camera_path": theirs},
+        "ngp": {"path": ngp, "time": 1.0},
+        "own": own,
+    }.items():
+        file = tmp_path / f"{name}.json"
+        file.write_text(json.dumps(content))
+        frame = "file" if name == "own" else "auto"
+        read = find_route(str(file), None, path, None, to_source, frame).cameras
+        torch.testing.assert_close(read.c2w, path.c2w, atol=1e-4, rtol=0)
+        torch.testing.assert_close(read.K, path.K, atol=1e-3, rtol=0)
+        assert (read.width, read.height) == (16, 12)
+        assert "in the world frame of the photos' own file (path_frame=run takes the other)" in capsys.readouterr().out
+        read = find_route(str(file), None, path, None, to_source, "run").cameras
+        torch.testing.assert_close(read.c2w, in_file, atol=1e-4, rtol=0)
+        assert "in the run's frame" in capsys.readouterr().out
+    torch.testing.assert_close(find_route(str(file), None, path, None, to_source).cameras.c2w, in_file)
+    with pytest.raises(InputError, match="path_frame: found 'file' with path=orbit"):
+        find_route("orbit", None, path, None, to_source, "file")
+    with pytest.raises(InputError, match="path_frame: found 'world', expected one of auto, run, file"):
+        find_route("ngp.json", None, path, None, to_source, "world")
 
 
 THEIRS = (
@@ -111,13 +153,16 @@ PATH = '{"width": 4, "height": 4, "K": [[%s,0,2],[0,1,2],[0,0,1]], "c2w": %s}'
         ('{"render_width": 1e999, "render_height": 4, "camera_path": []}', "cannot convert float infinity"),
         (THEIRS % (4, 0), "division by zero"),
         (THEIRS % (10**30, 90), "path.json: found"),
+        (PATH % (1, "[[-1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "no rotation"),
+        ('{"path": [{"R": [0,0,0,0], "T": [0,0,0], "fov": 50}]}', "zero norm"),
+        ('{"path": []}', "expected width"),
         (PATH % (1, "[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]"), "no rotation"),
     ],
 )
 def test_what_is_no_path_is_refused(content: str, message: str, tmp_path: Path):
     (tmp_path / "path.json").write_text(content)
     with pytest.raises(InputError, match=message):
-        read_path(tmp_path / "path.json")
+        read_path(tmp_path / "path.json", circle(), torch.eye(4))
 
 
 def test_other_words_are_refused():

@@ -1,0 +1,129 @@
+"""Paths stay where photos were taken, whatever the layout, and never hold a degenerate pose."""
+
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from nerf_lightning.cameras import Cameras, classify_layout, orbit_like, pivot_of, spiral_like
+from nerf_lightning.cameras.paths import rigid, walking_order
+from tests.cameras.captures import CENTRE, RADIUS, UP, corridor, dome, forward, pan, ring, walk
+
+CAPTURES = {
+    "ring": ring(),
+    "framed to one side": ring(yaw=20),
+    "arc": ring(degrees=150),
+    "short arc": ring(degrees=70),
+    "dome": dome(),
+    "converging": forward(-0.3),
+    "parallel": forward(0.0),
+    "diverging": forward(0.2),
+    "pan": pan(),
+    "noisy pan": pan(0.02),
+    "half a pan": pan(degrees=150),
+    "walk": walk(),
+    "corridor": corridor(),
+    "one": ring(1),
+    "two": ring(2),
+    "four": ring(4),
+    "all in one pose": ring(1).repeat(5, 1, 1),
+}
+
+
+def cameras_at(c2w: torch.Tensor) -> Cameras:
+    return Cameras.of_size(torch.eye(3).repeat(len(c2w), 1, 1) * 20, c2w.float(), 32, 24)
+
+
+@pytest.mark.parametrize("frames", [1, 7, 60])
+@pytest.mark.parametrize("c2w", CAPTURES.values(), ids=CAPTURES.keys())
+def test_paths_stay_where_photos_were_taken(c2w: torch.Tensor, frames: int):
+    cameras = cameras_at(c2w)
+    orbit = orbit_like(cameras, frames)
+    spiral = spiral_like(orbit, frames)
+    for path in (orbit, spiral):
+        assert len(path) == frames
+        rigid(path.c2w)
+        assert (path.c2w[:, :3, 1] @ UP.float()).max() < 0.1, "upright"
+    apart = torch.cdist(orbit.centres, cameras.centres)
+    spacing = torch.cdist(cameras.centres, cameras.centres).fill_diagonal_(math.inf).amin(1)
+    size = float((cameras.centres - cameras.centres.mean(0)).norm(dim=1).max())
+    limit = max(0.35 * size, float(spacing[spacing < math.inf].max()) if len(c2w) > 1 else 0.0)
+    assert float(apart.amin(1).max()) <= limit + 1e-3, "no view far from all photos"
+    # Each view looks within 45 degrees of a photo's direction.
+    assert (orbit.c2w[:, :3, 2] @ cameras.c2w[:, :3, 2].T).amax(1).min() > 0.7
+    if frames == 60:
+        step = (orbit.centres.roll(-1, 0) - orbit.centres).norm(dim=1)
+        assert float(step.max()) < 0.25 * max(size, 1e-3), "no jump, from the last to the first neither"
+    pivot = pivot_of(orbit)
+    assert pivot.isfinite().all() and float((pivot - orbit.centres[0]).norm()) > 1e-3
+
+
+@pytest.mark.parametrize("yaw", [0, 20])
+def test_a_ring_gives_a_full_turn_that_looks_at_the_middle(yaw: int):
+    orbit = orbit_like(cameras_at(ring(yaw=yaw)), 8)
+    offset = orbit.centres - CENTRE.float()
+    torch.testing.assert_close(offset.norm(dim=1), torch.full((8,), RADIUS), atol=0.05, rtol=0)
+    torch.testing.assert_close(orbit.c2w[:, :3, 2], -normalize(offset, dim=1), atol=0.05, rtol=0)
+    turn = torch.atan2(offset[:, 1], offset[:, 0])
+    steps = torch.remainder(turn.roll(-1) - turn, 2 * math.pi)
+    torch.testing.assert_close(steps, torch.full((8,), math.pi / 4), atol=0.05, rtol=0)
+    torch.testing.assert_close(pivot_of(orbit), CENTRE.float(), atol=0.05, rtol=0)
+
+
+def test_an_arc_gives_a_swing_between_its_ends():
+    orbit = orbit_like(cameras_at(ring(24, degrees=150)), 60)
+    offset = orbit.centres - CENTRE.float()
+    turn = torch.atan2(offset[:, 1], offset[:, 0]).rad2deg()
+    assert turn.min() == pytest.approx(0, abs=1) and turn.max() == pytest.approx(150 * 23 / 24, abs=1)
+    torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.02, rtol=0)
+
+
+def test_a_stray_camera_does_not_turn_an_arc_into_a_full_turn():
+    c2w = torch.cat([ring(40, degrees=150), ring(8)[6:7]])  # at 270 degrees
+    offset = orbit_like(cameras_at(c2w), 60).centres - CENTRE.float()
+    turn = torch.atan2(offset[:, 1], offset[:, 0]).rad2deg()
+    assert turn.min() > -15 and turn.max() < 165
+
+
+def test_half_a_pan_turns_to_and_fro():
+    orbit = orbit_like(cameras_at(pan(degrees=150)), 60)
+    turn = torch.atan2(orbit.c2w[:, 1, 2], orbit.c2w[:, 0, 2]).rad2deg()
+    assert turn.min() == pytest.approx(0, abs=1) and turn.max() == pytest.approx(150 * 23 / 24, abs=1)
+    assert float((orbit.centres - CENTRE.float()).abs().max()) < 1e-6
+
+
+def test_a_shuffled_walk_is_walked_in_its_own_order():
+    shuffled = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+    assert walking_order(walk()[:, :3, 3]) == list(range(40))
+    order = shuffled[torch.tensor(walking_order(walk()[shuffled][:, :3, 3]))]
+    assert torch.equal(order, torch.arange(40)) or torch.equal(order, torch.arange(40).flip(0))
+    path = orbit_like(cameras_at(walk()[shuffled]), 61).centres
+    assert float((path[30] - walk()[0, :3, 3]).norm()) < 1 or float((path[30] - walk()[-1, :3, 3]).norm()) < 1
+    torch.testing.assert_close(path[1:31], path[31:].flip(0), atol=1e-1, rtol=0)  # there and back
+
+
+@pytest.mark.parametrize("name", ["ring", "short arc", "diverging", "pan", "walk"])
+def test_an_orbit_has_the_layout_of_its_cameras(name: str):
+    layout = classify_layout(CAPTURES[name])
+    assert classify_layout(orbit_like(cameras_at(CAPTURES[name])).c2w) == layout
+
+
+def test_a_spiral_on_one_side_winds_in_to_the_middle_of_its_loop():
+    orbit = orbit_like(cameras_at(ring(24, degrees=150)), 60)
+    spiral = spiral_like(orbit, 60)
+    offset, middle = spiral.centres - CENTRE.float(), normalize(orbit.centres.mean(0) - CENTRE.float(), dim=0)
+    torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.05, rtol=0)
+    away = torch.acos(normalize(offset, dim=1) @ middle).rad2deg()
+    assert away[:8].max() > 50 and away[25:36].max() < 25
+
+
+def test_degenerate_paths_are_not_handed_on():
+    for pose in (
+        torch.zeros(4, 4),
+        torch.eye(4) * torch.nan,
+        2 * torch.eye(4),
+        torch.diag(torch.tensor([-1.0, 1, 1, 1])),
+    ):
+        with pytest.raises(AssertionError):
+            rigid(pose[None])
