@@ -70,7 +70,8 @@ def orbit_like(
         build = turn_around if layout == Layout.INWARD else loop_before
         poses = build(c2w, centre.double(), up, frames)
     typical = typical_view(cameras)
-    K, (width, height) = cameras.K[typical], cameras.size(typical)
+    one = cameras[typical].as_pinholes()  # photos of all directions have no view to repeat
+    K, (width, height) = one.K[0], one.size(0)
     if int(sides[typical]) % 2 == 1:  # it lies on its side
         K, width, height = on_its_side(K, width, height), height, width
     return Cameras.of_size(K.repeat(frames, 1, 1), rigid(poses).to(cameras.c2w), width, height)

@@ -8,11 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from nerf_lightning.cameras import Bounds, Cameras, focus_point, orbit_around
-from nerf_lightning.dataset.extent import viewing_distance, visible_cube
+from nerf_lightning.cameras import Bounds, Cameras, orbit_around
+from nerf_lightning.dataset.extent import visible_cube
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.dataset.lens import Lens, Rectification, rectify
 from nerf_lightning.dataset.posed import NEAR
+from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
@@ -73,7 +74,8 @@ def pack(
     if not held.any():
         held[len(paths) // 2] = True
     train = Views.of(images[~held], cameras[~held])
-    centre = focus_point(train.cameras.c2w)
+    region = find_region(train.cameras.c2w)
+    centre = region.centre.float()
     distances = (train.cameras.centres - centre).norm(dim=1)
     if orbit is not None:
         through = poses[[path.name for path in paths].index(orbit), :3, 3]
@@ -85,7 +87,7 @@ def pack(
     radius = float(offset.norm())
     elevation = float(torch.asin((offset[2] / max(radius, 1e-9)).clamp(-0.99, 0.99)))
     circle = orbit_around(centre, torch.tensor([0.0, 0.0, 1.0]), radius, elevation, FRAMES)
-    near = NEAR * min(viewing_distance(train.cameras.c2w, centre), float(distances.min()))
+    near = NEAR * min(region.unit, float(distances.min()))
     cube = torch.from_numpy(visible_cube(train.cameras)).float()
     aabb = centre + SUBJECT * (cube - centre)
     return Scene(

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
-from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, axes_meet, focus_point
+from nerf_lightning.cameras import Bounds, Cameras
+from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.views import Views
 
 GRID = 48
@@ -23,9 +23,6 @@ FLAT = 0.75
 """Least share of the borders' pixels that have the background's colour; the rest is content that leaves the picture."""
 AGREEMENT = 0.95
 """Share of the views seeing a voxel that must find it in the silhouette; the rest forgives dark-on-dark pixels."""
-
-SPOT = 1e-5
-"""Cameras nearer than this share of their coordinates stand on one spot."""
 
 
 def estimate_bounds(
@@ -93,22 +90,12 @@ def border_colour(views: Views) -> tuple[float, float, float] | None:
     return red, green, blue
 
 
-def viewing_distance(c2w: Float[Tensor, "V 4 4"], centre: Float[Tensor, "3"]) -> float:
-    """Median distance of the cameras to `centre`, in the scene's unit; 1 where all stand on that very spot.
-
-    What is near in a small unit may be what all look at; else it is rounding.
-    """
-    distance, apart = float((c2w[:, :3, 3] - centre).norm(dim=-1).median()), SPOT * float(centre.norm())
-    return distance if distance > SPOT + apart or (distance > apart and axes_meet(c2w)) else 1.0
-
-
 def visible_cube(cameras: Cameras) -> Float[np.ndarray, "2 3"]:
-    """A cube around the point the cameras look at, as wide as they see there, in world units."""
-    centre = focus_point(cameras.c2w)
-    distance = viewing_distance(cameras.c2w, centre)
+    """A cube around the region that the cameras show, as wide as they see there, in world units."""
+    region = find_region(cameras.c2w)
     tangent = float((cameras.sizes / cameras.K[:, [0, 1], [0, 1]].cpu()).max()) / 2
-    half = distance * tangent
-    return np.stack([centre.numpy() - half, centre.numpy() + half]).astype(np.float64)
+    centre, half = region.centre.cpu().numpy(), region.unit * tangent
+    return np.stack([centre - half, centre + half])
 
 
 @dataclass(frozen=True)

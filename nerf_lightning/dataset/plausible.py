@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from nerf_lightning.cameras import Bounds, Cameras, axes_meet, focus_point
+from nerf_lightning.cameras import Bounds, Cameras, Layout, axes_meet, classify_layout, focus_point, gaze_point
 from nerf_lightning.dataset.extent import MAX_VIEWS, border_colour, sightings, silhouettes, visible_cube, visual_hull
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
@@ -29,6 +30,11 @@ from all sides.
 """
 IN_BOX = 0.9
 """Coverage inside the box below which content lies outside it, provided the hull without the box fits well."""
+AROUND, OFF_CENTRE = 0.35, 0.5
+"""Mean of the directions to cameras up to which they stand all around, and the largest offset of the box, as a share of their
+distance."""
+FAR_OFF = 8.0
+"""Largest distance of cameras from the box's centre, in its half-sizes, in an unbounded scene."""
 CUT = 0.02
 """Mean share of a ray's way through the box that near or far may cut off."""
 
@@ -57,7 +63,7 @@ def check_scene(scene: Scene, corrected: bool = False) -> list[Doubt]:
         InputError: no method can learn anything from the data.
     """
     doubts = []
-    for check in (looking_away, border, misfits, repeats, overlap, cut_short):
+    for check in (looking_away, border, misfits, repeats, overlap, cut_short, off_centre):
         for doubt in check(scene):
             if doubt.hopeless and not (corrected and doubt.inexact):
                 expected = "photos and poses that fit each other"
@@ -115,6 +121,25 @@ def misfits(scene: Scene) -> Iterator[Doubt]:
             " The poses may belong to other photos, be turned, or be inexact"
         )
         yield Doubt(text, hopeless=explained < FITS, inexact=True, far_off=explained < FITS_BADLY)
+
+
+def off_centre(scene: Scene) -> Iterator[Doubt]:
+    """Cameras that stand far off the middle of the box, which holds the detail."""
+    cameras, middle = scene.train.cameras, scene.bounds.aabb.mean(0)
+    distance = float((cameras.centres - middle).norm(dim=1).median())
+    off = float((cameras.centres - middle).mean(0)[:2].norm())
+    layout = classify_layout(cameras.c2w)
+    around = float(normalize(cameras.centres - gaze_point(cameras.c2w).float(), dim=1)[:, :2].mean(0).norm())
+    if layout == Layout.INWARD and around < AROUND and off > OFF_CENTRE * distance:
+        yield Doubt(
+            f"cameras stand around a place {off:.2g} beside the box's centre, at a distance of {distance:.2g}: the box"
+            " misses what they look at"
+        )
+    elif scene.bounds.unbounded and distance > FAR_OFF * scene.bounds.longest:
+        yield Doubt(
+            f"cameras stand {distance / scene.bounds.longest:.2g} times the box's half-size off its centre: what they see is"
+            " small in the box, or beside it"
+        )
 
 
 def hull_coverage(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Cameras, bounds: Bounds) -> float:

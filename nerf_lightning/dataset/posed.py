@@ -15,17 +15,18 @@ from torch import Tensor
 from nerf_lightning.cameras import (
     Bounds,
     Cameras,
-    axes_meet,
-    focus_point,
+    Projection,
     held,
     in_other_frame,
     orbit_like,
     transform,
     turn_upright,
 )
-from nerf_lightning.dataset.extent import estimate_bounds, viewing_distance
+from nerf_lightning.dataset.extent import estimate_bounds
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.kind import apply_alpha, check_visible, decide_kind
+from nerf_lightning.dataset.matches import match_points
+from nerf_lightning.dataset.region import Region, find_region
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import Reading, Shot, read_shots
 from nerf_lightning.dataset.views import Views
@@ -151,9 +152,9 @@ def assemble_scene(
 ) -> Scene:
     """Places read photos in one frame and decides what kind of scene they show, the same for every format.
 
-    The world is moved to what the training cameras look at, turned so that z points up (see `cameras.held`), and scaled so
-    that their median distance to that place is 1; `to_source` leads back. A bounded scene with `hints.keep_frame` stays where
-    it is instead. Unbounded scenes have the cube [-1, 1]^3 for a box.
+    The world is moved to the region that the training photos show (see `find_region`), turned so that z points up (see
+    `cameras.held`), and scaled so that this region is the cube [-1, 1]^3, the box of an unbounded scene; `to_source` leads
+    back. A bounded scene with `hints.keep_frame` stays where it is instead.
     """
     check_visible(source, train.views)
     checks.told_apart(source, train.c2w)
@@ -162,14 +163,19 @@ def assemble_scene(
         kind = replace(kind, bounded=not hints.bounds.unbounded, reason="the file states a box")
     if hints.background is not None:
         kind = replace(kind, background=hints.background)
-    text = "%s: taken as %s, since %s (dataset.bounded overrides)"
-    log.info(text, name, "bounded" if kind.bounded else "unbounded", kind.reason)
+    poses = viewing_poses(train.views.cameras, train.c2w)
+    points = None if hints.points is None else torch.from_numpy(hints.points)
+    region = find_region(poses, points, lambda: match_points(train.views, train.c2w))
+    text = "%s: taken as %s, since %s (dataset.bounded overrides); %s cameras"
+    log.info(text, name, "bounded" if kind.bounded else "unbounded", kind.reason, region.layout)
+    if not region.known and not kind.bounded:
+        log.warning("%s: %s", source, region.doubt)
     splits = {"train": train, "val": val} | ({} if test is None else {"test": test})
     focal = train.views.cameras.K[:, 0, 0].double().numpy()
     if hints.bounds is not None or (hints.keep_frame and kind.bounded and checks.is_precise(train.c2w, focal)):
         to_source = torch.eye(4, dtype=torch.float64)
     else:
-        _, to_source = framed(torch.from_numpy(train.c2w), torch.arange(len(train.c2w)))
+        _, to_source = normalize_poses(torch.from_numpy(train.c2w), torch.arange(len(train.c2w)), region)
     from_source = torch.linalg.inv(to_source)
 
     def move(cameras: Cameras, c2w: Float[np.ndarray, "V 4 4"]) -> Cameras:
@@ -188,8 +194,9 @@ def assemble_scene(
     elif kind.bounded:
         bounds = estimate_bounds(views, kind.background, near, far)
     else:
-        bounds = replace(unbounded_box(views, to_source, hints), far=far)
+        bounds = replace(unbounded_box(views, from_source, hints, region), far=far)
         bounds = bounds if near is None else replace(bounds, near=near)
+    centre = transform(from_source, region.centre.double()).float()
     path = None if hints.path is None else move(hints.path, hints.path.c2w.double().numpy())
     return Scene(
         name=name.lower(),
@@ -197,29 +204,37 @@ def assemble_scene(
         train=views,
         val=placed["val"],
         test=placed.get("test"),
-        orbit=orbit_like(views.cameras) if path is None else path,
+        orbit=orbit_like(views.cameras, layout=region.layout, centre=centre) if path is None else path,
         bounds=bounds,
         background=kind.background,
         to_source=to_source if hints.to_source is None else torch.from_numpy(hints.to_source) @ to_source,
-        kind=kind.reason,
+        kind=f"{kind.reason}; {region.layout} cameras",
+        points=None if region.points is None else transform(from_source, region.points).float(),
     )
 
 
-def unbounded_box(views: Views, to_source: Float[Tensor, "4 4"], hints: Hints) -> Bounds:
+def unbounded_box(views: Views, from_source: Float[Tensor, "4 4"], hints: Hints, region: Region) -> Bounds:
     """The cube [-1, 1]^3, and where sampling starts: before the nearest content that is known, or what cameras look at."""
-    known = [] if hints.nearest is None else [hints.nearest * float(torch.linalg.det(to_source[:3, :3])) ** (-1 / 3)]
+    known = [] if hints.nearest is None else [hints.nearest * float(torch.linalg.det(from_source[:3, :3])) ** (1 / 3)]
     if hints.points is not None and len(hints.points):
-        points = transform(torch.linalg.inv(to_source), torch.from_numpy(hints.points)).float()
-        known.append(nearest_point(points, views))
+        known.append(nearest_point(transform(from_source, torch.from_numpy(hints.points)).float(), views))
     starts = [CLEAR * distance for distance in known]
-    if axes_meet(views.cameras.c2w):
+    if region.has_subject:
         starts.append(NEAR * nearest_camera(views))
-    near = min(starts, default=None)
-    return Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), unbounded=True, near=near)
+    return Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3]), unbounded=True, near=min(starts, default=None))
+
+
+def viewing_poses(cameras: Cameras, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor, "W 4 4"]:
+    """Poses whose axes say where cameras look: of a photo of all directions, four around its vertical axis."""
+    poses = torch.from_numpy(c2w)
+    if cameras.lenses is None or not bool((cameras.lenses.projection == Projection.EQUIRECTANGULAR).any()):
+        return poses
+    quarter = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    return torch.cat([poses @ torch.linalg.matrix_power(quarter, turns) for turns in range(4)])
 
 
 def nearest_camera(views: Views) -> float:
-    """Distance of the nearest camera to what all look at, at most the usual one, in the scene's unit."""
+    """Distance of the nearest camera to the region's centre, at most the usual one, in the scene's unit."""
     return min(1.0, float(views.cameras.centres.norm(dim=1).min()))
 
 
@@ -245,16 +260,16 @@ def select_known(views: Views, val: list[int], shots: Sequence[Shot]) -> list[in
     return kept
 
 
-def framed(c2w: Float[Tensor, "V 4 4"], train: Int[Tensor, "T"]) -> tuple[Float[Tensor, "V 4 4"], Float[Tensor, "4 4"]]:
-    """Poses in a frame centred on what the training cameras look at, z up, at a median distance of 1; and the similarity
+def normalize_poses(
+    c2w: Float[Tensor, "V 4 4"], train: Int[Tensor, "T"], region: Region
+) -> tuple[Float[Tensor, "V 4 4"], Float[Tensor, "4 4"]]:
+    """Poses in a frame centred on a region, in its unit, with what is up in the training photos along z; and the similarity
     back."""
-    centre = focus_point(c2w[train])
-    scale = viewing_distance(c2w[train], centre)
     turn = turn_upright(held(c2w[train])[0])
     moved = c2w.clone()
     moved[:, :3, :3] = turn @ c2w[:, :3, :3]
-    moved[:, :3, 3] = (c2w[:, :3, 3] - centre) @ turn.mT / scale
+    moved[:, :3, 3] = (c2w[:, :3, 3] - region.centre) @ turn.mT / region.unit
     to_source = torch.eye(4, dtype=torch.float64)
-    to_source[:3, :3] = scale * turn.mT
-    to_source[:3, 3] = centre
+    to_source[:3, :3] = region.unit * turn.mT
+    to_source[:3, 3] = region.centre
     return moved, to_source

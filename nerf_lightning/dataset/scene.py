@@ -36,7 +36,9 @@ class Scene:
     test: Views | None = None
     """Held out, and measured on at the end alone, where a format has both."""
     kind: str = ""
-    """Why the scene is bounded or unbounded, in a few words."""
+    """Why the scene is bounded or unbounded, in a few words, and how its cameras are laid out."""
+    points: Float[Tensor, "P 3"] | None = None
+    """Some places on surfaces, in this frame, where a file brings them or photos were matched: for maps."""
 
     @property
     def resolution(self) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""A map of a scene: the cameras, the tags, and its box and orbit."""
+"""A map of a scene: the cameras, the tags, known points, and its box and orbit."""
 
 from collections.abc import Sequence
 
@@ -17,6 +17,7 @@ FRUSTUM = 0.06
 EDGES = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
 NUMBERS = 120
 """Most cameras that are numbered; of more, every N-th is."""
+MAX_POINTS = 5000
 WIDE, HIGH = 13.0, 17.0
 """Largest size of the map, inches."""
 
@@ -61,6 +62,9 @@ def camera_map(
         axes.set_title(name, loc="left")
         axes.grid(color="0.92")
         axes.set_axisbelow(True)
+        if scene.points is not None:
+            some = scene.points[:: -(-len(scene.points) // MAX_POINTS)].numpy()
+            axes.plot(some[:, 0], some[:, up], ".", color="0.6", markersize=1.5, zorder=0.5)
         _draw(axes, [0, up], frusta, tags, orbit, box)
     beside.set_xlabel(f"x, {unit}")
     for tag, corners in tags.items():
@@ -71,6 +75,8 @@ def camera_map(
         Line2D([], [], color=GREY, linestyle="--", label="box of the scene"),
         Line2D([], [], color=ORANGE, linewidth=2, label="orbit"),
     ]
+    if scene.points is not None:
+        key.append(Line2D([], [], color="0.6", marker=".", linestyle="", label="known points"))
     if tags:
         label = "tags, with their ids"
         key[1:1] = [Line2D([], [], color="black", marker="s", markerfacecolor="0.8", linestyle="", label=label)]

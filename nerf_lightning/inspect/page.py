@@ -28,13 +28,14 @@ img.map {{ max-width: 100%; }}
 </head>
 <body>
 <h1>{name}</h1>
+<h2>Cameras</h2>
+<img class="map" alt="cameras from above and from the side" src="{cameras}">
+<h2>Scene</h2>
 <table>{facts}</table>
 <h2>What to look after</h2>
 {doubts}
 <h2>Photos</h2>
 <div class="sheet">{sheet}</div>
-<h2>Cameras</h2>
-<img class="map" alt="cameras from above and from the side" src="{cameras}">
 </body>
 </html>
 """

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from nerf_lightning.cameras import Cameras, in_other_frame
+from nerf_lightning.cameras import Cameras, in_other_frame, transform
 from nerf_lightning.config.build import SceneFrame, build_data, target_of
 from nerf_lightning.config.literal import escape
 from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
@@ -46,9 +46,9 @@ def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
         for views in (scene.train, scene.val, scene.test)
     )
     assert train is not None and val is not None  # every scene has them
-    return replace(
-        scene, train=train, val=val, test=test, orbit=placed(scene.orbit), bounds=frame.bounds, to_source=to_source
-    )
+    points = None if scene.points is None else transform(moved, scene.points.double()).float()
+    scene = replace(scene, train=train, val=val, test=test, orbit=placed(scene.orbit), points=points)
+    return replace(scene, bounds=frame.bounds, to_source=to_source)
 
 
 def seen_by_corrected(scene: Scene, content: Mapping[str, Any]) -> Scene:

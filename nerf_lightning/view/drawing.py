@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, Rays, focus_point, upward
-from nerf_lightning.dataset.extent import viewing_distance
+from nerf_lightning.cameras import Bounds, Cameras, Rays, upward
+from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
@@ -146,12 +146,12 @@ def path_segments(cameras: Cameras) -> Float[np.ndarray, "N 2 3"]:
 
 def scene_scale(scene: Scene) -> float:
     """The cameras' distance to what they look at, in the scene's unit."""
-    return viewing_distance(scene.train.cameras.c2w, focus_point(scene.train.cameras.c2w))
+    return find_region(scene.train.cameras.c2w).unit
 
 
 def overview(scene: Scene) -> Viewpoint:
     """A view of all cameras and the bounds: from behind the orbit's start, upright as the orbit's pictures."""
-    focus = focus_point(scene.train.cameras.c2w)
+    focus = find_region(scene.train.cameras.c2w).centre.float()
     up = upward(scene.orbit)
     if float(up.norm()) < 0.5:  # a path that rolls over: no direction is up
         up = torch.tensor([0.0, 0.0, 1.0])

@@ -12,7 +12,7 @@ from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset import Scene, Views, load_npz, plausible, save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.extent import border_colour
-from nerf_lightning.dataset.plausible import check_scene
+from nerf_lightning.dataset.plausible import check_scene, off_centre
 from nerf_lightning.errors import InputError
 from nerf_lightning.stability.damage import posed, shuffled, turned_to_opengl
 from nerf_lightning.stability.toys import MARBLE, PILE, ROD, toy
@@ -145,3 +145,13 @@ def test_the_border_tells_the_background(pile: Scene, tmp_path: Path):
     assert arrays.pop("background").tolist() == [1, 1, 1]
     np.savez(path, **arrays)
     assert load_npz(path).background == WHITE, "also where the file does not say"
+
+
+def test_a_box_beside_what_cameras_look_at_is_told(pile: Scene):
+    aside = replace(pile.bounds, aabb=pile.bounds.aabb + torch.tensor([3.0, 0, 0]))
+    (text,) = (doubt.text for doubt in off_centre(replace(pile, bounds=aside)))
+    assert "cameras stand around a place 3 beside the box's centre" in text
+    tiny = replace(pile.bounds, aabb=0.1 * pile.bounds.aabb, unbounded=True)
+    (text,) = (doubt.text for doubt in off_centre(replace(pile, bounds=tiny)))
+    assert "times the box's half-size off its centre" in text
+    assert not list(off_centre(replace(pile, bounds=replace(pile.bounds, unbounded=True))))

@@ -8,10 +8,11 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nerf_lightning.cameras import Cameras, focus_point, orbit_around
+from nerf_lightning.cameras import Cameras, orbit_around
 from nerf_lightning.dataset import Reading, Views, open_scene
 from nerf_lightning.dataset.formats.exif import stated_exposure
-from nerf_lightning.dataset.posed import framed
+from nerf_lightning.dataset.posed import normalize_poses
+from nerf_lightning.dataset.region import find_region
 from tests.dataset.colmap_files import photos, write_transforms
 from tests.dataset.exif import tags
 
@@ -26,7 +27,7 @@ def test_any_frame_is_turned_upright(some: slice):
     moved[:3, 3] = torch.tensor([5.0, -3.0, 2.0])
     elsewhere = moved @ c2w
     elsewhere[:, :3, 3] *= 7
-    found, to_source = framed(elsewhere, torch.arange(len(c2w)))
+    found, to_source = normalize_poses(elsewhere, torch.arange(len(c2w)), find_region(elsewhere))
     torch.testing.assert_close(found[:, 2, 3], c2w[:, 2, 3] / 2, atol=1e-5, rtol=0)
     torch.testing.assert_close(found[:, :3, 3].norm(dim=1), torch.ones(len(c2w)).double(), atol=1e-5, rtol=0)
     torch.testing.assert_close(found[:, 2, 2], c2w[:, 2, 2], atol=1e-5, rtol=0)  # they look down as before
@@ -39,8 +40,9 @@ def test_held_out_photos_do_not_move_the_frame():
     far = c2w.clone()
     far[::4, :3, 3] += 30
     train = torch.tensor([i for i in range(12) if i % 4])
-    torch.testing.assert_close(framed(far, train)[1], framed(c2w, train)[1])
-    torch.testing.assert_close(focus_point(framed(far, train)[0][train]), torch.zeros(3).double(), atol=1e-6, rtol=0)
+    found, to_source = normalize_poses(far, train, find_region(far[train]))
+    torch.testing.assert_close(to_source, normalize_poses(c2w, train, find_region(c2w[train]))[1])
+    torch.testing.assert_close(find_region(found[train]).centre, torch.zeros(3).double(), atol=1e-6, rtol=0)
 
 
 def test_a_walk_along_a_wall_is_sampled_from_the_lens_on(tmp_path: Path):

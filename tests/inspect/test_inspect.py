@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from nerf_lightning.dataset import Views, open_scene
+from nerf_lightning.drawing.camera_map import camera_map
 from nerf_lightning.inspect.quality import judge, look_at, sharpness
 from nerf_lightning.inspect.verb import inspect
 from nerf_lightning.stability.toys import PILE, around, photograph
@@ -85,9 +86,32 @@ def test_the_page_says_everything_and_opens_without_a_network(
     text = page.read_text(encoding="utf-8")
     assert "14 to train on, 2 held out" in text and "16 of 64x64" in text and "0002.png" in text
     assert "1 photos have no place in the model, 9999.png" in text and "<b>" not in text and "a &lt;b&gt;" in text
+    assert text.index("<h1>") < text.index("cameras from above") < text.index("<td>source") < text.index("<h2>Photos")
     assert text.count("data:image/jpeg") == 16 and "http" not in text.replace("http-equiv", "")
     out = capsys.readouterr().out
     assert "0002.png: blurred" in out and str(page) in out
+
+
+def test_the_map_shows_the_points_and_the_box(views: Views, tmp_path: Path):
+    folder = capture(tmp_path, views, {})
+    points = np.random.default_rng(0).normal(0, 0.3, (300, 3))
+    write_colmap(
+        folder / "sparse/0",
+        views.cameras.c2w.numpy(),
+        sorted(f"{i:04d}.png" for i in range(16)),
+        cameras_of(views),
+        points=points,
+    )
+    scene = open_scene(str(folder))
+    numbered = [(i, c2w) for i, c2w in enumerate(scene.train.cameras.c2w.double().numpy())]
+    figure = camera_map(numbered, scene, {})
+    assert scene.points is not None
+    above, beside = figure.axes
+    for axes, up in ((above, 1), (beside, 2)):
+        lines = [np.asarray(line.get_xydata()) for line in axes.lines]
+        assert any(len(xy) == 300 and np.allclose(xy, scene.points[:, [0, up]]) for xy in lines)
+        assert any(np.allclose(xy[[0, 2]], scene.bounds.aabb[:, [0, up]]) for xy in lines if len(xy) == 5)
+    assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "known points"
 
 
 def test_bad_input_is_one_line(verb, tmp_path: Path):

@@ -13,7 +13,8 @@ from nerf_lightning.capture.poses.geometry import inverse
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.dataset.placing.place import FEWEST, OVERLAP, place
-from nerf_lightning.dataset.posed import framed
+from nerf_lightning.dataset.posed import normalize_poses
+from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
 
@@ -46,7 +47,9 @@ def capture_without_tags(folder: Path, packing: Packing) -> tuple[list[Placed], 
     lens = _lens(model.cameras[images[names[0]].camera_id])
     last = [[0.0, 0.0, 0.0, 1.0]]
     raw = np.stack([inverse(np.concatenate([images[name].cam_from_world().matrix(), last])) for name in names])
-    placed, _ = framed(torch.from_numpy(raw), torch.arange(len(raw)))
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    region = find_region(torch.from_numpy(raw), torch.from_numpy(points))
+    placed, _ = normalize_poses(torch.from_numpy(raw), torch.arange(len(raw)), region)
     poses = dict(zip(names, placed.numpy(), strict=True))
     photos = []
     for path in paths:

@@ -1,0 +1,123 @@
+"""Points between photos of known pose: a few SIFT matches, triangulated."""
+
+import logging
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.dataset.resize import fit_size
+from nerf_lightning.dataset.views import Views
+from nerf_lightning.utils.evenly import evenly
+
+log = logging.getLogger(__name__)
+
+MAX_PAIRS, MAX_SIDE = 8, 640
+"""Pairs of photos that are matched, and the longest side at which, pixels."""
+MAX_FEATURES = 1500
+MAX_RATIO = 0.8
+"""Lowe's ratio test: largest distance to the nearest descriptor as a share of that to the second."""
+MIN_OVERLAP = 0.85
+"""Least cosine between the axes of photos that are matched."""
+MAX_ERROR = 2.0
+"""Largest reprojection error of a point, pixels of the reduced photos."""
+MIN_PARALLAX = 0.005
+"""Least angle between two rays, radians, that tells a depth; farther points are put where it would be that."""
+SUBPIXELS = 16
+
+
+def match_points(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor, "M 3"]:
+    """Triangulates matches between pairs of photos that look in nearly the same direction from different places.
+
+    A match counts where its rays meet in front of both cameras. Points too far to tell their depth are put as near as they
+    may be.
+
+    Args:
+        views: photos; the poses of their cameras do not count.
+        c2w: OpenCV camera to world, in the frame of the points.
+    """
+    local = torch.from_numpy(c2w).clone()
+    origin = local[:, :3, 3].median(0).values
+    local[:, :3, 3] -= origin
+    cameras = replace(views.cameras, c2w=local.float())
+    sizes = torch.tensor([fit_size(width, height, MAX_SIDE) for width, height in views.cameras.sizes.tolist()])
+    found = [torch.zeros(0, 3)]
+    for first, second in neighbours(local):
+        one, other = (detect_features(views.image(view), *sizes[view].tolist()) for view in (first, second))
+        if min(len(one[1]), len(other[1])) < 2:
+            continue
+        near = cv2.BFMatcher().knnMatch(one[1], other[1], k=2)
+        kept = [m for m, n in near if m.distance < MAX_RATIO * n.distance]
+        if kept:
+            pair = torch.tensor([first, second])
+            pixels = [one[0][[m.queryIdx for m in kept]], other[0][[m.trainIdx for m in kept]]]
+            found.append(triangulate(cameras[pair].resized(sizes[pair]), *pixels))
+    points = torch.cat(found)
+    log.info("%d points from matches between %d pairs of photos", len(points), len(found) - 1)
+    return points.double() + origin
+
+
+def neighbours(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
+    """Pairs of photos, spread over a capture: one each of which has the median baseline among those that look alike."""
+    axes, centres = normalize(c2w[:, :3, 2], dim=1), c2w[:, :3, 3]
+    pairs = set()
+    for view in evenly(len(c2w), MAX_PAIRS):
+        alike = axes @ axes[view]
+        alike[view] = -1
+        others = (alike >= min(MIN_OVERLAP, float(alike.max()))).nonzero()[:, 0]
+        baseline = (centres[others] - centres[view]).norm(dim=1)
+        other = int(others[baseline.argsort()[len(others) // 2]])
+        if other != view:
+            pairs.add((min(view, other), max(view, other)))
+    return sorted(pairs)
+
+
+def detect_features(
+    image: UInt8[Tensor, "H W C"], width: int, height: int
+) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 128"]]:
+    """SIFT features of a photo at a size: places as shares of its width and height, and descriptors."""
+    grey = cv2.cvtColor(np.ascontiguousarray(image[..., :3].numpy()), cv2.COLOR_RGB2GRAY)
+    small = np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    keys, descriptors = cv2.SIFT.create(nfeatures=MAX_FEATURES).detectAndCompute(small, None)
+    if descriptors is None:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    return (np.array([key.pt for key in keys], np.float64) + 0.5) / (width, height), descriptors
+
+
+def triangulate(
+    cameras: Cameras, one: Float[np.ndarray, "N 2"], other: Float[np.ndarray, "N 2"]
+) -> Float[Tensor, "M 3"]:
+    """Points that two cameras see where they are said to, in front of both.
+
+    Args:
+        cameras: two.
+        one, other: places in their photos, as shares of width and height.
+    """
+    fine = cameras.scaled(SUBPIXELS)  # rays go through the middles of pixels
+    rays = []
+    for view, places in enumerate((one, other)):
+        width, height = fine.size(view)
+        across, down = (torch.from_numpy(places) * torch.tensor([width, height])).long().unbind(1)
+        view_index = torch.full_like(across, view)
+        rays.append(fine.rays(view_index, down.clamp(0, height - 1), across.clamp(0, width - 1)))
+    a, b = (ray.directions.double() for ray in rays)
+    baseline = (cameras.centres[1] - cameras.centres[0]).double()
+    # Least squares for s a - t b = baseline; the angle is held above the least that tells a depth.
+    sine = torch.linalg.cross(a, b).norm(dim=1)
+    cosine = (a * b).sum(1)
+    s = ((a - cosine[:, None] * b) @ baseline) / sine.square().clamp_min(1e-12)
+    t = ((cosine[:, None] * a - b) @ baseline) / sine.square().clamp_min(1e-12)
+    farthest = float(baseline.norm()) / MIN_PARALLAX
+    is_far = (sine < MIN_PARALLAX) | (s <= 0) | (t <= 0) | (s > farthest)
+    points = cameras.centres[0].double() + torch.where(is_far, farthest, s)[:, None] * a
+    kept = torch.ones(len(points), dtype=torch.bool)
+    for view, places in enumerate((one, other)):
+        pixels, _, seen = cameras.project(points.float(), view)
+        off = (pixels.double() - torch.from_numpy(places) * cameras.sizes[view]).norm(dim=1)
+        kept &= seen & (off < MAX_ERROR)
+    return points[kept].float()

@@ -1,0 +1,175 @@
+"""The region of detail of captures whose subject and depth are known."""
+
+import logging
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from nerf_lightning.cameras import Cameras, Layout, spiral_like
+from nerf_lightning.dataset import Scene, Views, open_scene
+from nerf_lightning.dataset.region import PAN_DEPTH, find_region
+from nerf_lightning.runs.scene_file import _orbit
+from tests.cameras.captures import CENTRE, RADIUS, forward, pan, ring, walk
+from tests.dataset.colmap_files import cameras_of, photos, write_colmap, write_transforms
+
+WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
+
+
+def scattered(low: tuple[float, ...], high: tuple[float, ...], count: int = 400) -> Float[Tensor, "P 3"]:
+    """Points in a box around `CENTRE`."""
+    share = torch.rand(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return CENTRE + torch.tensor(low) + share * (torch.tensor(high) - torch.tensor(low))
+
+
+def sphere(radius: float) -> Float[Tensor, "P 3"]:
+    """Points all around `CENTRE`."""
+    points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return CENTRE + radius * points / points.norm(dim=1, keepdim=True)
+
+
+def size_of(scene: Scene) -> float:
+    """The scene's unit, in that of its file."""
+    return float(torch.linalg.det(scene.to_source[:3, :3].double()) ** (1 / 3))
+
+
+def folder_of(folder: Path, c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | None = None) -> Path:
+    """A capture of what is drawn, or of noise, as transforms.json."""
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]).repeat(len(c2w), 1, 1)
+    cameras = Cameras.of_size(K, c2w.float(), WIDTH, HEIGHT)
+    noise = torch.randint(0, 255, (len(c2w), HEIGHT, WIDTH, 3), generator=torch.manual_seed(0)).to(torch.uint8)
+    views = Views.of(noise if draw is None else draw(cameras), cameras)
+    write_transforms(folder / "transforms.json", views, photos(folder, views), w=WIDTH, h=HEIGHT)
+    return folder
+
+
+@pytest.mark.parametrize("distance", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("yaw", [0, 10, 20])
+def test_rings_framed_to_one_side_are_centred_on_their_subject(yaw: int, distance: float):
+    radius = RADIUS * distance
+    for elevation in (10.0, 25.0, 40.0):
+        region = find_region(ring(32, yaw, elevation, radius=radius))
+        assert region.layout == Layout.INWARD and region.known
+        assert float((region.centre - CENTRE).norm()) < 0.1 * radius
+        assert region.unit == pytest.approx(radius, rel=0.05)
+
+
+@pytest.mark.parametrize("yaw", [0, 15])
+def test_an_arc_framed_to_one_side_is_centred_by_its_points(yaw: int):
+    """A subject, and a wall behind it that few of the photos show."""
+    points = torch.cat([scattered((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), scattered((-6, -6, -1), (-5, 6, 4))])
+    region = find_region(ring(24, yaw, degrees=150), points)
+    assert float((region.centre - CENTRE).norm()) < 0.1 * RADIUS
+    assert region.unit == pytest.approx(RADIUS, rel=0.1)
+
+
+@pytest.mark.parametrize("diverging", [-0.3, 0.0, 0.2])
+def test_forward_facing_captures_are_centred_on_what_they_show(diverging: float):
+    region = find_region(forward(diverging), scattered((2.5, -1, -0.7), (3.5, 1, 0.7)))
+    assert region.has_subject
+    assert float((region.centre - CENTRE - torch.tensor([3.0, 0, 0])).norm()) < 0.4
+    assert region.unit == pytest.approx(3.0, rel=0.15)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_pan_is_centred_on_its_camera_in_the_unit_of_what_it_sees(noise: float):
+    region = find_region(pan(noise), sphere(3.0))
+    assert region.layout == Layout.PAN and region.known and not region.has_subject
+    assert float((region.centre - CENTRE).norm()) < noise + 1e-9
+    assert region.unit == pytest.approx(3.0 / PAN_DEPTH, rel=0.05)
+
+
+def test_a_walk_is_in_the_box_with_what_it_sees():
+    c2w = walk()
+    region = find_region(c2w, c2w[:, :3, 3] + 3 * c2w[:, :3, 2])
+    inside = ((c2w[:, :3, 3] - region.centre).abs() <= region.unit).all(1).double().mean()
+    assert region.layout == Layout.WALK and region.known and inside >= 0.8
+    assert 2.5 < region.unit < 8.0
+
+
+def test_nothing_is_matched_where_poses_tell_all():
+    def match() -> None:
+        raise AssertionError("matched")
+
+    for c2w in (ring(yaw=10), forward(-0.3), pan()):
+        assert find_region(c2w, None, match).known
+    region = find_region(pan(0.02), None, lambda: None)
+    assert not region.known and 0.1 < region.unit < 1.0
+
+
+def inside_a_ball(cameras: Cameras, radius: float = 3.0) -> UInt8[Tensor, "V H W 3"]:
+    """Photos from within a ball around the origin that is painted with coarse noise."""
+    paint = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (512, 1024, 3)).astype(np.float32), (0, 0), 3)
+    paint = (128 + 12 * (paint - paint.mean())).clip(0, 255).astype(np.uint8)
+    images = []
+    for view in range(len(cameras)):
+        rays = cameras.view_rays(view)
+        along = (rays.origins * rays.directions).sum(1, keepdim=True)
+        depth = -along + (along.square() - rays.origins.square().sum(1, keepdim=True) + radius**2).sqrt()
+        x, y, z = (rays.origins + depth * rays.directions).view(HEIGHT, WIDTH, 3).numpy().transpose(2, 0, 1) / radius
+        across, down = (np.arctan2(y, x) / (2 * math.pi) + 0.5) * 1023, np.arccos(z.clip(-1, 1)) / math.pi * 511
+        images.append(cv2.remap(paint, across.astype(np.float32), down.astype(np.float32), cv2.INTER_LINEAR))
+    return torch.from_numpy(np.stack(images))
+
+
+@pytest.mark.parametrize(
+    ("c2w", "layout"),
+    [(pan(0.05, seed=1), Layout.PAN), (forward(0.1), Layout.FORWARD)],
+    ids=["pan", "forward"],
+)
+def test_photos_are_matched_where_poses_do_not_tell_the_depth(c2w: torch.Tensor, layout: Layout, tmp_path: Path):
+    c2w = c2w.clone()
+    c2w[:, :3, 3] -= CENTRE
+    scene = open_scene(str(folder_of(tmp_path, c2w, inside_a_ball)), holdout=8)
+    assert size_of(scene) * (PAN_DEPTH if layout == Layout.PAN else 1) == pytest.approx(3, rel=0.2)
+    assert scene.points is not None and len(scene.points) > 50
+    places = scene.points.double() @ scene.to_source[:3, :3].double().T + scene.to_source[:3, 3]
+    assert float((places.norm(dim=1) - 3).abs().median()) < 0.3, "most points lie on the ball"
+
+
+def test_rounding_far_from_the_origin_is_no_motion():
+    c2w = pan()
+    c2w[:, :3, 3] = (1000 + CENTRE + 1e-4 * torch.randn(len(c2w), 3, generator=torch.manual_seed(0))).float().double()
+    region = find_region(c2w)
+    assert region.layout == Layout.PAN and region.known and region.unit == 1
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_camera_that_turns_gives_a_run_that_can_be_read_again(
+    noise: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    with caplog.at_level(logging.WARNING):
+        scene = open_scene(str(folder_of(tmp_path, pan(noise))))
+    assert ("how far away" in caplog.text) == (noise > 0)
+    assert scene.bounds.unbounded and scene.bounds.near is None
+    assert float((scene.to_source[:3, 3].double() - CENTRE).norm()) < 0.05
+    orbit = scene.orbit
+    for path in (orbit, spiral_like(orbit, 90)):
+        R = path.c2w[:, :3, :3]
+        torch.testing.assert_close(R @ R.mT, torch.eye(3).expand_as(R), atol=1e-5, rtol=0)
+        assert float((path.centres - orbit.centres[0]).abs().max()) == 0
+    turn = torch.atan2(orbit.c2w[:, 1, 2], orbit.c2w[:, 0, 2])
+    steps = torch.remainder(turn.roll(-1) - turn + math.pi, 2 * math.pi) - math.pi
+    torch.testing.assert_close(steps.abs(), torch.full_like(steps, 2 * math.pi / 60), atol=1e-3, rtol=0)
+    kept = {"K": orbit.K.tolist(), "c2w": orbit.c2w.tolist(), "width": orbit.width, "height": orbit.height}
+    assert torch.equal(_orbit("scene.json", kept).c2w, orbit.c2w)
+
+
+def test_points_of_a_model_are_kept_in_the_scenes_frame(tmp_path: Path):
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]).repeat(16, 1, 1)
+    cameras = Cameras.of_size(K, ring(16).float(), WIDTH, HEIGHT)
+    images = torch.randint(0, 255, (16, HEIGHT, WIDTH, 3), generator=torch.manual_seed(0)).to(torch.uint8)
+    views, points = Views.of(images, cameras), scattered((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
+    names = photos(tmp_path / "images", views)
+    write_colmap(tmp_path / "sparse/0", cameras.c2w.numpy(), names, cameras_of(views), points=points.numpy())
+    scene = open_scene(str(tmp_path))
+    assert scene.points is not None
+    back = scene.points.double() @ scene.to_source[:3, :3].double().T + scene.to_source[:3, 3]
+    np.testing.assert_allclose(np.sort(back.numpy(), 0), np.sort(points.numpy(), 0), atol=1e-4)
+    assert float(scene.points.norm(dim=1).max()) < 0.6 / RADIUS
