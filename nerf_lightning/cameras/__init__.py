@@ -1,7 +1,7 @@
 """Stage 1, cameras: pixels -> Rays, and the Bounds of the content along them."""
 
 from nerf_lightning.cameras.bounds import Bounds, InBounds
-from nerf_lightning.cameras.cameras import Cameras, Rays
+from nerf_lightning.cameras.cameras import Cameras, Rays, has_panoramas
 from nerf_lightning.cameras.layout import Layout, classify_layout, gaze_point
 from nerf_lightning.cameras.lenses import Distortion, Lenses, Projection
 from nerf_lightning.cameras.orbit import (
@@ -35,6 +35,7 @@ __all__ = [
     "classify_layout",
     "focus_point",
     "gaze_point",
+    "has_panoramas",
     "held",
     "in_other_frame",
     "look_at",

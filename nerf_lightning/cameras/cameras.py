@@ -240,6 +240,12 @@ class Cameras:
         return (tables.norm(dim=1).view(-1, LATTICE**2).amax(1) * 1.001)[which]
 
 
+def has_panoramas(cameras: Cameras) -> bool:
+    """Whether any photo shows all directions, so that its optical axis does not say where it looks."""
+    lenses = cameras.lenses
+    return lenses is not None and bool((lenses.projection == Projection.EQUIRECTANGULAR).any())
+
+
 def _on_sensor(K: Float[Tensor, "#N 3 3"], places: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:
     """Flat coordinates, distorted, of places in pixels."""
     y = (places[:, 1] - K[:, 1, 2]) / K[:, 1, 1]

@@ -3,14 +3,14 @@
 import logging
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Cameras
+from nerf_lightning.dataset.evidence import detect_features, match
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.utils.evenly import evenly
@@ -18,10 +18,7 @@ from nerf_lightning.utils.evenly import evenly
 log = logging.getLogger(__name__)
 
 MAX_PAIRS, MAX_SIDE = 8, 640
-"""Pairs of photos that are matched, and the longest side at which, pixels."""
-MAX_FEATURES = 1500
-MAX_RATIO = 0.8
-"""Lowe's ratio test: largest distance to the nearest descriptor as a share of that to the second."""
+"""Pairs of photos that are matched, and the longest side, in pixels, at which reprojection errors are measured."""
 MIN_OVERLAP = 0.85
 """Least cosine between the axes of photos that are matched."""
 MAX_ERROR = 2.0
@@ -48,15 +45,15 @@ def match_points(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor,
     sizes = torch.tensor([fit_size(width, height, MAX_SIDE) for width, height in views.cameras.sizes.tolist()])
     found = [torch.zeros(0, 3)]
     for first, second in neighbours(local):
-        one, other = (detect_features(views.image(view), *sizes[view].tolist()) for view in (first, second))
-        if min(len(one[1]), len(other[1])) < 2:
-            continue
-        near = cv2.BFMatcher().knnMatch(one[1], other[1], k=2)
-        kept = [m for m, n in near if m.distance < MAX_RATIO * n.distance]
-        if kept:
+        features = []
+        for view in (first, second):
+            known = None if views.known is None else views.mask_of(view).numpy()
+            features.append(detect_features(views.image(view).numpy(), known))
+        places = match(*features)
+        if len(places):
             pair = torch.tensor([first, second])
-            pixels = [one[0][[m.queryIdx for m in kept]], other[0][[m.trainIdx for m in kept]]]
-            found.append(triangulate(cameras[pair].resized(sizes[pair]), *pixels))
+            shares = places / views.cameras.sizes[pair].numpy()
+            found.append(triangulate(cameras[pair].resized(sizes[pair]), shares[:, 0], shares[:, 1]))
     points = torch.cat(found)
     log.info("%d points from matches between %d pairs of photos", len(points), len(found) - 1)
     return points.double() + origin
@@ -75,18 +72,6 @@ def neighbours(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
         if other != view:
             pairs.add((min(view, other), max(view, other)))
     return sorted(pairs)
-
-
-def detect_features(
-    image: UInt8[Tensor, "H W C"], width: int, height: int
-) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 128"]]:
-    """SIFT features of a photo at a size: places as shares of its width and height, and descriptors."""
-    grey = cv2.cvtColor(np.ascontiguousarray(image[..., :3].numpy()), cv2.COLOR_RGB2GRAY)
-    small = np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    keys, descriptors = cv2.SIFT.create(nfeatures=MAX_FEATURES).detectAndCompute(small, None)
-    if descriptors is None:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    return (np.array([key.pt for key in keys], np.float64) + 0.5) / (width, height), descriptors
 
 
 def triangulate(

@@ -1,7 +1,8 @@
 """Data that can be read but cannot be learned from: wrong poses, wrong background, a box that is too small."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 import torch
@@ -10,12 +11,25 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Cameras, Layout, axes_meet, classify_layout, focus_point, gaze_point
-from nerf_lightning.dataset.extent import MAX_VIEWS, border_colour, sightings, silhouettes, visible_cube, visual_hull
+from nerf_lightning.dataset.conventions import judge_cameras
+from nerf_lightning.dataset.extent import (
+    MAX_VIEWS,
+    border_colour,
+    sightings,
+    silhouettes,
+    visible_cube,
+    visual_hull,
+)
+from nerf_lightning.dataset.hypotheses import Hypothesis, convention_hypotheses
+from nerf_lightning.dataset.kind import check_visible
 from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
 SAME_PLACE, SAME_WAY = 1e-6, 1e-6
 """Cameras nearer than these (of the scene's size, and entry by entry of the rotation) stand in one pose."""
+ALIKE = 1.0
+"""Mean difference between photos, in 1/255, up to which they show the same."""
 OTHER_COLOUR = 8 / 255
 """A border that differs from the background by more than this, in any channel, shows something else."""
 HULL = 40
@@ -28,6 +42,8 @@ Exact poses of the built-in scene and of Lego explain all; ones off by 2 degrees
 degrees and 5 % 47 to 57 %; three of others among a hundred 98 %. Shuffled ones may explain 86 %, of content that is much alike
 from all sides.
 """
+LIKELIEST = 3
+"""Hypotheses that silhouettes are held against."""
 IN_BOX = 0.9
 """Coverage inside the box below which content lies outside it, provided the hull without the box fits well."""
 AROUND, OFF_CENTRE = 0.35, 0.5
@@ -50,6 +66,7 @@ class Doubt:
     """Whether correcting the poses may help."""
     far_off: bool = False
     """Whether it is certain that they are wrong."""
+    todo: str = "see the file's convention"
 
 
 def check_scene(scene: Scene, corrected: bool = False) -> list[Doubt]:
@@ -63,28 +80,44 @@ def check_scene(scene: Scene, corrected: bool = False) -> list[Doubt]:
         InputError: no method can learn anything from the data.
     """
     doubts = []
-    for check in (looking_away, border, misfits, repeats, overlap, cut_short, off_centre):
+    for check in (empty, cameras, border, misfits, repeats, overlap, cut_short, off_centre):
         for doubt in check(scene):
             if doubt.hopeless and not (corrected and doubt.inexact):
                 expected = "photos and poses that fit each other"
-                raise InputError(scene.source, "", doubt.text, expected, "see the file's convention")
+                raise InputError(scene.source, "", doubt.text, expected, doubt.todo)
             doubts.append(doubt)
     return doubts
 
 
-def looking_away(scene: Scene) -> Iterator[Doubt]:
-    """Cameras whose axes meet in a point behind them: a sign of mixed-up conventions (OpenGL looks along -z)."""
+def empty(scene: Scene) -> Iterator[Doubt]:
+    """Photos that show nothing, or nothing to learn a third dimension from."""
+    views, todo = scene.train, "take several photos of it from different places"
+    if len(views) == 1:
+        yield Doubt("one photo to train on", hopeless=True, todo=todo)
+    check_visible(scene.source, views)
+    if (views.pixels == views.pixels[:1]).all():
+        yield Doubt("training photos of one colour: nothing is visible", hopeless=True, todo="export them again")
+    elif len(views) > 1 and views.cameras.one_size and are_alike(views):
+        yield Doubt("training photos that are all alike", hopeless=True, todo=todo)
+
+
+def are_alike(views: Views) -> bool:
+    """Whether photos of one size differ by no more than noise."""
+    images = views.images
+    return all(float((image.float() - images[0].float()).abs().mean()) < ALIKE for image in images[1:])
+
+
+def cameras(scene: Scene) -> Iterator[Doubt]:
+    """Cameras that do not fit the photos, by the matches between these; without matches, ones that look away."""
+    verdict = judge_cameras(scene)
+    for finding in verdict.findings:
+        yield Doubt(finding.found, finding.certain, finding.inexact, finding.inexact and finding.certain, finding.todo)
     c2w = scene.train.cameras.c2w
-    if len(c2w) < 3:
+    if verdict.fits or verdict.findings or len(c2w) < 3 or not axes_meet(c2w):
         return
-    if not axes_meet(c2w):
-        return  # a panorama, a fly-through
     behind = float((((focus_point(c2w) - c2w[:, :3, 3]) * c2w[:, :3, 2]).sum(1) < 0).float().mean())
-    if behind > 0.5:
-        text = f"{behind:.0%} of the cameras with their backs to the point where their axes meet; their z axis points backward"
-        yield Doubt(text, hopeless=True)
-    elif behind > 0:
-        yield Doubt(f"{behind:.0%} of the cameras look away from the point where the others' axes meet")
+    if behind > 0:
+        yield Doubt(f"{behind:.0%} of the cameras with their backs to the point where their axes meet")
 
 
 def border(scene: Scene) -> Iterator[Doubt]:
@@ -115,6 +148,8 @@ def misfits(scene: Scene) -> Iterator[Doubt]:
     if explained < IN_BOX and hull_coverage(masks, views.cameras, everything) >= FITS_WELL:
         text = f"content beyond the box: the box explains {explained:.0%} of what the photos show"
         yield Doubt(text, hopeless=explained < FITS)
+    elif (mistake := outlined_by(masks, views.cameras.c2w.double().numpy(), views.cameras)) is not None:
+        yield Doubt(f"{mistake.found}: so the outlines are those of one body", hopeless=True, todo=mistake.todo)
     else:
         text = (
             f"outlines that no body has: the photos together can explain {explained:.0%} of what each shows."
@@ -140,6 +175,17 @@ def off_centre(scene: Scene) -> Iterator[Doubt]:
             f"cameras stand {distance / scene.bounds.longest:.2g} times the box's half-size off its centre: what they see is"
             " small in the box, or beside it"
         )
+
+
+def outlined_by(
+    masks: Sequence[Bool[np.ndarray, "_ _"]], c2w: Float[np.ndarray, "V 4 4"], cameras: Cameras
+) -> Hypothesis | None:
+    """The first of the likeliest mistakes without which some body has all silhouettes."""
+    for mistake in islice(convention_hypotheses(c2w), LIKELIEST):
+        mended = replace(cameras, c2w=torch.from_numpy(mistake.c2w).float())
+        if hull_coverage(masks, mended, Bounds(torch.from_numpy(visible_cube(mended)).float())) >= FITS_WELL:
+            return mistake
+    return None
 
 
 def hull_coverage(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Cameras, bounds: Bounds) -> float:

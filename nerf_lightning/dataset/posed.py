@@ -15,7 +15,6 @@ from torch import Tensor
 from nerf_lightning.cameras import (
     Bounds,
     Cameras,
-    Projection,
     held,
     in_other_frame,
     orbit_like,

@@ -68,7 +68,7 @@ def test_every_method_learns_something(method: str, tmp_path: Path):
 def test_a_cell_is_done_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     cell = Cell("OpenGL poses", "voxels", 0, 20)
     outcome = run(cell, tmp_path)
-    assert outcome.status == "refused" and "backs to the point" in outcome.diagnosis
+    assert outcome.status == "refused" and "axes of the other convention" in outcome.diagnosis
     assert str(tmp_path) not in outcome.diagnosis
     monkeypatch.setattr("nerf_lightning.stability.cell._train", lambda *_: pytest.fail("trained again"))
     assert run(cell, tmp_path) == outcome

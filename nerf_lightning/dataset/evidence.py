@@ -1,0 +1,162 @@
+"""Matches between photos: what the photos alone tell about the cameras that took them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from nerf_lightning.dataset.views import Views
+from nerf_lightning.utils.evenly import evenly
+
+MAX_TRAIN_PHOTOS, MAX_VAL_PHOTOS = 48, 8
+"""Photos that are matched, evenly chosen."""
+MAX_SIDE_PX, MIN_SIDE_PX, MAX_ENLARGEMENT = 320, 256, 3
+"""Longest side of a photo when features are detected: larger ones are reduced, smaller ones enlarged."""
+MAX_FEATURES, MAX_COARSE_FEATURES = 400, 128
+"""Features of a photo; the first of them tell which photos may overlap."""
+DESCRIPTOR = 128 + 3
+MAX_RATIO = 0.8
+"""Largest distance of a match, as a share of the second-best (Lowe 2004, section 7.1)."""
+MIN_COARSE_MATCHES, MIN_MATCHES = 5, 8
+"""Of the strongest features, for two photos to be matched at all; and of all of them, for a pair to count."""
+PARTNERS_BY_PHOTO, PARTNERS_BY_POSE = 3, 2
+"""Photos that each is matched with: those with most matches, and those whose cameras are nearest."""
+MAX_PAIRS = 120
+MIN_DISPLACEMENT = 0.02
+"""Median displacement of a pair's matches, as a share of the longest side, below which nearly any camera explains it."""
+EPIPOLAR_TOLERANCE, MAX_ITERATIONS = 0.004, 500
+"""Of the fundamental matrix that the matches of a pair agree on, as a share of the longest side; and of RANSAC."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Salient points of a photo."""
+
+    places: Float[np.ndarray, "F 2"]
+    """Column and row, pixels of the photo; the first pixel's centre is at 0.5."""
+    descriptors: Float[Tensor, "F D"]
+    """RootSIFT (Arandjelovic and Zisserman 2012) and sRGB in [0, 1], which tells apart what is alike but for its colour; the
+    strongest feature first."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two photos, and matches between them, some of them wrong."""
+
+    first: int
+    second: int
+    places: Float[np.ndarray, "M 2 2"]
+    """Of each match in the first and in the second photo, pixels."""
+
+    @property
+    def displacement(self) -> float:
+        """Median distance between a match's two places, pixels."""
+        return float(np.median(np.linalg.norm(self.places[:, 1] - self.places[:, 0], axis=1)))
+
+
+def detect_features(image: UInt8[np.ndarray, "H W C"], known: Bool[np.ndarray, "H W"] | None) -> Features:
+    """SIFT features of a photo, where it shows something."""
+    height, width = image.shape[:2]
+    longest = max(height, width)
+    scale = min(max(1.0, min(MIN_SIDE_PX / longest, MAX_ENLARGEMENT)), MAX_SIDE_PX / longest)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    shows = np.ones((height, width), bool) if known is None else known
+    if image.shape[2] == 4:
+        shows = shows & (image[..., 3] > 127)
+    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    colours = cv2.resize(np.ascontiguousarray(image[..., :3]), size, interpolation=method)
+    mask = cv2.resize(shows.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    colours[mask == 0] = 127
+    sift = cv2.SIFT.create(MAX_FEATURES, contrastThreshold=0.02)
+    points, descriptors = sift.detectAndCompute(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY), mask)
+    if descriptors is None or not len(points):
+        return Features(np.zeros((0, 2)), torch.zeros(0, DESCRIPTOR))
+    order = np.argsort([-point.response for point in points], kind="stable")[:MAX_FEATURES]
+    places = np.array([points[i].pt for i in order], np.float64) + 0.5
+    root = np.sqrt(descriptors[order] / descriptors[order].sum(1, keepdims=True).clip(1e-6))
+    column, row = places.astype(int).clip(0, np.array(size) - 1).T
+    colour = cv2.GaussianBlur(colours, (0, 0), 2.0)[row, column] / 255
+    together = torch.from_numpy(np.hstack([root, colour])).float()
+    return Features(places * [width / size[0], height / size[1]], together)
+
+
+def match(first: Features, second: Features) -> Float[np.ndarray, "M 2 2"]:
+    """Places of features that are each other's nearest, and clearly so."""
+    if min(len(first.places), len(second.places)) < 2:
+        return np.zeros((0, 2, 2))
+    distance = torch.cdist(first.descriptors, second.descriptors)
+    best, partner = distance.topk(2, dim=1, largest=False)
+    index = torch.arange(len(distance))
+    kept = (best[:, 0] < MAX_RATIO * best[:, 1]) & (distance.argmin(0)[partner[:, 0]] == index)
+    return np.stack([first.places[index[kept].numpy()], second.places[partner[kept, 0].numpy()]], axis=1)
+
+
+def count_matches(features: Sequence[Features]) -> Int[np.ndarray, "V V"]:
+    """How many of the strongest features of each photo have a match in each other one, and in reverse, whichever is less."""
+    count, absent = len(features), 1e3
+    table = torch.full((count, MAX_COARSE_FEATURES, DESCRIPTOR), absent)
+    for view, one in enumerate(features):
+        some = one.descriptors[:MAX_COARSE_FEATURES]
+        table[view, : len(some)] = some
+    squares = table.square().sum(2)
+    found = torch.zeros(count, count, dtype=torch.long)
+    for view in range(count):
+        mine = table[view][table[view, :, 0] < absent]
+        if not len(mine):
+            continue
+        product = (mine @ table.flatten(0, 1).T).view(len(mine), count, -1)
+        distance = mine.square().sum(1)[:, None, None] + squares - 2 * product
+        nearest, which = distance.min(2)
+        distance.scatter_(2, which[..., None], torch.inf)
+        found[view] = (nearest < MAX_RATIO**2 * distance.amin(2)).sum(0)
+        found[view, view] = 0
+    return torch.minimum(found, found.T).numpy()
+
+
+def pose_distances(c2w: Float[Tensor, "V 4 4"]) -> Float[np.ndarray, "V V"]:
+    """How far apart cameras are: their distance as a share of their spread, and the chord between their axes."""
+    centres, axes = c2w[:, :3, 3], c2w[:, :3, 2]
+    spread = (centres - centres.mean(0)).norm(dim=1).mean().clamp_min(1e-12)
+    return (torch.cdist(centres, centres) / spread + torch.cdist(axes, axes)).numpy()
+
+
+def find_pairs(views: Views) -> list[Pair]:
+    """Matches between photos that seem to show the same, or whose cameras stand side by side."""
+    features = [
+        detect_features(views.image(view).numpy(), None if views.known is None else views.mask_of(view).numpy())
+        for view in range(len(views))
+    ]
+    counts = count_matches(features)
+    by_photo = np.argsort(-counts, axis=1, kind="stable")[:, :PARTNERS_BY_PHOTO]
+    by_pose = np.argsort(pose_distances(views.cameras.c2w), axis=1, kind="stable")[:, 1 : 1 + PARTNERS_BY_POSE]
+    candidates = set()
+    for view in range(len(views)):
+        alike = [other for other in by_photo[view] if counts[view, other] >= MIN_COARSE_MATCHES]
+        candidates |= {(min(view, int(other)), max(view, int(other))) for other in (*by_pose[view], *alike)}
+    pairs = []
+    every = sorted(candidate for candidate in candidates if candidate[0] != candidate[1])
+    for first, second in (every[i] for i in evenly(len(every), MAX_PAIRS)):
+        places = match(features[first], features[second])
+        if len(places) >= MIN_MATCHES:
+            pair = Pair(first, second, places)
+            if pair.displacement >= MIN_DISPLACEMENT * max(views.cameras.size(first)):
+                pairs.append(pair)
+    return pairs
+
+
+def verified(pair: Pair, longest: int) -> Bool[np.ndarray, "M"]:
+    """Which matches agree on one fundamental matrix, whatever the cameras.
+
+    Args:
+        pair: of photos.
+        longest: their longest side, pixels.
+    """
+    places = pair.places / longest  # one unit for all sizes
+    _, inliers = cv2.findFundamentalMat(
+        places[:, 0], places[:, 1], cv2.FM_RANSAC, EPIPOLAR_TOLERANCE, 0.99, MAX_ITERATIONS
+    )
+    return np.zeros(len(places), bool) if inliers is None else inliers[:, 0] > 0

@@ -1,0 +1,285 @@
+"""Mistakes with the cameras of a file are recognised by matches between its photos, and named."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from nerf_lightning.cameras import Bounds, Cameras, look_at
+from nerf_lightning.dataset import Scene, Views
+from nerf_lightning.dataset.conventions import Verdict, judge_cameras, numeric_key, order_hypotheses
+from nerf_lightning.dataset.evidence import Pair, detect_features, find_pairs
+from nerf_lightning.dataset.hypotheses import FLIP, Hypothesis, Matches, convention_hypotheses, explained
+from nerf_lightning.dataset.plausible import check_scene
+from nerf_lightning.dataset.scene import BUILT_IN
+from nerf_lightning.errors import InputError
+from nerf_lightning.stability.damage import posed, shuffled, with_focal_length
+from nerf_lightning.stability.rooms import ROOMS, photograph
+
+SIZE, FOCAL = 200, 220.0
+GL = np.diag([1.0, -1.0, -1.0, 1.0])
+UP = torch.tensor([0.0, 0.0, 1.0]).double()
+
+
+def ring(count: int, outward: bool = False, distance: float = 2.5) -> np.ndarray:
+    """Poses around the origin at changing heights and rolls."""
+    angle = torch.arange(count).double() * 2 * np.pi / count
+    eyes = distance * torch.stack([angle.cos(), angle.sin(), 0.4 + 0.2 * (3 * angle).sin()], dim=1)
+    target = 4 * eyes if outward else 0.2 * torch.stack([angle.sin(), angle.cos(), angle.cos()], dim=1)
+    return look_at(eyes, target, UP + 0.02).numpy()
+
+
+def cameras_at(c2w: np.ndarray, focal: float = FOCAL, width: int = SIZE, height: int = SIZE) -> Cameras:
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w).float(), width, height)
+
+
+def matches_of(c2w: np.ndarray, spread: float) -> Matches:
+    """Exact matches of neighbours: points around the origin, or all around from far."""
+    points = torch.from_numpy(np.random.default_rng(0).normal(size=(4000, 3)) * spread).float()
+    cameras = cameras_at(c2w)
+    seen = [cameras.project(points, view) for view in range(len(c2w))]
+    pairs = []
+    for first in range(len(c2w)):
+        second = (first + 1) % len(c2w)
+        both = (seen[first][2] & seen[second][2]).numpy().nonzero()[0][:60]
+        if len(both):
+            pairs.append(Pair(first, second, np.stack([seen[i][0].numpy()[both] for i in (first, second)], axis=1)))
+    return Matches.of(pairs, cameras)
+
+
+def rotated(c2w: np.ndarray, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    moved = c2w.copy()
+    moved[:, :3, :3] = change(c2w[:, :3, :3])
+    return moved
+
+
+def centred(c2w: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    moved = c2w.copy()
+    moved[:, :3, 3] = centres
+    return moved
+
+
+def mirrored(c2w: np.ndarray) -> np.ndarray:
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    return mirror @ c2w @ mirror
+
+
+def quaternions_rolled(rotation: np.ndarray) -> np.ndarray:
+    return Rotation.from_quat(np.roll(Rotation.from_matrix(rotation).as_quat(), 1, axis=1)).as_matrix()
+
+
+MISTAKES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+    "other axes": (lambda c2w: c2w @ GL, "camera axes of the other convention"),
+    "inverse": (np.linalg.inv, "world-to-camera matrices"),
+    "inverse of other axes": (lambda c2w: np.linalg.inv(c2w @ GL), "world-to-camera matrices"),
+    "transposed": (lambda c2w: rotated(c2w, lambda R: R.transpose(0, 2, 1)), "transposed rotations"),
+    "other translations": (
+        lambda c2w: centred(c2w, np.linalg.inv(c2w)[:, :3, 3]),
+        "translations of world-to-camera matrices",
+    ),
+    "on their sides": (
+        lambda c2w: rotated(c2w, lambda R: R @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])),
+        "photos that lie on their sides or upside down",
+    ),
+    "mirrored": (mirrored, "a mirrored world"),
+    "quaternions": (lambda c2w: rotated(c2w, quaternions_rolled), "rotations of quaternions in another order"),
+    "two world frames": (
+        lambda c2w: centred(c2w, c2w[:, :3, 3] @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])),
+        "centres in another world frame than rotations",
+    ),
+}
+
+
+@pytest.mark.parametrize("outward", [False, True], ids=["inward", "outward"])
+@pytest.mark.parametrize("name", MISTAKES)
+@pytest.mark.parametrize("opengl", [False, True], ids=["OpenCV file", "OpenGL file"])
+def test_each_mistake_is_explained_by_its_hypothesis_alone(name: str, outward: bool, opengl: bool):
+    """What a file holds, in its own axes, is spoilt; matches are exact."""
+    if opengl and name in ("mirrored", "on their sides"):
+        return  # the same in either convention
+    change, words = MISTAKES[name]
+    right = ring(24, outward)
+    matches = matches_of(right, 8.0 if outward else 0.6)
+    read = change(right @ GL) @ GL if opengl else change(right)
+    assert explained(matches, right).all()
+    assert explained(matches, read).mean() < 0.4
+
+    def share(hypothesis: Hypothesis) -> float:
+        return float(explained(matches, hypothesis.c2w).mean())
+
+    assert max(share(one) for one in convention_hypotheses(right)) < 0.98
+    best = max(convention_hypotheses(read), key=share)
+    assert share(best) == 1 and words in best.found
+
+
+def test_cameras_on_one_spot_are_told_by_their_rotations():
+    pan = centred(ring(24, outward=True), np.array([0.3, 0.2, 0.1]))
+    matches = matches_of(pan, 8.0)
+    assert explained(matches, pan).all()
+    assert explained(matches, rotated(pan, lambda R: R @ FLIP)).mean() < 0.05
+    assert explained(matches, np.linalg.inv(pan)).mean() < 0.05
+
+
+def test_a_focal_length_is_told_by_a_pan():
+    pan = centred(ring(24, outward=True), np.zeros(3))
+    matches = matches_of(pan, 8.0)
+    for zoom in (0.25, 0.8, 1.25, 4.0):
+        assert explained(matches, pan, zoom).mean() < 0.2
+    wrong = Matches(
+        *(getattr(matches, key) for key in ("views", "pair")),
+        *(
+            x / np.linalg.norm(x, axis=1, keepdims=True)
+            for x in (matches.first * [4, 4, 1], matches.second * [4, 4, 1])
+        ),
+        matches.tolerance * 4,
+        matches.fisheye,
+    )
+    assert explained(wrong, pan, 4.0).all(), "photos whose focal length is said to be a quarter of it"
+
+
+def scene_of(c2w: np.ndarray, names: tuple[str, ...] = (), focal: float = 80.0, width: int = 96) -> Scene:
+    """Photos of a room without bounds; every eighth is held out."""
+    cameras = cameras_at(c2w, focal, width, 3 * width // 4)
+    room = ROOMS["filling subject"]
+    views = Views.of(torch.stack([photograph(room, cameras, view) for view in range(len(cameras))]), cameras)
+    views = replace(views, names=names)
+    held = torch.arange(len(c2w)) % 8 == 0
+    bounds = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True)
+    train, val = views[(~held).nonzero()[:, 0]], views[held.nonzero()[:, 0]]
+    return Scene("room", BUILT_IN, train, val, cameras, bounds)
+
+
+def diverging(count: int = 20) -> np.ndarray:
+    """Cameras side by side that look ahead, outward the farther they stand from the middle."""
+    i = torch.arange(count)
+    eyes = torch.stack([torch.full((count,), -2.4), 0.2 * (i % 5 - 2), 0.2 * (i // 5 - 1.5)], dim=1).double()
+    ahead = torch.tensor([1.0, 0.0, 0.0]) + torch.tensor([0.0, 0.4, 0.4]) * eyes
+    return look_at(eyes, eyes + ahead, UP).numpy()
+
+
+@pytest.fixture(scope="module")
+def forward() -> Scene:
+    return scene_of(diverging(), tuple(f"{i}.png" for i in range(20)))
+
+
+def test_axes_that_diverge_are_no_mistake(forward: Scene):
+    """They meet behind the cameras, as flipped ones do."""
+    assert check_scene(forward) == []
+    assert judge_cameras(forward) == Verdict(fits=True)
+
+
+def test_a_photo_with_a_wrong_pose_is_named(forward: Scene):
+    def turn(c2w: torch.Tensor) -> torch.Tensor:
+        c2w[3, :3, 1:3] *= -1
+        return c2w
+
+    (doubt,) = check_scene(replace(forward, train=posed(forward.train, turn)))
+    assert doubt.text == "1 training photos whose poses do not fit the others: 4.png"
+
+
+def spoilt(scene: Scene, change: Callable[[np.ndarray], np.ndarray]) -> Scene:
+    """Poses of both splits, in the order of the names, changed."""
+    order = np.argsort([int(name.removesuffix(".png")) for name in scene.train.names + scene.val.names])
+    every = torch.cat([scene.train.cameras.c2w, scene.val.cameras.c2w]).double().numpy()
+    every[order] = change(every[order])
+    moved = torch.from_numpy(every).float()
+    train, val = moved[: len(scene.train)], moved[len(scene.train) :]
+    return replace(scene, train=posed(scene.train, lambda _: train), val=posed(scene.val, lambda _: val))
+
+
+ORDERS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+    "before": (lambda c2w: np.roll(c2w, 1, axis=0), "poses that are those of the photos before them"),
+    "after": (lambda c2w: np.roll(c2w, -1, axis=0), "poses that are those of the photos after them"),
+    "reversed": (lambda c2w: c2w[::-1], "poses in the reverse order of the photos"),
+    "sorted as text": (
+        lambda c2w: c2w[np.argsort(sorted(range(len(c2w)), key=lambda i: f"{i}.png"))],
+        "whose names sort otherwise as numbers",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_poses_in_another_order_are_put_back(name: str):
+    """Whatever the split."""
+    right = ring(24)
+    change, words = ORDERS[name]
+    cameras = cameras_at(change(right), width=4, height=4)
+    names = tuple(f"{i}.png" for i in range(24))
+    views = replace(Views.of(torch.zeros(24, 4, 4, 3, dtype=torch.uint8), cameras), names=names)
+    val, train = torch.arange(0, 24, 8), torch.arange(24)[torch.arange(24) % 8 != 0]
+    bounds = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    scene = Scene("ring", BUILT_IN, views[train], views[val], cameras, bounds)
+    order = torch.cat([train, val]).numpy()
+    found = [
+        one.found
+        for one in order_hypotheses(scene, change(right)[order], np.arange(24))
+        if np.allclose(one.c2w, right[order])
+    ]
+    assert len(found) == 1 and words in found[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (MISTAKES["other axes"][0], "camera axes of the other convention"),
+        (np.linalg.inv, "world-to-camera matrices"),
+        (MISTAKES["transposed"][0], "transposed rotations"),
+        (lambda c2w: c2w[np.random.default_rng(1).permutation(len(c2w))], "they belong to other photos"),
+    ],
+    ids=["axes", "inverse", "transposed", "shuffled"],
+)
+def test_wrong_poses_are_refused_by_name(forward: Scene, change: Callable[[np.ndarray], np.ndarray], words: str):
+    with pytest.raises(InputError, match=words):
+        check_scene(spoilt(forward, change))
+
+
+@pytest.mark.parametrize("factor", [0.1, 4.0])
+def test_a_wrong_focal_length_is_refused_with_the_right_one(forward: Scene, factor: float):
+    with pytest.raises(InputError, match=f"a focal length of {80 * factor:g} pixels, where about [6-9][0-9] would fit"):
+        check_scene(with_focal_length(forward, 0, factor))
+
+
+def test_held_out_photos_with_other_poses_are_refused(forward: Scene):
+    mixed = replace(forward, val=posed(forward.val, lambda c2w: c2w.roll(1, 0)))
+    with pytest.raises(InputError, match="held-out photos whose poses"):
+        check_scene(mixed)
+
+
+def test_shuffled_poses_are_only_doubted_where_poses_are_corrected(forward: Scene):
+    (doubt,) = check_scene(shuffled(forward, 0), corrected=True)
+    assert doubt.inexact and doubt.far_off
+    with pytest.raises(InputError, match="other convention"):
+        check_scene(spoilt(forward, lambda c2w: c2w @ GL), corrected=True)
+
+
+def test_masked_and_transparent_places_have_no_features(forward: Scene):
+    image = forward.train.image(3).numpy()
+    left = np.zeros(image.shape[:2], bool)
+    left[:, :48] = True
+    everywhere, masked = detect_features(image, None), detect_features(image, left)
+    transparent = detect_features(np.dstack([image, np.where(left, 255, 0).astype(np.uint8)]), None)
+    assert everywhere.places[:, 0].max() > 80
+    assert len(masked.places) > 5 and masked.places[:, 0].max() < 49
+    np.testing.assert_array_equal(masked.places, transparent.places)
+
+
+def test_matches_lie_where_the_same_point_appears(forward: Scene):
+    """Points of one photo, at their true depth, appear in the other where the match says."""
+    off = []
+    for pair in find_pairs(forward.train)[:6]:
+        cameras = forward.train.cameras
+        column, row = torch.from_numpy(pair.places[:, 0]).long().unbind(1)
+        rays = cameras.rays(torch.full_like(column, pair.first), row, column)
+        points = rays.origins + rays.directions * ROOMS["filling subject"].see(rays)[1][:, None]
+        places = cameras.project(points, pair.second)[0].numpy()
+        off.append(np.linalg.norm(places - pair.places[:, 1], axis=1))
+    assert np.median(np.concatenate(off)) < 1.5
+
+
+def test_numbers_in_names_sort_by_value():
+    names = ["a10.png", "a2.png", "b1.png", "a2b3.png"]
+    assert sorted(names, key=numeric_key) == ["a2.png", "a2b3.png", "a10.png", "b1.png"]
