@@ -194,7 +194,7 @@ def spoilt(scene: Scene, change: Callable[[np.ndarray], np.ndarray]) -> Scene:
 ORDERS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "before": (lambda c2w: np.roll(c2w, 1, axis=0), "poses that are those of the photos before them"),
     "after": (lambda c2w: np.roll(c2w, -1, axis=0), "poses that are those of the photos after them"),
-    "reversed": (lambda c2w: c2w[::-1], "poses in the reverse order of the photos"),
+    "reversed": (lambda c2w: c2w[::-1].copy(), "poses in the reverse order of the photos"),
     "sorted as text": (
         lambda c2w: c2w[np.argsort(sorted(range(len(c2w)), key=lambda i: f"{i}.png"))],
         "whose names sort otherwise as numbers",
