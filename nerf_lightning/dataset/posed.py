@@ -15,6 +15,7 @@ from torch import Tensor
 from nerf_lightning.cameras import (
     Bounds,
     Cameras,
+    has_panoramas,
     held,
     in_other_frame,
     orbit_like,
@@ -226,7 +227,7 @@ def unbounded_box(views: Views, from_source: Float[Tensor, "4 4"], hints: Hints,
 def viewing_poses(cameras: Cameras, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor, "W 4 4"]:
     """Poses whose axes say where cameras look: of a photo of all directions, four around its vertical axis."""
     poses = torch.from_numpy(c2w)
-    if cameras.lenses is None or not bool((cameras.lenses.projection == Projection.EQUIRECTANGULAR).any()):
+    if not has_panoramas(cameras):
         return poses
     quarter = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
     return torch.cat([poses @ torch.linalg.matrix_power(quarter, turns) for turns in range(4)])
