@@ -18,6 +18,8 @@ import pytest
 from capture.views import SIZE
 from commands import BARE
 
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.export.photos import write_photos
 from nerf_lightning.utils.ending import Interrupted
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -133,6 +135,9 @@ def test_every_command_of_a_page_works(
         folder, _ = request.getfixturevalue("made")
         shutil.copytree(folder / "calibration", tmp_path / "sheet_photos")
         shutil.copytree(folder / "photos", tmp_path / "object_photos")
+    if "my_photos" in page.read_text(encoding="utf-8"):
+        (tmp_path / "my_photos").mkdir()
+        write_photos(bricks(24, 12, 2, 4), tmp_path / "my_photos")
     imageio.imwrite(tmp_path / "cat.jpg", np.tile(np.arange(0, 240, 10, np.uint8)[:, None, None], (1, 20, 3)))
     assert commands(page)
     for line in commands(page):

@@ -115,7 +115,7 @@ def test_what_a_run_leaves(tmp_path: Path):
         "rows_measured", "test", "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "plateau", "misfits",
         "corrections", "recoveries", "status", "diagnosis",
     }  # fmt: skip
-    assert set(results["scene"]) == {"name", "source", "sha256", "views", "resolution"}
+    assert set(results["scene"]) == {"name", "source", "sha256", "views", "resolution", "bounded", "kind"}
     assert results["scene"]["name"] == "bricks"
     assert results["background"] == [0, 0, 0]
     assert set(results["machine"]) == {"processor", "cores", "accelerator"}

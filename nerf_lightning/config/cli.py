@@ -135,7 +135,8 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     try:
         flags = check_flags(sys.argv[1:])
         given = without_nulls(by_path(sys.argv[1:], conf_dir()))
-        sys.argv[1:] = to_folders(quote_texts(given, (*texts, *FOLDERS), flags.multirun))
+        sweep = flags.multirun or (None if config == "config" else False)
+        sys.argv[1:] = to_folders(quote_texts(given, (*texts, *FOLDERS), sweep))
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
     except Exception as error:
         # Before the task starts only Hydra is at work, on the command line: any error then is bad input.

@@ -41,7 +41,7 @@ def parse_argument(argument: str) -> Override | None:
         return None
 
 
-def quote_texts(arguments: Sequence[str], keys: Sequence[str], sweep: bool = False) -> list[str]:
+def quote_texts(arguments: Sequence[str], keys: Sequence[str], sweep: bool | None = False) -> list[str]:
     """Quotes values that Hydra would not read as the text they are: those of some keys, and all that it cannot parse.
 
     The name of an existing file or folder is literal. Other text may hold interpolations, be quoted by the user, or be a list
@@ -50,12 +50,12 @@ def quote_texts(arguments: Sequence[str], keys: Sequence[str], sweep: bool = Fal
     Args:
         arguments: of the command line.
         keys: whose values are text, such as paths.
-        sweep: whether several values make several jobs.
+        sweep: whether several values make several jobs; None where an experiment may say so.
     """
     return [argument if argument.startswith(("-", "~")) else _quoted(argument, keys, sweep) for argument in arguments]
 
 
-def _quoted(argument: str, keys: Sequence[str], sweep: bool) -> str:
+def _quoted(argument: str, keys: Sequence[str], sweep: bool | None) -> str:
     key, equals, value = argument.partition("=")
     if not equals or value in ("", "null"):
         return argument
@@ -69,8 +69,7 @@ def _quoted(argument: str, keys: Sequence[str], sweep: bool) -> str:
         return override_of(key, value)
     if parsed and (value[0] in "'\"[" or (sweep and _is_function(parsed))):
         return argument
-    # An experiment may be a sweep without -m.
-    if len(values) > 1 and all(values) and (sweep or all(map(_exists, values))):
+    if len(values) > 1 and all(values) and (sweep or (sweep is None and all(map(_exists, values)))):
         if sweep:
             print(f"{key}: {len(values)} values to sweep: {' | '.join(values)}")
         return f"{key}={','.join(_quoted(f'{key}={one}', keys, False).partition('=')[2] for one in values)}"

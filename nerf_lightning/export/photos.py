@@ -26,6 +26,8 @@ def write_photos(scene: Scene, folder: Path) -> None:
         InputError: for a lens that the format does not know.
     """
     parts = {"train_filenames": scene.train, "val_filenames": scene.val}
+    if scene.test is not None:
+        parts["test_filenames"] = scene.test
     stems = [Path(views.name(view)).stem for views in parts.values() for view in range(len(views))]
     if len(set(stems)) < len(stems):
         stems = [f"{number:04d}" for number in range(len(stems))]

@@ -101,7 +101,7 @@ def test_commas_in_a_sweep(value: str, expected: list[str], said: str, tmp_path:
 def test_a_list_of_paths_that_are_there_is_a_sweep_in_an_experiment_that_sweeps(tmp_path: Path):
     for name in ("a (1)", "b"):
         (tmp_path / name).mkdir()
-    assert values_of(*quote_texts(["dataset.path=a (1),b"], KEYS)) == ["a (1)", "b"]
+    assert values_of(*quote_texts(["dataset.path=a (1),b"], KEYS, None)) == ["a (1)", "b"]
 
 
 def test_other_keys_are_hydras_unless_it_cannot_read_them():

@@ -38,8 +38,8 @@ ALL = [f"images/{i:04d}.png" for i in range(12)]
 DAMAGE = {
     "no json": (lambda c: (c / "transforms.json").unlink(), "transforms.json: found nothing there"),
     "most photos missing": (_remove_most, "found 'images/0002.png', which is not there (nor are 7 more)"),
-    "focal missing": (_pop("fl_x"), "fl_x: found no focal length among [cx, cy"),
-    "focal null": (_top(fl_x=None), "fl_x: found no focal length"),
+    "focal missing": (lambda c: (_pop("fl_x")(c), _pop("fl_y")(c)), "fl_x: found no focal length among [cx, cy"),
+    "focal null": (_top(fl_x=None, fl_y=None), "fl_x: found no focal length"),
     "focal negative": (_top(fl_y=-3), "fl_y: found -3, expected a positive"),
     "focal of a frame": (_first(fl_x=0), "frames[0].fl_x: found 0"),
     "angle": (lambda c: (_pop("fl_x")(c), _top(camera_angle_x=4.0)(c)), "camera_angle_x: found 4"),
@@ -66,8 +66,8 @@ DAMAGE = {
     ),
     "folded over": (_top(k1=-3.0), "k1, k2, k3, p1, p2: found a distortion that folds the photo over"),
     "mask missing": (_first(mask_path="no.png"), "frames[0].mask_path: found 'no.png', which is not there"),
-    "width": (_top(w=181), "0000.png: found 160x120 pixels, expected 181x120, the size of its camera"),
-    "height of a frame": (_first(h=1), "0000.png: found 160x120 pixels, expected 160x1"),
+    "width": (_top(w=181), ".png: found 160x120 pixels, expected 181x120, the size of its camera"),
+    "height of a frame": (_first(h=1), ".png: found 160x120 pixels, expected 160x1"),
     "image size": (
         lambda c: cv2.imwrite(str(c / "images/0004.png"), np.zeros((H, W + 9, 3), np.uint8)),
         "0004.png: found 169x120 pixels, expected 160x120",

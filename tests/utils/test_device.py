@@ -89,11 +89,9 @@ def test_what_is_there_is_known_on_the_machine_that_runs_the_jobs(plain_torch: N
 
 
 def test_a_resumed_run_may_go_on_elsewhere(inside, small_run: Path, plain_torch: None, tmp_path: Path):
-    """Also one that was begun before there was a `device`."""
     run = tmp_path / "run"
     shutil.copytree(small_run, run)
     config = yaml.safe_load((run / "config.yaml").read_text())
-    del config["device"], config["limits"], config["compile"]
     config["trainer"]["accelerator"] = "auto"
     (run / "config.yaml").write_text(yaml.safe_dump(config))
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}

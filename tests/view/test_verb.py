@@ -110,7 +110,7 @@ def test_ctrl_c_ends_it_cleanly_and_nothing_is_written(scene: Scene, tmp_path: P
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(called, cwd=tmp_path, env=environment, preexec_fn=listen, **pipes)
     try:
-        line = process.stdout.readline()
+        line = next(line for line in process.stdout if not line.startswith("INFO"))
         assert line.startswith("small: http://127.0.0.1:"), line
     finally:
         process.send_signal(signal.SIGINT)
