@@ -242,30 +242,6 @@ def similarity(where: object, key: str, matrix: Shaped[np.ndarray, "..."]) -> Fl
     raise InputError(where, key, found, expected, "leave it out, and the frame is the file's own")
 
 
-def json_frames(path: Path, content: dict) -> tuple[list[str], Float[np.ndarray, "V 4 4"]]:
-    """File names and camera-to-world matrices of `frames`, in the file's own camera convention."""
-    require_keys(path, content, ["frames"])
-    frames = content["frames"]
-    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise InputError(path, "frames", "something else", "a list of objects with file_path and transform_matrix")
-    if not frames:
-        raise InputError(path, "frames", "an empty list", "at least one frame")
-    poses = []
-    for i, frame in enumerate(frames):
-        require_keys(f"{path}: frames[{i}]", frame, ["file_path", "transform_matrix"])
-        if not isinstance(frame["file_path"], str):
-            raise InputError(path, f"frames[{i}].file_path", repr(frame["file_path"])[:60], "a string")
-        key = f"frames[{i}].transform_matrix"
-        try:
-            pose = np.array(frame["transform_matrix"], dtype=np.float64)
-        except (ValueError, TypeError, OverflowError) as error:
-            raise InputError(path, key, f"no matrix ({error})", "4 rows of 4 numbers") from error
-        if pose.shape not in ((4, 4), (3, 4)):
-            raise InputError(path, key, f"shape {pose.shape}", "4 rows of 4 numbers")
-        poses.append(pose if len(pose) == 4 else np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]]))
-    return [frame["file_path"] for frame in frames], rigid_poses(path, "frames[{}].transform_matrix", np.stack(poses))
-
-
 def colour(where: object, key: str, value: Shaped[np.ndarray, "..."]) -> tuple[float, float, float]:
     """sRGB in [0, 1]."""
     red, green, blue = numeric(where, key, value, "3").tolist()
