@@ -17,8 +17,8 @@ MAX_SPOT = 0.05
 """Largest spread of the centres of a camera that turns on a spot, as a share of the depth of what it sees."""
 MAX_STRIP = 1.5
 """Largest spread of forward-facing cameras likewise; farther apart, they do not look at one thing."""
-ROUNDING = 1e-5
-"""Centres that spread by less than this share of their coordinates are the same."""
+SINGLE_ROUNDING, DOUBLE_ROUNDING = 5e-7, 1e-12
+"""Centres that spread by less than this share of their coordinates are the same, by the precision they are given in."""
 MIN_SCATTER = 0.5
 """Centres are noise where those of neighbours, in order and in direction, differ by at least this share of what any two do."""
 MIN_VIEWS_FOR_NOISE = 6
@@ -78,7 +78,9 @@ def centre_spread(c2w: Float[Tensor, "V 4 4"]) -> float:
     centres = c2w[:, :3, 3].double()
     distance = (centres - centres.median(0).values).norm(dim=1)
     spread = float(distance.median()) or float(distance.mean())
-    return spread if spread > ROUNDING * float(centres.abs().max()) else 0.0
+    is_single = bool((centres == centres.float()).all())
+    rounding = SINGLE_ROUNDING if is_single else DOUBLE_ROUNDING
+    return spread if spread > rounding * float(centres.abs().max()) else 0.0
 
 
 def median_depth(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> float | None:

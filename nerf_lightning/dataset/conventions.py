@@ -116,7 +116,9 @@ def judge_cameras(scene: Scene) -> Verdict:
     if held_out - chance >= HELD_OUT * (given - chance):
         return Verdict(fits=True)
     found = f"held-out photos whose poses explain {held_out:.0%} of the matches, those of training photos {given:.0%}"
-    return Verdict((Finding(found, "check which photos and poses each split has", True, inexact=True),), fits=True)
+    # Where few matches are right, those of a few held-out photos may all be wrong.
+    certain = given >= REFUTED
+    return Verdict((Finding(found, "check which photos and poses each split has", certain, inexact=True),), fits=True)
 
 
 def focal_hypothesis(matches: Matches, c2w: Float[np.ndarray, "V 4 4"], focal: float) -> Hypothesis:
@@ -251,4 +253,6 @@ def join_views(first: Views, second: Views) -> Views:
         bent = Lenses(*(torch.cat([getattr(x.lenses, key) for x in both]) for key in ("coefficients", "projection")))
     masked = first.known is not None or second.known is not None
     known = Runs.of(torch.cat([first.mask, second.mask])) if masked else None
-    return Views(torch.cat([first.pixels, second.pixels]), Cameras(K, c2w, sizes, bent), known)
+    channels = min(first.channels, second.channels)  # one of them may have alpha
+    pixels = torch.cat([views.pixels[:, :channels] for views in (first, second)])
+    return Views(pixels, Cameras(K, c2w, sizes, bent), known)

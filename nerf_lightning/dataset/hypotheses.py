@@ -27,6 +27,10 @@ ZOOMS = tuple(2.0 ** (step / 8) for step in range(-32, 57) if step)
 """Focal lengths that are tried, in those given: lenses in millimetres are up to a hundred times too short."""
 
 
+SIDEWAYS = "turn them, as dataset.orientation=exif does where their EXIF data say so"
+"""What to do about photos that lie on their sides."""
+
+
 @dataclass(frozen=True)
 class Hypothesis:
     """Cameras that a file may mean, and what is wrong with it if it does."""
@@ -162,7 +166,7 @@ def convention_hypotheses(c2w: Float[np.ndarray, "V 4 4"]) -> Iterator[Hypothesi
             found = "a mirrored world: left-handed axes, or photos that are flipped"
             todo = "negate one axis, of the world and of the cameras, or flip the photos back"
         elif change[2, 2] == 1:
-            found, todo = "photos that lie on their sides or upside down in their cameras", "turn the photos back"
+            found, todo = "photos that lie on their sides or upside down in their cameras", SIDEWAYS
         else:
             found, todo = "camera axes in another order", "the columns of a rotation are the camera's axes in the world"
         rare = bool(change[2, 2] != 1)

@@ -149,7 +149,8 @@ def misfits(scene: Scene) -> Iterator[Doubt]:
         text = f"content beyond the box: the box explains {explained:.0%} of what the photos show"
         yield Doubt(text, hopeless=explained < FITS)
     elif (mistake := outlined_by(masks, views.cameras.c2w.double().numpy(), views.cameras)) is not None:
-        yield Doubt(f"{mistake.found}: so the outlines are those of one body", hopeless=True, todo=mistake.todo)
+        text = f"{mistake.found}: so the outlines are those of one body, and as read {explained:.0%} of one"
+        yield Doubt(text, hopeless=explained < FITS_BADLY, todo=mistake.todo)
     else:
         text = (
             f"outlines that no body has: the photos together can explain {explained:.0%} of what each shows."
@@ -183,15 +184,19 @@ def outlined_by(
     """The first of the likeliest mistakes without which some body has all silhouettes."""
     for mistake in islice(convention_hypotheses(c2w), LIKELIEST):
         mended = replace(cameras, c2w=torch.from_numpy(mistake.c2w).float())
-        if hull_coverage(masks, mended, Bounds(torch.from_numpy(visible_cube(mended)).float())) >= FITS_WELL:
+        box = Bounds(torch.from_numpy(visible_cube(mended)).float())
+        # Cameras that look in all directions share no view: each silhouette would have a body of its own.
+        if hull_coverage(masks, mended, box, least=0.5 * len(masks)) >= FITS_WELL:
             return mistake
     return None
 
 
-def hull_coverage(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Cameras, bounds: Bounds) -> float:
-    """Share of the silhouettes that their visual hull within the bounds covers, in [0, 1]."""
+def hull_coverage(
+    masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Cameras, bounds: Bounds, least: float = 1
+) -> float:
+    """Share of the silhouettes that their visual hull within the bounds covers, in [0, 1]; `least` views must see its parts."""
     seen = list(sightings(bounds.aabb.double().numpy(), HULL, cameras))
-    hull = visual_hull(masks, seen, least=1)
+    hull = visual_hull(masks, seen, least)
     covered = []
     for mask, sighting in zip(masks, seen, strict=True):
         shown = np.zeros(mask.shape, np.uint8)
