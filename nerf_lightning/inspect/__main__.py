@@ -17,6 +17,8 @@ def options(
     masked: str,
     invert_masks: bool,
     undistort: bool,
+    bounded: str | bool,
+    orientation: str,
 ) -> None:
     """The keys of conf/inspect.yaml, for checking."""
 

@@ -27,12 +27,21 @@ class Heard(logging.Handler):
 
 
 def inspect(
-    scene: str, output: str | None, resize: int | None, holdout: int, masked: str, invert_masks: bool, undistort: bool
+    scene: str,
+    output: str | None,
+    resize: int | None,
+    holdout: int,
+    masked: str,
+    invert_masks: bool,
+    undistort: bool,
+    bounded: str | bool = "auto",
+    orientation: str = "auto",
 ) -> None:
     """Writes a page about a scene, and says what was found.
 
     Args:
-        scene, resize, holdout, masked, invert_masks, undistort: see `open_scene`.
+        scene: see `open_scene`.
+        resize, holdout, masked, invert_masks, undistort, bounded, orientation: see `Reading`.
         output: the page; None puts `inspection.html` where the command runs.
 
     Raises:
@@ -42,7 +51,8 @@ def inspect(
     log = logging.getLogger("nerf_lightning")
     log.addHandler(heard)
     try:
-        found = open_scene(scene, reading=Reading(resize, holdout, masked, invert_masks, undistort))
+        how = Reading(resize, holdout, masked, invert_masks, undistort, str(bounded).lower(), orientation)
+        found = open_scene(scene, reading=how)
         doubts = doubts_about(found)
     finally:
         log.removeHandler(heard)
