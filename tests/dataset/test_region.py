@@ -133,6 +133,16 @@ def test_photos_are_matched_where_poses_do_not_tell_the_depth(c2w: torch.Tensor,
     assert float((places.norm(dim=1) - 3).abs().median()) < 0.3, "most points lie on the ball"
 
 
+def test_georeferenced_cameras_have_the_region_of_those_at_the_origin():
+    here, there = ring(24, 0, 25.0), ring(24, 0, 25.0)
+    shift = torch.tensor([449500.25, 5411200.75, 210.5], dtype=torch.float64)
+    there[:, :3, 3] += shift
+    near, far = find_region(here), find_region(there)
+    assert far.layout == near.layout == Layout.INWARD
+    torch.testing.assert_close(far.centre - shift, near.centre, atol=1e-6, rtol=0)
+    assert far.unit == pytest.approx(near.unit)
+
+
 def test_rounding_far_from_the_origin_is_no_motion():
     c2w = pan()
     c2w[:, :3, 3] = (1000 + CENTRE + 1e-4 * torch.randn(len(c2w), 3, generator=torch.manual_seed(0))).float().double()

@@ -62,7 +62,7 @@ def load_npz(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -
     K = _intrinsics(path, data, width, height)
 
     def cameras(c2w: Float[np.ndarray, "V 4 4"]) -> Cameras:
-        return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w).float(), width, height)
+        return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height)
 
     poses = {key: checks.rigid_poses(path, key + "[{}]", data[key]) for key in PAIRS.values() if key in data}
     posed = {
