@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.cameras import Distortion, Projection
+from nerf_lightning.cameras import Distortion, Projection, in_other_frame
 from nerf_lightning.dataset import Reading, Scene, Views, open_scene
 from nerf_lightning.dataset.formats.colmap_cameras import MODELS, NUMBERS, optics_of
 from nerf_lightning.dataset.optics import Optics
@@ -177,7 +177,9 @@ def test_a_real_capture_is_the_same_in_both_formats(real_data: Path, tmp_path: P
     (tmp_path / "images").symlink_to(real_data / "cup" / "images")
     (tmp_path / "poses_bounds.npy").symlink_to(real_data / "cup" / "poses_bounds.npy")
     b = open_scene(str(tmp_path), reading=Reading(resize=40))
-    torch.testing.assert_close(a.train.cameras.c2w, b.train.cameras.c2w, atol=1e-5, rtol=0)
+    # The model's points move the region of detail: poses agree in the files' frame.
+    poses = [in_other_frame(scene.train.cameras.c2w, scene.to_source).float() for scene in (a, b)]
+    torch.testing.assert_close(*poses, atol=1e-4, rtol=0)
     assert a.bounds.unbounded and len(a.train) == 67
 
 
