@@ -61,7 +61,7 @@ def classify_layout(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"] | 
     if circular_variance(axes) <= MAX_FORWARD_SPREAD:
         too_wide = depth is not None and spread > MAX_STRIP * depth
         return Layout.WALK if too_wide or is_dolly(centres, axes) else Layout.FORWARD
-    if convergence(c2w, gaze_point(c2w)) >= MIN_CONVERGENCE:
+    if find_convergence(c2w) is not None:
         return Layout.INWARD
     if depth is None and len(c2w) >= MIN_VIEWS_FOR_NOISE and is_noise(centres, axes):
         return Layout.PAN
@@ -122,6 +122,14 @@ def convergence(c2w: Float[Tensor, "V 4 4"], point: Float[Tensor, "3"]) -> float
     if variance < PARALLEL:
         return 0.0
     return 1 - (1 - float(gaze(c2w, point[None].double())[0].mean())) / variance
+
+
+def find_convergence(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"] | None:
+    """The point that cameras look at together, double precision; None where they look at none."""
+    if centre_spread(c2w) == 0:
+        return None
+    target = gaze_point(c2w)
+    return target if convergence(c2w, target) >= MIN_CONVERGENCE else None
 
 
 def gaze(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> Float[Tensor, "P V"]:

@@ -10,14 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras.cameras import Cameras
-from nerf_lightning.cameras.layout import (
-    MIN_CONVERGENCE,
-    Layout,
-    centre_spread,
-    classify_layout,
-    convergence,
-    gaze_point,
-)
+from nerf_lightning.cameras.layout import Layout, centre_spread, classify_layout, find_convergence
 from nerf_lightning.cameras.orbit import look_at, typical_view, upward
 from nerf_lightning.cameras.upright import held
 
@@ -64,9 +57,9 @@ def orbit_like(
         poses = turn_on_spot(c2w, up, frames)
     else:
         if centre is None:
-            converges = centre_spread(c2w) > 0 and convergence(c2w, gaze_point(c2w)) >= MIN_CONVERGENCE
             ahead = c2w[:, :3, 3].mean(0) + (4 * centre_spread(c2w) or 1.0) * normalize(c2w[:, :3, 2].mean(0), dim=0)
-            centre = gaze_point(c2w) if converges else ahead
+            target = find_convergence(c2w)
+            centre = ahead if target is None else target
         build = turn_around if layout == Layout.INWARD else loop_before
         poses = build(c2w, centre.double(), up, frames)
     typical = typical_view(cameras)
@@ -255,8 +248,7 @@ def resample_path(cameras: Cameras, frames: int, closed: bool) -> Cameras:
 def pivot_of(path: Cameras) -> Float[Tensor, "3"]:
     """What a viewer turns about that starts at a path's first view: the subject, or a place ahead where there is none."""
     c2w = path.c2w
-    target = gaze_point(c2w)
-    if centre_spread(c2w) > 0 and convergence(c2w, target) >= MIN_CONVERGENCE:
+    if (target := find_convergence(c2w)) is not None:
         return target.to(c2w)
     return c2w[0, :3, 3] + (centre_spread(c2w) or 1.0) * c2w[0, :3, 2]
 
@@ -272,11 +264,11 @@ def spiral_like(orbit: Cameras, frames: int = 60) -> Cameras:
         frames: number of poses; the last stops one step short of the first.
     """
     layout = classify_layout(orbit.c2w)
-    converges = centre_spread(orbit.c2w) > 0 and convergence(orbit.c2w, gaze_point(orbit.c2w)) >= MIN_CONVERGENCE
-    if layout in (Layout.PAN, Layout.WALK) or not converges:
+    target = find_convergence(orbit.c2w)
+    if layout in (Layout.PAN, Layout.WALK) or target is None:
         return resample_path(orbit, frames, closed=True)
     up = upward(orbit)
-    centre = gaze_point(orbit.c2w).to(up)
+    centre = target.to(up)
     offset = orbit.centres - centre
     flat = normalize(offset - (offset @ up)[:, None] * up, dim=1)
     build = wind_up if float(flat.mean(0).norm()) < ONE_SIDED else wind_in

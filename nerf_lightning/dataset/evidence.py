@@ -84,6 +84,12 @@ def detect_features(image: UInt8[np.ndarray, "H W C"], known: Bool[np.ndarray, "
     return Features(places * [width / size[0], height / size[1]], together)
 
 
+def detect_in_view(views: Views, view: int) -> Features:
+    """The same of one of several photos, where it is not masked."""
+    known = None if views.known is None else views.mask_of(view).numpy()
+    return detect_features(views.image(view).numpy(), known)
+
+
 def match(first: Features, second: Features) -> Float[np.ndarray, "M 2 2"]:
     """Places of features that are each other's nearest, and clearly so."""
     if min(len(first.places), len(second.places)) < 2:
@@ -126,10 +132,7 @@ def pose_distances(c2w: Float[Tensor, "V 4 4"]) -> Float[np.ndarray, "V V"]:
 
 def find_pairs(views: Views) -> list[Pair]:
     """Matches between photos that seem to show the same, or whose cameras stand side by side."""
-    features = [
-        detect_features(views.image(view).numpy(), None if views.known is None else views.mask_of(view).numpy())
-        for view in range(len(views))
-    ]
+    features = [detect_in_view(views, view) for view in range(len(views))]
     counts = count_matches(features)
     by_photo = np.argsort(-counts, axis=1, kind="stable")[:, :PARTNERS_BY_PHOTO]
     by_pose = np.argsort(pose_distances(views.cameras.c2w), axis=1, kind="stable")[:, 1 : 1 + PARTNERS_BY_POSE]

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.dataset.evidence import detect_features, match
+from nerf_lightning.dataset.evidence import detect_in_view, match
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.utils.evenly import evenly
@@ -45,11 +45,7 @@ def match_points(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor,
     sizes = torch.tensor([fit_size(width, height, MAX_SIDE) for width, height in views.cameras.sizes.tolist()])
     found = [torch.zeros(0, 3)]
     for first, second in neighbours(local):
-        features = []
-        for view in (first, second):
-            known = None if views.known is None else views.mask_of(view).numpy()
-            features.append(detect_features(views.image(view).numpy(), known))
-        places = match(*features)
+        places = match(detect_in_view(views, first), detect_in_view(views, second))
         if len(places):
             pair = torch.tensor([first, second])
             shares = places / views.cameras.sizes[pair].numpy()

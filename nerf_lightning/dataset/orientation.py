@@ -4,11 +4,10 @@ import logging
 from pathlib import Path
 
 from nerf_lightning.dataset.formats.decode import image_header
-from nerf_lightning.dataset.formats.exif import exif_tags
+from nerf_lightning.dataset.formats.header import read_header
 
 log = logging.getLogger(__name__)
 
-ORIENTATION_TAG = 0x0112
 MAX_ASPECT_ERROR = 0.01
 """Most relative difference of two shapes that count as one: reduced photos are rounded to whole pixels."""
 
@@ -39,7 +38,8 @@ class OrientationChooser:
             InputError: see `image_header`.
         """
         width, height, _ = image_header(photo)
-        if exif_tags(photo).get(ORIENTATION_TAG, 1) == 1:
+        header = read_header(photo)
+        if header is None or header.orientation == 1:
             return width, height, False
         turned = image_header(photo, upright=True)[:2]
         fits = stated is None or has_shape((width, height), stated)

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.cameras import Layout, classify_layout, gaze_point
-from nerf_lightning.cameras.layout import MAX_POINTS, MIN_CONVERGENCE, centre_spread, convergence, gaze, median_depth
+from nerf_lightning.cameras import Layout, classify_layout
+from nerf_lightning.cameras.layout import MAX_POINTS, centre_spread, find_convergence, gaze, median_depth
 
 MAX_VIEWS = 128
 """Evenly chosen views that tell where points are looked at."""
@@ -80,14 +80,13 @@ def find_region(
     local[:, :3, 3] = (local[:, :3, 3] - origin) * moves  # what is left of one place is rounding
     known = _enough(None if points is None else points.double() - origin)
     layout = classify_layout(local, known)
-    target = gaze_point(local)
-    converges = moves and convergence(local, target) >= MIN_CONVERGENCE
-    if known is None and moves and not converges and match is not None:
+    target = find_convergence(local)
+    if known is None and moves and target is None and match is not None:
         matched = match()
         known = _enough(None if matched is None else matched.double() - origin)
         layout = classify_layout(local, known)
     if layout in (Layout.INWARD, Layout.FORWARD):
-        region = _subject(local, layout, target if converges else None, known)
+        region = _subject(local, layout, target, known)
     else:
         region = _surroundings(local, layout, known)
     found = None if known is None else known + origin

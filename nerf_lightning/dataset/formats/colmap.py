@@ -143,14 +143,6 @@ def has_images(folder: Path) -> bool:
     return folder.is_dir() and next(walk_images(folder), None) is not None
 
 
-def _is_file(path: Path) -> bool:
-    """Whether it is one; a name too long or a loop of links is none."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
-
-
 def report_unplaced(root: Path, placed: list[Path]) -> None:
     """Names photos beside the placed ones that the model does not place."""
     folders = {file.parent for file in placed}
