@@ -117,7 +117,7 @@ class RenderPlan:
         """Seconds that a pixel of a job takes."""
         return (self.pixel_seconds or 0.0) + need.scored * self.score_seconds
 
-    def _allotted(self, needs: Mapping[str, Need], allowance: float) -> dict[str, float]:
+    def _divide_seconds(self, needs: Mapping[str, Need], allowance: float) -> dict[str, float]:
         """Seconds of each job: what it renders in any case, and a share of the time beside."""
         least, more = {}, {}
         for job, need in needs.items():
@@ -137,8 +137,8 @@ class RenderPlan:
             allowance: seconds for all rendering of the run.
         """
         needed = self._cost(needs[job]) * needs[job].pixels
-        return min(1.0, self._allotted(needs, allowance)[job] / needed) if needed else 1.0
+        return min(1.0, self._divide_seconds(needs, allowance)[job] / needed) if needed else 1.0
 
     def seconds_left(self, needs: Mapping[str, Need], allowance: float) -> float | None:
         """Of all jobs together; None before the first view."""
-        return None if self.pixel_seconds is None else sum(self._allotted(needs, allowance).values())
+        return None if self.pixel_seconds is None else sum(self._divide_seconds(needs, allowance).values())

@@ -210,7 +210,7 @@ def order_hypotheses(scene: Scene, c2w: Float[np.ndarray, "V 4 4"], kept: Int[np
     alphabetical = np.array(sorted(range(count), key=lambda i: names[i])) if names else np.arange(count)
     numeric = np.array(sorted(range(count), key=lambda i: numeric_key(names[i]))) if names else alphabetical
 
-    def reordered(source: Int[np.ndarray, "V"], target: Int[np.ndarray, "V"]) -> Float[np.ndarray, "K 4 4"]:
+    def reorder(source: Int[np.ndarray, "V"], target: Int[np.ndarray, "V"]) -> Float[np.ndarray, "K 4 4"]:
         moved = c2w.copy()
         moved[target] = c2w[source]
         return moved[kept]
@@ -220,14 +220,14 @@ def order_hypotheses(scene: Scene, c2w: Float[np.ndarray, "V 4 4"], kept: Int[np
         for step, where in ((1, "before"), (-1, "after")):
             # Read: each photo has the pose of the one before it; so its own is at the next.
             found = f"poses that are those of the photos {where} them in the order of names"
-            yield Hypothesis(found, todo, reordered(np.roll(order, -step), order))
-        yield Hypothesis("poses in the reverse order of the photos", todo, reordered(order[::-1], order))
+            yield Hypothesis(found, todo, reorder(np.roll(order, -step), order))
+        yield Hypothesis("poses in the reverse order of the photos", todo, reorder(order[::-1], order))
     if (alphabetical != numeric).any():
         found = (
             "poses in another order than the photos, whose names sort otherwise as numbers (2, 10) than as text (10, 2)"
         )
-        yield Hypothesis(found, todo, reordered(alphabetical, numeric))
-        yield Hypothesis(found, todo, reordered(numeric, alphabetical))
+        yield Hypothesis(found, todo, reorder(alphabetical, numeric))
+        yield Hypothesis(found, todo, reorder(numeric, alphabetical))
 
 
 def numeric_key(name: str) -> list[tuple[int, str]]:
