@@ -10,8 +10,12 @@ from cyclopts import App, Parameter
 from cyclopts.exceptions import CycloptsError
 
 from nerf_lightning import __version__
+from nerf_lightning.cli.check import check
 from nerf_lightning.cli.evaluate import evaluate
+from nerf_lightning.cli.export import export
+from nerf_lightning.cli.render import render
 from nerf_lightning.cli.train import is_override, train
+from nerf_lightning.cli.view import view
 from nerf_lightning.errors import InputError
 
 TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
@@ -27,8 +31,13 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for function in (train, evaluate):
-    app.command(function, sort_key=len(app.resolved_commands()))
+for function in (train, check, view, render, evaluate, export):
+    position = len(app.resolved_commands())
+    if isinstance(function, App):  # with sub-commands
+        function.sort_key = position
+        app.command(function)
+    else:
+        app.command(function, sort_key=position)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
