@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 @command
 def view(
-    path: Annotated[Path | None, Parameter(help="A run, a folder of runs for its newest, or a scene; default: the latest run.")] = None,
+    path: Annotated[
+        Path | None, Parameter(help="A run, a folder of runs for its newest, or a scene; default: the latest run.")
+    ] = None,
     /,
     *,
     resize: Count | Literal["auto"] | None = "auto",

@@ -97,7 +97,9 @@ def smallest(
                 return tried[-1]
     best = min(tried, key=lambda compact: compact.loss)
     found = f"{best.loss:.2f} dB lost with --precision {best.precision}"
-    advice = f"allow it with --loss-db {best.loss + 0.005:.2f}" + (", or --precision half" if precision == "byte" else "")
+    advice = f"allow it with --loss-db {best.loss + 0.005:.2f}" + (
+        ", or --precision half" if precision == "byte" else ""
+    )
     raise InputError("export", "loss_db", found, f"at most {most_loss:g} dB", advice)
 
 

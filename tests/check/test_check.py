@@ -72,14 +72,14 @@ def test_sharpness_does_not_depend_on_exposure(views: Views):
     assert sharpness(cv2.GaussianBlur(image, (0, 0), 1.5)) < 0.7 * sharpness(image)
 
 
-def test_check_page_shows_everything_the_worst_first(
-    views: Views, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_check_page_shows_everything_the_worst_first(views: Views, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = capture(tmp_path / "a <b>", views, {9: lambda image: cv2.GaussianBlur(image, (0, 0), 1.5)})
     (folder / "images/9999.png").write_bytes((folder / "images/0000.png").read_bytes())
     page = tmp_path / "page.html"
     found = check(folder, output=page, resize=64)
-    assert any(line.startswith("0009.png: blurred") for line in found) and "0009.png: blurred" in capsys.readouterr().out
+    assert (
+        any(line.startswith("0009.png: blurred") for line in found) and "0009.png: blurred" in capsys.readouterr().out
+    )
     text = page.read_text(encoding="utf-8")
     assert "14 to train on, 2 held out" in text and "16 of 64 x 64" in text
     assert "1 photos have no place in the model, 9999.png" in text and "<b>" not in text.split("<figure")[0]

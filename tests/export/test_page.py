@@ -188,7 +188,10 @@ def test_field_page_settings_leave_the_subject_visible_and_escape_closes_them(br
     assert page.evaluate("field.renderer.look.keep") == [0, 0, 0, 1, 0.25, 1]
     page.click("#uncrop")
     assert page.evaluate("field.renderer.look.keep") == [0, 0, 0, 1, 1, 1]
-    assert all(page.locator("#panel :is(input, select)").nth(i).evaluate("x => Boolean(x.labels.length || x.ariaLabel)") for i in range(11))
+    assert all(
+        page.locator("#panel :is(input, select)").nth(i).evaluate("x => Boolean(x.labels.length || x.ariaLabel)")
+        for i in range(11)
+    )
     assert not wrong
     page.close()
 

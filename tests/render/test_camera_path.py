@@ -120,7 +120,9 @@ def test_read_path_frame_is_that_of_the_run_or_the_file(tmp_path: Path, capsys: 
         torch.testing.assert_close(read.c2w, path.c2w, atol=1e-4, rtol=0)
         torch.testing.assert_close(read.K, path.K, atol=1e-3, rtol=0)
         assert (read.width, read.height) == (16, 12)
-        assert "in the world frame of the photos' own file (--path-frame run takes the other)" in capsys.readouterr().out
+        assert (
+            "in the world frame of the photos' own file (--path-frame run takes the other)" in capsys.readouterr().out
+        )
         read = build_path(str(file), None, path, None, to_source, "run").cameras
         torch.testing.assert_close(read.c2w, in_file, atol=1e-4, rtol=0)
         assert "in the run's frame" in capsys.readouterr().out

@@ -24,9 +24,7 @@ def run(small_run: Path, tmp_path: Path) -> Path:
     return shutil.copytree(small_run, tmp_path / "run")
 
 
-def test_render_frames_show_what_the_system_renders(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_render_frames_show_what_the_system_renders(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     output = render(run, frames=2, output=tmp_path / "frames", background="0.2,0.4,0.6", device="cpu")
     assert "2 frames of 16 x 16 pixels" in capsys.readouterr().out
     found = load_run(run)
