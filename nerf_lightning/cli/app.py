@@ -11,8 +11,12 @@ from cyclopts import App, Parameter
 from cyclopts.exceptions import CycloptsError
 
 from nerf_lightning import __version__
+from nerf_lightning.cli.check import check
 from nerf_lightning.cli.evaluate import evaluate
+from nerf_lightning.cli.export import export
+from nerf_lightning.cli.render import render
 from nerf_lightning.cli.train import describe_groups, is_override, train
+from nerf_lightning.cli.view import view
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leave, listen
 from nerf_lightning.utils.files import full_disk, no_room
@@ -33,8 +37,8 @@ app = App(
 )
 _help = f"{inspect.cleandoc(train.__doc__ or '')}\n{describe_groups()}"
 app.command(train, help=_help, help_format="plaintext", usage="Usage: nerf_lightning train KEY=VALUE...\n")
-for _function in (evaluate,):
-    app.command(_function)
+for _command in (check, view, render, evaluate, export):
+    app.command(_command)
 for _number, _name in enumerate(app.resolved_commands()):
     app[_name].sort_key = _number
 app.register_install_completion_command()
