@@ -3,7 +3,6 @@
 import io
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,19 +10,14 @@ import pytest
 import torch
 from once import once
 
-from nerf_lightning.config import cli
+from nerf_lightning.cli.export import export_compact
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.__main__ import task
 from nerf_lightning.runs.compact import decode, load_compact
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.stability.toys import MARBLE, toy
 from nerf_lightning.training.train import train
-
-
-def export(folder: Path, *given: str) -> None:
-    task(composed([f"run={folder}", *given], folder, "export"))
 
 
 def trained(folder: Path, recipe: str = "tensorf_small", *more: str) -> Path:
@@ -65,7 +59,7 @@ def test_it_shows_what_the_run_shows_in_far_fewer_bytes(
     recipe: str, more: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     folder = trained(tmp_path, recipe, *more, "budget.steps=80")  # after 40, one of 400 pixels may make 0.3 dB
-    export(folder)
+    export_compact(folder)
     assert "dB lost" in capsys.readouterr().out
     run, small = load_run(folder).system, load_compact(folder / "compact.npz").system
     held = sum(tensor.numel() * tensor.element_size() for tensor in run.state_dict().values())
@@ -83,7 +77,7 @@ def test_halves_are_nearer_than_bytes(run_folder: Path):
     planes = load_run(folder).system.field.density_volume.planes.detach()
     for precision in ("half", "byte"):
         path = folder / f"{precision}.npz"
-        export(folder, f"precision={precision}", f"output={path}")
+        export_compact(folder, precision=precision, output=path)
         kept = load_compact(path).system.field.density_volume.planes.detach()
         used = kept.any(-1) if precision == "half" else used  # bytes do not tell nothing from the least
         errors[precision], sizes[precision] = float((kept - planes)[used].abs().max()), path.stat().st_size
@@ -94,7 +88,7 @@ def test_halves_are_nearer_than_bytes(run_folder: Path):
 def test_pictures_too(tmp_path: Path):
     given = ["+experiment=picture", "dataset.max_side=32", "budget.steps=40", "threads=1", "~logger"]
     train(composed([*given, *(f"callbacks.{one}=null" for one in ("training_gif", "charts", "baselines"))], tmp_path))
-    export(tmp_path)
+    export_compact(tmp_path)
     assert load_compact(tmp_path / "compact.npz").orbit is None
 
 
@@ -106,9 +100,9 @@ def test_too_much_lost_is_refused_and_nothing_written(run_folder: Path, monkeypa
     monkeypatch.setattr(smallest, "held_out_psnr", lambda *_: next(scores))
     monkeypatch.setattr(smallest, "seen_cells", lambda system, _: smallest.occupied_cells(system) & False)  # not all
     with pytest.raises(
-        InputError, match=r"0\.30 dB lost with precision=half, expected at most 0\.1 dB; allow it with loss=0\.3"
+        InputError, match=r"0\.30 dB lost with --precision half, expected at most 0\.1 dB; allow it with --loss-db 0\.3"
     ):
-        export(folder)
+        export_compact(folder)
     assert not (folder / "compact.npz").exists()
 
 
@@ -116,28 +110,9 @@ def test_moved_photos_can_be_pointed_at(tmp_path: Path):
     folder = trained(tmp_path)
     (folder / "scene.npz").rename(folder / "moved.npz")
     with pytest.raises(InputError, match=r"scene\.npz"):
-        export(folder)
-    export(folder, f"dataset.path={folder}/moved.npz")
+        export_compact(folder)
+    export_compact(folder, photos=folder / "moved.npz")
     assert (folder / "compact.npz").exists()
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (["format=zip"], "format: found 'zip', expected compact"),
-        (["precision=nibble"], "precision: found 'nibble'"),
-        (["loss=-1"], "loss: found -1, expected a number at least 0"),
-        (["run=missing"], "missing/config.yaml: found nothing there"),
-    ],
-)
-def test_bad_input_is_told_in_one_line(
-    given: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.setattr(sys, "argv", ["export", f"run={tmp_path}", *given])
-    with pytest.raises(SystemExit) as stop:
-        cli.run("export", task)
-    line = capsys.readouterr().err
-    assert stop.value.code == 2 and line.count("\n") == 1 and message in line
 
 
 def changed(content: bytes, **arrays: np.ndarray) -> bytes:
@@ -155,7 +130,7 @@ def with_header(content: bytes, **values: object) -> bytes:
 
 
 def test_what_is_broken_or_not_trusted_is_refused(run_folder: Path):
-    export(run_folder)
+    export_compact(run_folder)
     content = (run_folder / "compact.npz").read_bytes()
     for broken in (b"", b"no zip at all", content[: len(content) // 2]):
         with pytest.raises(InputError, match="expected a compact file"):
