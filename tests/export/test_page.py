@@ -314,7 +314,9 @@ def test_picture_page_shows_the_whole_image(browser: Any, tmp_path: Path):
     page = browser.new_page(viewport={"width": 300, "height": 300})
     page.goto((tmp_path / "field.html").as_uri())
     page.wait_for_selector("#picture[style]")
-    assert page.locator("#picture").bounding_box() == {"x": 0, "y": 75, "width": 300, "height": 150}
+    assert page.locator("#picture").bounding_box() == {"x": 0, "y": 42, "width": 300, "height": 150}, (
+        "above the toolbar"
+    )
     page.close()
 
 
