@@ -11,6 +11,7 @@ import lightning as L
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
@@ -168,7 +169,8 @@ def train(
         report(results.summary, folder, trainer.logger)
     live = attached(trainer, Live)
     if live is not None:
-        live.stay_open(results.summary["psnr"])
+        in_sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+        live.finish(results.summary["psnr"], stay=not in_sweep)
     quality: float | None = results.summary["psnr"]
     return math.nan if quality is None else quality  # views of a field that has broken down may have none
 
