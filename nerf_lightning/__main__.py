@@ -14,8 +14,8 @@ from hydra.types import RunMode
 from nerf_lightning.config import cli
 from nerf_lightning.config.literal import override_of
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.ending import Interrupted
 from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.signals import Interrupted
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -35,7 +35,7 @@ def train(cfg: "DictConfig") -> float | None:
         folder = Path(HydraConfig.get().runtime.output_dir)
         if (folder / "checkpoints" / "last.ckpt").exists():
             given = shlex.quote(f"resume={os.path.relpath(folder)}")
-            interrupted.go_on = f"go on with: python -m nerf_lightning {given}"
+            interrupted.hint = f"continue with: python -m nerf_lightning {given}"
         raise
 
 

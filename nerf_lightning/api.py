@@ -4,6 +4,7 @@ import logging
 import math
 import os
 import random
+import signal
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -33,10 +34,10 @@ from nerf_lightning.runs.owner import Taken, may_overwrite, own_folder
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train as train_configured
 from nerf_lightning.utils.device import the_device
-from nerf_lightning.utils.ending import listening
 from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.libraries import NOISY
 from nerf_lightning.utils.options import check_options
-from nerf_lightning.utils.quiet import NOISY
+from nerf_lightning.utils.signals import Interrupted, handle_signals
 
 
 @dataclass(frozen=True)
@@ -168,13 +169,16 @@ def train(
     ]
     if recipe is not None:
         given.append(f"recipe={recipe}")
-    with undisturbed(), listening():
-        cfg = composed([*given, *options], place)
-        try:
+    try:
+        with undisturbed(), handle_signals():
+            cfg = composed([*given, *options], place)
             with own_folder(place, may_overwrite(cfg), renamed=folder is None) as place:
                 train_configured(cfg, folder=place, scene=scene)
-        except Taken as error:
-            raise FileExistsError(f"{error}; load_run opens it, another folder= keeps both") from error
+    except Taken as error:
+        raise FileExistsError(f"{error}; load_run opens it, another folder= keeps both") from error
+    except Interrupted as interrupted:
+        signal.raise_signal(interrupted.signum)  # to the caller's own handlers
+        raise
     return load_run(place, device)
 
 

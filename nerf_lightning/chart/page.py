@@ -9,8 +9,8 @@ from nerf_lightning.chart.comparison import COSTS, Comparison
 from nerf_lightning.chart.points import Point
 from nerf_lightning.chart.references import Reference
 from nerf_lightning.runs.index import FIELD_PAGE
-from nerf_lightning.utils.html import address_from, script_data
 from nerf_lightning.utils.machine import crowding
+from nerf_lightning.utils.text import relative_url, script_data
 
 TEMPLATE = """<!DOCTYPE html>
 <html lang="en">
@@ -135,7 +135,7 @@ def _card(point: Point, fronts: Sequence[str], folder: Path) -> dict[str, Any]:
     left_out = [key for key in point.configuration if key.startswith("trainer.") or key.endswith("_partial_")]
     options = [(key, str(value)) for key, value in point.configuration.items() if key not in left_out]
     page = point.typical.folder / FIELD_PAGE
-    address = address_from(folder, page) if page.is_file() else None
+    address = relative_url(folder, page) if page.is_file() else None
     return {"title": point.label, "figures": figures, "options": options, "page": address}
 
 

@@ -4,7 +4,6 @@ import functools
 import os
 import re
 import sys
-import threading
 import traceback
 from argparse import Namespace
 from collections.abc import Callable, Sequence
@@ -22,9 +21,9 @@ from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses
 from nerf_lightning.config.keys import check_keys, without_nulls
 from nerf_lightning.config.literal import escape, override_of, parse_argument, quote_texts
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leave, listen
 from nerf_lightning.utils.files import full_disk, no_room, output_path, remove_empty, user_path
-from nerf_lightning.utils.waiting import wait_briefly
+from nerf_lightning.utils.libraries import shorten_openmp_waits
+from nerf_lightning.utils.signals import Interrupted, exit_on_signal
 
 BAD_INPUT = InputError | HydraException | OmegaConfBaseException
 """What a user can mend. Hydra and OmegaConf also notice it late, as a reference to a key that is not there."""
@@ -48,7 +47,7 @@ def by_path(arguments: Sequence[str], folder: Path) -> list[str]:
     for argument in arguments:
         key, _, value = argument.partition("=")
         if key == "+experiment" and value.endswith(".yaml") and (path := user_path(value)).is_file():
-            from nerf_lightning.utils.untrusted import read_yaml
+            from nerf_lightning.utils.parsing import read_yaml
 
             read_yaml(path, "an experiment in YAML")  # Hydra reads without limits
             argument = override_of(key, os.path.relpath(path.with_suffix(""), folder / "experiment"))
@@ -108,7 +107,7 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
     Bad input is anything the user can fix: it gets one line. Anything else is a defect and keeps its traceback.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing its own report and exiting with 1
-    wait_briefly()
+    shorten_openmp_waits()
     started = False
 
     @functools.wraps(task)
@@ -130,33 +129,19 @@ def run(config: str, task: Callable[[DictConfig], object], texts: Sequence[str] 
                 give_up(told)  # here, as Hydra would add a line
             raise
 
-    threading.excepthook = _untold
-    listen()
     try:
-        flags = check_flags(sys.argv[1:])
-        given = without_nulls(by_path(sys.argv[1:], conf_dir()))
-        sweep = flags.multirun or (None if config == "config" else False)
-        sys.argv[1:] = to_folders(quote_texts(given, (*texts, *FOLDERS), sweep))
-        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
+        with exit_on_signal():
+            flags = check_flags(sys.argv[1:])
+            given = without_nulls(by_path(sys.argv[1:], conf_dir()))
+            sweep = flags.multirun or (None if config == "config" else False)
+            sys.argv[1:] = to_folders(quote_texts(given, (*texts, *FOLDERS), sweep))
+            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config)(job)()
     except Exception as error:
         # Before the task starts only Hydra is at work, on the command line: any error then is bad input.
         told = as_told(error)
         if started and not isinstance(told, BAD_INPUT):
             raise
         give_up(told)
-    except BaseException as error:  # whatever a signal has become on its way
-        number = asked()
-        if number is None:
-            raise
-        leave(number, error.go_on if isinstance(error, Interrupted) else AGAIN)
-    finally:
-        be_deaf()
-
-
-def _untold(of: threading.ExceptHookArgs) -> None:
-    """A thread that meets a full disk, as TensorBoard's does, says nothing: whoever gives it more to write is told."""
-    if not full_disk(of.exc_value):
-        threading.__excepthook__(of)
 
 
 def as_told(error: BaseException) -> BaseException:

@@ -19,7 +19,7 @@ from nerf_lightning.model import TensoRFField, VoxelField
 from nerf_lightning.model.layers.activation import SoftenableReLU, shifted_softplus
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.utils.html import script_data
+from nerf_lightning.utils.text import script_data
 
 SCRIPTS = ("common.js", "compact.js", "textures.js", "camera.js", "renderer.js", "page.js")
 PICTURE_SCRIPTS = ("common.js", "picture.js")

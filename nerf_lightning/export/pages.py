@@ -22,9 +22,8 @@ from nerf_lightning.runs.folder import RunFolder, plain_config
 from nerf_lightning.runs.index import FIELD_PAGE, find_runs, read_run, varied
 from nerf_lightning.runs.open import open_run
 from nerf_lightning.system import NeRF2D, NeRF3D
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic, output_path
-from nerf_lightning.utils.html import address_from
+from nerf_lightning.utils.text import relative_url, subsample
 
 MOST_PHOTOS = 100
 """Photos to look through on a page."""
@@ -81,7 +80,7 @@ def scene(options: ExportOptions, source: Path, found: RunFolder) -> tuple[str, 
             *([("drawn with", f"{changes}: {before - compact.psnr:.2f} dB lost")] if changes else []),
         ],
     )
-    shown, chosen = data.scene.train, evenly(len(data.scene.train), MOST_PHOTOS)
+    shown, chosen = data.scene.train, subsample(len(data.scene.train), MOST_PHOTOS)
     cameras = shown.cameras[torch.tensor(chosen)].to("cpu")
     names = [shown.name(i) for i in chosen]
     page = field_page(content, drawn.system, found.orbit, data.scene.name, facts, cameras, names)
@@ -120,7 +119,7 @@ def side_by_side(options: ExportOptions, folder: Path, device: torch.device) -> 
             with atomic(address) as temporary:
                 temporary.write_bytes(page)
             print(f"{address}: {words}")
-        pages.append((address_from(output.parent, address), label(run, keys), line))
+        pages.append((relative_url(output.parent, address), label(run, keys), line))
     if not pages:
         raise InputError(folder, "", "no run that can be shown", "a folder of finished runs", "see what was left out")
     with atomic(output) as temporary:

@@ -20,10 +20,10 @@ from nerf_lightning.runs.index import FIELD_PAGE
 from nerf_lightning.runs.open import SceneRun, beside, open_run, open_scene_run
 from nerf_lightning.runs.scene_file import load_scene
 from nerf_lightning.utils.device import the_device
-from nerf_lightning.utils.evenly import evenly
-from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.files import atomic, atomic_folder, output_path, user_path
+from nerf_lightning.utils.libraries import require
 from nerf_lightning.utils.machine import device_in_words
+from nerf_lightning.utils.text import subsample
 
 NAMES = {
     ("compact", "mesh"): "compact.npz",
@@ -128,7 +128,7 @@ def views_of(run: SceneRun, photos: str | None) -> Cameras:
             raise
         print(f"without the photos' cameras, from the orbit: {error}")
         spiral, count = spiral_like(run.orbit, MOST_VIEWS // 2), MOST_VIEWS // 2
-        orbit = run.orbit[torch.tensor(evenly(len(run.orbit), count))]
+        orbit = run.orbit[torch.tensor(subsample(len(run.orbit), count))]
         K, c2w, sizes = (torch.cat([getattr(x, name) for x in (orbit, spiral)]) for name in ("K", "c2w", "sizes"))
         return Cameras(K, c2w, sizes)
     assert isinstance(data, RayDataModule)  # of a scene's run

@@ -10,8 +10,8 @@ from nerf_lightning.cameras import Cameras, resample_path, spiral_like
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.path_file import FRAMES, read_path
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.text import subsample
 
 WORDS = ("orbit", "spiral", "test", "train")
 WITH_PHOTOS = {"test": "val", "train": "train"}
@@ -59,7 +59,7 @@ def find_route(
     if path in WITH_PHOTOS:
         assert scene is not None  # the caller opens it for these words
         photos: Views = getattr(scene, WITH_PHOTOS[path])
-        chosen = evenly(len(photos), frames)
+        chosen = subsample(len(photos), frames)
         index = torch.tensor(chosen)
         return Route(photos.cameras[index], chosen, photos[index])
     if path == "orbit":

@@ -13,20 +13,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from nerf_lightning.dataset.formats.checks import require_keys
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.checkpoint import check_finite
-from nerf_lightning.runs.folder import RunFolder, system_of
+from nerf_lightning.runs.folder import RunFolder, config_from, system_of
 from nerf_lightning.runs.scene_file import frame_from
-from nerf_lightning.runs.trusted import check_config
 from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.utils.arrays import Headers, read_npz
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.memory import check_memory
-from nerf_lightning.utils.untrusted import NONSENSE, existing_file, parsed_json, read_content
+from nerf_lightning.utils.parsing import VALUE_ERRORS, Headers, existing_file, parse_json, read_content, read_npz
 
 FORMAT, VERSION = "nerf_lightning compact", 1
 WORTH_BYTES = 2048
@@ -114,7 +111,7 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
     header, arrays = _unpacked(content, path)
     expected = "the weights of the model it names"
     frame, orbit, to_source = frame_from(header["scene"], f"{path}: header.scene")
-    cfg = OmegaConf.create(check_config(header["config"], path))
+    cfg = config_from(header["config"], path)
     system = system_of(cfg, frame, device, path)
     try:
         floats = sum(math.prod(one["shape"]) for one in header["arrays"].values())
@@ -125,7 +122,7 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
             system.sampler.import_state(_of("sampler", tensors))
     except InputError:
         raise
-    except NONSENSE as error:
+    except VALUE_ERRORS as error:
         raise InputError(path, "", f"{type(error).__name__}: {error}", expected) from error
     check_finite(system, path)
     return RunFolder(cfg, system.eval().to(device), orbit, to_source, header["scene"])
@@ -143,7 +140,7 @@ def _unpacked(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]
         require_keys(path, headers, ["header"])
 
     arrays = read_npz(content, None, check, path, expected)
-    header = parsed_json(arrays.pop("header").tobytes(), f"{path}: header", expected)
+    header = parse_json(arrays.pop("header").tobytes(), f"{path}: header", expected)
     if not isinstance(header, dict):
         raise InputError(path, "header", f"a {type(header).__name__}", expected)
     require_keys(f"{path}: header", header, ["format", "version"])

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.untrusted import read_json, read_yaml
+from nerf_lightning.utils.parsing import read_json, read_yaml
 
 FINISHED = ("finished", "collapsed")
 """Status of completed runs."""

@@ -16,10 +16,8 @@ from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Sce
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import write_json
-from nerf_lightning.utils.untrusted import read_json
+from nerf_lightning.utils.parsing import read_json
 
-FORMAT = 1
-"""Version of run folders. Goes up when older versions of this package can no longer read newer runs."""
 PICTURE = ("name", "resolution")
 SCENE = ("name", "aabb", "unbounded", "near", "far", "background", "orbit", "to_source")
 """Keys of every scene.json, of a picture and of a scene."""
@@ -42,7 +40,7 @@ def save_scene(
 def scene_content(data: RayDataModule | PixelDataModule) -> dict[str, Any]:
     """The same as plain values."""
     scene, frame = data.scene, frame_of(data)
-    content: dict[str, Any] = {"format": FORMAT, **scene.describe()}
+    content: dict[str, Any] = {**scene.describe()}
     if scene.source != BUILT_IN:
         content["source"] = os.path.abspath(scene.source)
     if isinstance(scene, Scene) and isinstance(frame, SceneFrame):
@@ -70,15 +68,12 @@ def load_scene(folder: Path) -> dict[str, Any]:
     """The content of a run's scene.json, whose values `frame_from` checks.
 
     Raises:
-        InputError: where it is missing, broken, or of another version.
+        InputError: where it is missing or broken.
     """
     path = folder / "scene.json"
     scene = read_json(path, "the scene of a run, whole", "")
     if not isinstance(scene, dict):
         raise InputError(path, "", f"a {type(scene).__name__}", "the scene of a run, whole")
-    if scene.get("format", FORMAT) != FORMAT:
-        found, expected = f"format {scene['format']}", f"format {FORMAT}, which this version reads"
-        raise InputError(path, "format", found, expected, "use the version of nerf_lightning that made the run")
     return scene
 
 

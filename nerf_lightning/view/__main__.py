@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from nerf_lightning.config import cli
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.ending import Interrupted
 from nerf_lightning.utils.files import user_path
 from nerf_lightning.utils.options import AtLeast, Count, Port, check_options
+from nerf_lightning.utils.signals import Interrupted
 from nerf_lightning.view.serve import announcement, find_port, require_viser
 
 if TYPE_CHECKING:

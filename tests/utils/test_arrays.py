@@ -11,7 +11,7 @@ import pytest
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils import memory
-from nerf_lightning.utils.arrays import Header, read_npy, read_npz
+from nerf_lightning.utils.parsing import Header, read_npy, read_npz
 
 ROWS = np.arange(6.0).reshape(2, 3)
 ENTRY = b"PK\x01\x02\x14\x03\x14\x00"

@@ -9,7 +9,7 @@ import pytest
 
 from nerf_lightning.dataset import load_picture
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.quiet import native_errors_hidden
+from nerf_lightning.utils.libraries import native_errors_hidden
 
 
 def test_a_damaged_photo_is_told_once(tmp_path, capfd: pytest.CaptureFixture[str]):

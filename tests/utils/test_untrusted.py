@@ -8,7 +8,7 @@ import yaml
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils import memory
-from nerf_lightning.utils.untrusted import DEEPEST, YAML_SIZE, read_json, read_yaml
+from nerf_lightning.utils.parsing import DEEPEST, YAML_SIZE, read_json, read_yaml
 
 NINES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)

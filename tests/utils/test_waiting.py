@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from nerf_lightning.utils.waiting import SPINS, wait_briefly
+from nerf_lightning.utils.libraries import SPINS, shorten_openmp_waits
 
 
 @pytest.mark.parametrize(
@@ -23,5 +23,5 @@ def test_what_the_environment_says_stays(
         monkeypatch.delenv(name)
     for name, value in given.items():
         monkeypatch.setenv(name, value)
-    wait_briefly()
+    shorten_openmp_waits()
     assert os.environ.get("GOMP_SPINCOUNT") == expected
