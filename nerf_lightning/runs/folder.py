@@ -40,8 +40,8 @@ VERSION = ".".join(nerf_lightning.__version__.split(".")[:2])
 
 def plain_config(cfg: DictConfig) -> dict[str, Any]:
     """The resolved configuration; a relative dataset path becomes absolute, so that it is valid from any folder."""
-    plain = {key: value for key, value in resolved(cfg).items() if key != "overwrite"}  # of the command, not of the run
-    plain["version"] = VERSION
+    of_command = ("overwrite", "version")
+    plain = {"version": VERSION} | {key: value for key, value in resolved(cfg).items() if key not in of_command}
     path = plain["dataset"].get("path")
     if path is not None:
         plain["dataset"]["path"] = os.path.abspath(user_path(path))

@@ -6,7 +6,7 @@ import math
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,7 @@ def atomic(path: Path) -> Iterator[Path]:
     """
     if path.is_dir():
         raise InputError(path, "", "a folder", "a file to write", "give another name")
-    with _temporary_of(path) as temporary:
-        _create(temporary, path, Path.touch)
+    with _temporary_of(path, Path.touch) as temporary:
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
@@ -38,23 +37,25 @@ def atomic(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yields a temporary folder beside `path`; replaces `path` with it if the block succeeds.
-
-    Raises:
-        NoRoom: the disk is full; what was at `path` stays.
-        Unwritable: the folder above cannot be written.
-    """
-    with _temporary_of(path) as temporary:
-        _create(temporary, path, Path.mkdir)
+    """As `atomic`, for a folder, which replaces one that is there."""
+    with _temporary_of(path, Path.mkdir) as temporary:
         yield temporary
         shutil.rmtree(path, ignore_errors=True)
         os.replace(temporary, path)
 
 
 @contextmanager
-def _temporary_of(path: Path) -> Iterator[Path]:
+def _temporary_of(path: Path, create: Callable[[Path], None]) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
     try:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            create(temporary)
+        except OSError as error:
+            if error.errno in FULL:
+                raise
+            found = error.strerror or str(error)
+            raise Unwritable(path.parent, "", found, "a folder that can be written", "give another one") from error
         yield temporary
     except Exception as error:
         if full_disk(error):
@@ -63,17 +64,6 @@ def _temporary_of(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             remove(temporary)
-
-
-def _create(temporary: Path, path: Path, create: Any) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        create(temporary)
-    except OSError as error:
-        if error.errno in FULL:
-            raise
-        found = error.strerror or str(error)
-        raise Unwritable(path.parent, "", found, "a folder that can be written", "give another one") from error
 
 
 def link_file(source: Path, target: Path) -> None:
@@ -131,7 +121,8 @@ def user_path(text: str | os.PathLike[str]) -> Path:
     """
     try:
         path = Path(text).expanduser()
-        path.exists()
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            path.lstat()
     except (RuntimeError, ValueError, OSError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise InputError(repr(str(text)[:60]), "", str(reason), "a path that a file or folder can have") from error

@@ -7,7 +7,8 @@ import math
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -98,11 +99,10 @@ def read_yaml(path: Path, expected: str, todo: str = "") -> Any:
     """
     if (size := existing_file(path, expected).stat().st_size) > MAX_YAML_BYTES:
         raise InputError(path, "", f"{size} bytes", f"{expected}, of at most {MAX_YAML_BYTES} bytes", todo)
+    content = read_content(path, expected)
     try:
-        return yaml.load(read_content(path, expected).decode("utf-8-sig"), _PlainLoader)  # noqa: S506  (a SafeLoader)
+        return yaml.load(content.decode("utf-8-sig"), _PlainLoader)  # noqa: S506  (a SafeLoader)
     except (yaml.YAMLError, *VALUE_ERRORS) as error:  # Python's own for a date or a number that is none
-        if isinstance(error, InputError):
-            raise
         raise InputError(path, "", f"no YAML ({type(error).__name__}: {error})", expected, todo) from error
 
 
@@ -144,30 +144,26 @@ def read_npz(
     Raises:
         InputError: it is no such file, is damaged, holds pickled objects, or unpacks to more than fits into memory.
     """
-    where, key = source if isinstance(source, Path) else where, ""
+    where = source if isinstance(source, Path) else where
     if isinstance(source, Path):
         existing_file(source, expected)
-    try:
-        with zipfile.ZipFile(source if isinstance(source, Path) else io.BytesIO(source)) as archive:
-            members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-            names = list(members) if known is None else [name for name in known if name in members]
-            headers = {}
-            for key in names:
-                with archive.open(members[key]) as stream:
-                    headers[key] = _read_header(stream, members[key].file_size)
-            key = ""
-            check(headers)
-            check_memory(where, "", "arrays", sum(header.nbytes for header in headers.values()))
-            arrays = {}
-            for key in names:
-                with archive.open(members[key]) as stream:
-                    arrays[key] = np.lib.format.read_array(stream, allow_pickle=False)
-            return arrays
-    except DAMAGE_ERRORS as error:
-        if isinstance(error, InputError):
-            raise
-        found = f"something unreadable ({type(error).__name__}: {error})"
-        raise InputError(where, key, found, expected, "save or copy it again") from error
+    with (
+        _reporting_damage(where, expected),
+        zipfile.ZipFile(source if isinstance(source, Path) else io.BytesIO(source)) as archive,
+    ):
+        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        names = list(members) if known is None else [name for name in known if name in members]
+        headers = {}
+        for name in names:
+            with archive.open(members[name]) as stream:
+                headers[name] = _read_header(stream, members[name].file_size)
+        check(headers)
+        check_memory(where, "", "arrays", sum(header.nbytes for header in headers.values()))
+        arrays = {}
+        for name in names:
+            with archive.open(members[name]) as stream:
+                arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
+        return arrays
 
 
 def read_npy(path: Path, check: Callable[[Header], None]) -> np.ndarray:
@@ -177,18 +173,23 @@ def read_npy(path: Path, check: Callable[[Header], None]) -> np.ndarray:
         InputError: it is no such file, is damaged or cut short, or holds pickled objects.
     """
     existing_file(path)
+    with _reporting_damage(path, "an .npy array of numbers"), path.open("rb") as file:
+        header = _read_header(file, path.stat().st_size)
+        check(header)
+        check_memory(path, "", "an array", header.nbytes)
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False)
+
+
+@contextmanager
+def _reporting_damage(where: object, expected: str) -> Iterator[None]:
     try:
-        with path.open("rb") as file:
-            header = _read_header(file, path.stat().st_size)
-            check(header)
-            check_memory(path, "", "an array", header.nbytes)
-            file.seek(0)
-            return np.lib.format.read_array(file, allow_pickle=False)
+        yield
+    except InputError:
+        raise
     except DAMAGE_ERRORS as error:
-        if isinstance(error, InputError):
-            raise
         found = f"something unreadable ({type(error).__name__}: {error})"
-        raise InputError(path, "", found, "an .npy array of numbers", "save or copy it again") from error
+        raise InputError(where, "", found, expected, "save or copy it again") from error
 
 
 def _read_header(stream: io.BufferedIOBase | IO[bytes], size: int) -> Header:
