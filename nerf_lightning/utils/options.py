@@ -110,12 +110,12 @@ def _describe(hint: Any) -> str:
     """An annotation in words."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        words = {AtLeast: "at least", AtMost: "at most"}
-        bounds = [f"{words[type(bound)]} {bound.value:.12g}" for bound in arguments[1:] if type(bound) in words]
+        sides = {AtLeast: "at least", AtMost: "at most"}
+        bounds = [f"{sides[type(bound)]} {bound.value:.12g}" for bound in arguments[1:] if type(bound) in sides]
         return f"{_describe(arguments[0])} {' and '.join(bounds)}"
     if origin in (typing.Union, types.UnionType):
         return " or ".join(_describe(argument) for argument in arguments)
     if origin in (list, dict):
         return f"a {origin.__name__}, each value {_describe(arguments[-1])}"
-    words: dict[Any, str] = {int: "a whole number", float: "a number", str: "text", bool: "true or false", type(None): "null"}
-    return words.get(hint, "a value")
+    words = {"int": "a whole number", "float": "a number", "str": "text", "bool": "true or false", "NoneType": "null"}
+    return words.get(getattr(hint, "__name__", ""), "a value")
