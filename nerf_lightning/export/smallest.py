@@ -19,8 +19,8 @@ from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.open import open_run
 from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import System
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.text import subsample
 
 MOST_VIEWS = 60
 """Training views whose rays show which cells matter."""
@@ -56,7 +56,7 @@ def held_out_psnr(system: System, data: RayDataModule | PixelDataModule, views: 
 def some_cameras(data: RayDataModule, most: int = MOST_VIEWS) -> Cameras:
     """Those of training views spread over all."""
     cameras = data.scene.train.cameras
-    return cameras[torch.tensor(evenly(len(cameras), most))]
+    return cameras[torch.tensor(subsample(len(cameras), most))]
 
 
 def smallest(

@@ -14,11 +14,11 @@ from numpy import ndarray
 from nerf_lightning.dataset.formats.decode import image_header
 from nerf_lightning.drawing.panels import write_animation
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.files import atomic, write_json
+from nerf_lightning.utils.libraries import require
 from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.parsing import read_json
 from nerf_lightning.utils.progress import tracked
-from nerf_lightning.utils.untrusted import read_json
 
 Image = UInt8[ndarray, "H W C"]
 PLAN = "frames.json"
