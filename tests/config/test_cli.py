@@ -1,7 +1,6 @@
 """The command line: help, errors, resuming after a kill, and the installed wheel."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -18,7 +17,6 @@ from nerf_lightning.config import conf_dir
 from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.owner import owned
-from nerf_lightning.training.train import train
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -171,12 +169,11 @@ def test_killed_at_any_moment_and_resumed_ends_with_the_same_weights(inside, tmp
         state = torch.load(saved[0], weights_only=True) if saved else None
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    (run,) = (tmp_path / "outputs" / "broken").iterdir()
+    run = (tmp_path / "outputs" / "broken" / "latest").resolve()
     assert not (run / "results.json").exists()
     code, _, err = inside(f"resume={run}")
     assert code == 0, err
-    (whole,) = tmp_path.glob("outputs/whole/*/checkpoints/last.ckpt")
-    (broken,) = tmp_path.glob("outputs/broken/*/checkpoints/last.ckpt")
+    whole, broken = (tmp_path / "outputs" / name / "latest/checkpoints/last.ckpt" for name in ("whole", "broken"))
     first, second = (torch.load(path, weights_only=True) for path in (whole, broken))
     assert first["global_step"] == second["global_step"] == 80
     for key, value in first["state_dict"].items():
@@ -185,58 +182,24 @@ def test_killed_at_any_moment_and_resumed_ends_with_the_same_weights(inside, tmp
 
 def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_path: Path):
     assert inside("+experiment=smoke_2d", "dataset.max_side=16", *BARE, "budget.steps=5")[0] == 0
-    (run,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
+    run = (tmp_path / "outputs" / "smoke_2d" / "latest").resolve()
     code, _, err = inside(f"resume={run}", "budget.steps=9")
     assert code == 0, err
     assert yaml.safe_load((run / "results.json").read_text())["steps"] == 9
     code, _, err = inside(f"resume={run}", "sampler.samples=9")
     assert code == 2
     assert "sampler.samples" in err
-    last = run / "checkpoints" / "last.ckpt"
-    state = torch.load(last, weights_only=True)
     before = {name: (run / name).read_bytes() for name in ("config.yaml", "scene.json", "results.json")}
-    described = (run / "config.yaml").read_text()
-    (run / "config.yaml").write_text(yaml.safe_dump({**yaml.safe_load(described), "callbacks": 3}))
-    code, _, err = inside(f"resume={run}")
-    assert code == 2 and "config: callbacks: found 3, expected callbacks by name" in err and err.count("\n") == 1
-    (run / "config.yaml").write_text(described)
     code, _, err = inside(f"resume={run}", "model.width=24")
     assert code == 2 and "last.ckpt: found " in err and err.count("\n") == 1
-    assert {name: (run / name).read_bytes() for name in before} == before, "what goes on from this state stays"
-    total, groups = state["loops"]["fit_loop"]["epoch_progress"], state["optimizer_states"][0]["param_groups"]
-    moments = state["optimizer_states"][0]["state"][0]
-    callbacks = state["callbacks"]
-    cfg = composed([f"resume={run}", "budget.steps=12"], run)
-    for where, key, wrong, words in (
-        (callbacks["Throughput"], "rays", [], "last.ckpt: found Type"),
-        (callbacks["HeldOut"], "curve", [1], "last.ckpt: found TypeError"),
-        (callbacks["Guard"], "rate", "fast", "last.ckpt: found ValueError"),
-        (total, "total", 1.0, "last.ckpt: loops: found something else"),
-        (total, "total", 1, "last.ckpt: found TypeError"),
-        (groups[0], "betas", True, "last.ckpt: optimizer_states.betas: found True"),
-        (groups[0], "amsgrad", True, "last.ckpt: optimizer_states.amsgrad: found True"),
-        (groups, 0, torch.zeros(2, 2), "last.ckpt: optimizer_states: found something else"),
-        (groups[0], "initial_lr", ..., "last.ckpt: optimizer_states.initial_lr: found nothing"),
-        (groups[0], "lr", float("nan"), "last.ckpt: optimizer_states.lr: found nan"),
-        (moments, "exp_avg", torch.zeros(3), "last.ckpt: optimizer_states.exp_avg: found torch.float32 (3,)"),
-        (moments, "exp_avg", moments["exp_avg"].to_sparse(), "last.ckpt: optimizer_states.exp_avg: found "),
-        (moments, "exp_avg_sq", ..., "last.ckpt: optimizer_states.exp_avg_sq: found nothing"),
-    ):
-        right, where[key] = where[key], wrong
-        if wrong is ...:
-            del where[key]
-        torch.save(state, last)
-        where[key] = right
-        with pytest.raises(InputError, match=re.escape(words)):
-            train(cfg)
-        assert {name: (run / name).read_bytes() for name in before} == before
+    assert {name: (run / name).read_bytes() for name in before} == before, "the run stays as it was"
 
 
 def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path: Path):
     small = ["+experiment=smoke_2d", "dataset.max_side=16", *BARE, "callbacks.checkpoints=null", "logger=null"]
     folder = tmp_path / "mine"
     assert inside(*small, "budget.steps=5", "callbacks.snapshots.steps=[2]", "hydra.run.dir=mine")[0] == 0
-    (folder / "notes.txt").write_text("not the run's")
+    (folder / "video.mp4").write_text("made from the run")
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     again = [*small, "budget.steps=3", "callbacks.snapshots.steps=[1]", "hydra.run.dir=mine"]
     code, _, err = inside(*again)
@@ -247,13 +210,13 @@ def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path
     code, _, err = inside(*again, "overwrite=true")
     assert code == 0, err
     assert sorted(path.name for path in (folder / "snapshots").iterdir()) == ["step_0000001.png", "step_0000003.png"]
-    assert sorted(path.name for path in folder.iterdir()) == [
-        *("config.yaml", "final.png", "notes.txt", "results.json", "scene.json", "snapshots")
+    assert sorted(path.name for path in folder.iterdir() if not path.name.startswith(".")) == [
+        *("config.yaml", "final.png", "results.json", "scene.json", "snapshots")
     ]
     assert "overwrite" not in (folder / "config.yaml").read_text()
     with owned(folder):
         code, _, err = inside(f"resume={folder}")
-    assert code == 2 and "a run that is still going on (process" in err and err.count("\n") == 1
+    assert code == 2 and "a run that is in progress" in err and err.count("\n") == 1
 
 
 def test_groups_that_can_be_left_out(inside, tmp_path: Path):
@@ -261,7 +224,7 @@ def test_groups_that_can_be_left_out(inside, tmp_path: Path):
     small = ["dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", "dataset.rays=64", "budget.steps=2"]
     code, _, err = inside(*small, "callbacks=null", "logger=null", "recipe=null", "hydra.run.dir=bare")
     assert code == 0, err
-    assert {path.name for path in (tmp_path / "bare").iterdir()} == {"config.yaml", "results.json", "scene.json"}
+    assert {path.name for path in (tmp_path / "bare").glob("[!.]*")} == {"config.yaml", "results.json", "scene.json"}
     cfg = composed(["+experiment=capture", "dataset.path=x", "callbacks=null", "refine=null"], tmp_path)
     assert cfg.callbacks is None and cfg.refine is None
 
