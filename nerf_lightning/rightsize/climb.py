@@ -32,8 +32,7 @@ from nerf_lightning.runs.compact import encode
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.training.room import check_room
-from nerf_lightning.training.train import prepare, warm_up
+from nerf_lightning.training.train import check_field_memory, prepare, warm_up
 from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.utils.text import subsample
 
@@ -100,7 +99,7 @@ def trained(cfg: DictConfig, data: Data, folder: Path, start: System | None = No
         data.start_again()
     device = device_of(cfg)
     system = build_system(cfg, frame_of(data), device)
-    check_room(system, data, device)
+    check_field_memory(system, device)
     if start is not None and as_wide(system.field, start.field):
         system.warm_start_from(start.cpu())  # where a new system is
         start.to(device)
@@ -198,7 +197,6 @@ def coarsest_sampler(cfg: DictConfig, data: Data, system: System, samplers: list
     for options in samplers:
         probe = build_system(set_options(cfg, "sampler", options), frame_of(data), system.device)
         assert isinstance(probe, NeRF3D)  # of the same data
-        check_room(probe, data, system.device)
         probe.field = system.field
         probe.to(system.device)
         probe.sampler.look_through(data.scene.train.cameras)

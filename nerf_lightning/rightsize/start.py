@@ -11,7 +11,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.rightsize.choose import Target
 from nerf_lightning.rightsize.ladder import Ladder
 from nerf_lightning.runs.folder import plain_config
-from nerf_lightning.runs.owner import LOCK
+from nerf_lightning.runs.owner import is_empty
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.parsing import read_json
 
@@ -27,7 +27,7 @@ def begin(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None
     """
     plan = {"target": asdict(target), "ladder": asdict(ladder), "config": plain_config(cfg)}
     plan = json.loads(json.dumps(plan), parse_constant=str)  # as it is read, without nan and infinity
-    if output.exists() and (not output.is_dir() or any(one.name != LOCK for one in output.iterdir())):
+    if output.exists() and (not output.is_dir() or not is_empty(output)):
         try:
             found: dict[str, Any] | None = read_json(output / PLAN, "what a search is for")
         except InputError:

@@ -84,7 +84,7 @@ def trained(cfg: "DictConfig", folder: Path) -> float | None:
         told = "without a figure" if done.psnr is None else f"{done.psnr:.2f} dB"
         print(f"{folder.name}: done before ({done.status}, {told})", flush=True)
         return done.psnr
-    print(f"{folder.name}: {'starts' if checkpoint is None else 'goes on from its last checkpoint'}", flush=True)
+    print(f"{folder.name}: {'starts' if checkpoint is None else 'continues from its last checkpoint'}", flush=True)
     return train(cfg, checkpoint)
 
 

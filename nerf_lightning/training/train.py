@@ -146,8 +146,7 @@ def prepare_system(
 ) -> System:
     """The system to train, if it fits into memory and the data."""
     system = build_system(cfg, frame_of(data), device)
-    what = "numbers, with their gradients and moments,"
-    check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
+    check_field_memory(system, device)
     if isinstance(system, NeRF3D) and system.corrections is not None and poses_are_off:
         system.corrections.begin_poses()
     system.backend = BACKEND if cfg.compile else None
@@ -155,6 +154,16 @@ def prepare_system(
         log.info("model: %s", system.field.sizing)
     check_background(cfg, data, system)
     return system
+
+
+def check_field_memory(system: System, device: torch.device) -> None:
+    """Refuses a field that, trained at its largest, needs more memory than is free.
+
+    Raises:
+        InputError: where it does.
+    """
+    what = "numbers, with their gradients and moments,"
+    check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
 
 
 def fit(

@@ -19,7 +19,7 @@ from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.dataset.picture import builtin_picture
 from nerf_lightning.dataset.pixels import Picture
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.owner import LOCK
+from nerf_lightning.runs.owner import LOCK, MARKER
 from nerf_lightning.stability.toys import MARBLE, toy
 from nerf_lightning.system import NeRF2D
 from nerf_lightning.utils.device import CPU, devices, synchronize, the_device
@@ -72,7 +72,7 @@ def test_resumed_run_may_use_another_device(inside, small_run: Path, plain_torch
     for key in ("device", "trainer.accelerator"):
         code, _, err = inside(f"resume={run}", f"{key}=cuda")
         assert code == 2 and err.count("\n") == 1 and "device: found 'cuda', but" in err, err
-    after = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.name != LOCK}
+    after = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.name not in (LOCK, MARKER)}
     assert before == after, "nothing was touched"
     code, _, err = inside(f"resume={run}", "device=cpu", "limits.chunk=100", "budget.steps=12")
     assert code == 0, err
