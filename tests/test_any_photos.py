@@ -14,12 +14,11 @@ import torch
 import nerf_lightning as nl
 from nerf_lightning.callbacks import results
 from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
-from nerf_lightning.config.compose import composed
+from nerf_lightning.cli.evaluate import evaluate
+from nerf_lightning.cli.export import export_compact
+from nerf_lightning.cli.render import render
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
-from nerf_lightning.evaluate.__main__ import task as evaluate
-from nerf_lightning.export.__main__ import task as export
-from nerf_lightning.render.__main__ import task as render
 from nerf_lightning.renderer import Rendered
 from nerf_lightning.stability.toys import PILE, around, photograph
 from nerf_lightning.system import NeRF3D
@@ -67,21 +66,15 @@ def test_a_run_on_any_photos(folder: Path, tmp_path: Path, capsys: pytest.Captur
     run = nl.train(scene, steps=STEPS, seed=1, device="cpu", folder=tmp_path / "run", options=options)
     assert np.isfinite(run.psnr) and run.psnr > 10
 
-    evaluate(composed([f"run={tmp_path / 'run'}", "device=cpu"], tmp_path, "evaluate"))
+    evaluate(tmp_path / "run", device="cpu")
     judged = json.loads((tmp_path / "run/evaluation/views.json").read_text())
     assert np.mean([view["psnr"] for view in judged["views"]]) == pytest.approx(run.psnr, abs=0.02)
     assert imageio.imread(tmp_path / "run/evaluation/worst.png").ndim == 3
 
-    film = tmp_path / "film.webp"
-    render(
-        composed(
-            [f"run={tmp_path / 'run'}", "path=train", "frames=4", f"output={film}", "device=cpu"], tmp_path, "render"
-        )
-    )
+    film = render(tmp_path / "run", path="train", frames=4, output=tmp_path / "film.webp", device="cpu")
     assert imageio.improps(film, plugin="pillow", index=...).n_images == 4, "frames of two sizes make one film"
 
-    export(composed([f"run={tmp_path / 'run'}", "loss=20", "device=cpu"], tmp_path, "export"))
-    assert (tmp_path / "run/compact.npz").exists()
+    assert export_compact(tmp_path / "run", loss_db=20.0, device="cpu") == tmp_path / "run/compact.npz"
     assert len(list(frusta(scene.train, "train", 16))) == len(scene.train)
 
 

@@ -49,7 +49,7 @@ SMALLER: list[tuple[str, str]] = [
     ("capture --calibration", f"--tag-size {SIZE} --resize 60"),
     ("nerf_lightning render", "--frames 2"),
     ("export compact", "--loss-db 100"),
-    ("export html", "--loss-db 100 --resolution 16"),
+    ("export html", "--loss-db 100 --cells 16"),
     ("export voxels", "--resolution 24"),
     ("nerf_lightning export", "--threshold 1e-3 --resolution 24"),
 ]

@@ -13,6 +13,7 @@ from export.balls import CENTRE, RADIUS, ball_run
 
 import nerf_lightning as nl
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at, orbit_around
+from nerf_lightning.check.findings import describe_scene
 from nerf_lightning.dataset import RayDataModule, Scene, Views, load_transforms
 from nerf_lightning.dataset.optics import equirectangular
 from nerf_lightning.dataset.shots import Reading, Shot, read_shots
@@ -22,7 +23,6 @@ from nerf_lightning.export.page import field_page
 from nerf_lightning.export.photos import write_photos
 from nerf_lightning.export.smallest import smallest
 from nerf_lightning.export.volume import sample_volume
-from nerf_lightning.inspect.verb import facts_of
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.open import open_run
 from nerf_lightning.stability.rooms import Room, pile, walls
@@ -89,7 +89,7 @@ def test_a_room_is_learned_and_exported(scene: Scene, tmp_path: Path):
 
 
 def test_the_inspection_names_the_projection(scene: Scene):
-    assert facts_of(scene)["lens"] == "equirectangular; rays follow the lens"
+    assert describe_scene(scene)["lens"] == "equirectangular; rays follow the lens"
 
 
 def test_surfaces_are_seen_in_every_direction():

@@ -17,7 +17,7 @@ ORDER = (
     ("config",),
     ("runs",),
     ("gallery",),
-    ("capture", "chart", "evaluate", "export", "inspect", "render", "view"),
+    ("capture", "chart", "evaluate", "check", "export", "render", "view"),
     ("training",),
     ("stability", "rightsize", "api", "__main__"),
     ("__init__",),

@@ -110,17 +110,22 @@ class Live(ChecksData):
             self.page.show_progress(1.0, f"trained; measuring: {self.describe(trainer)}")
             self.page.paint(IMAGE_SECONDS)
 
-    def stay_open(self, psnr: float | None) -> None:
-        """Serves the finished field until no browser shows it any more; called when all is written."""
+    def finish(self, psnr: float | None, stay: bool) -> None:
+        """Ends the page, called when all is written.
+
+        Args:
+            psnr: held out, dB.
+            stay: whether to serve the finished field until no browser shows it any more.
+        """
         if self.page is None:
             return
         page, self.page = self.page, None
         page.again()
         page.show_progress(1.0, "training is done" + ("" if psnr is None else f": held out {psnr:.2f} dB"))
         try:
-            if page.visitors:
+            if stay and page.visitors:
                 print("live: training is done; the page stays open until it is closed, or Ctrl-C", flush=True)
-            page.run(ended=lambda: not page.visitors)
+            page.run(ended=lambda: not (stay and page.visitors))
         finally:
             page.stop()
 

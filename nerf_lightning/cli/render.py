@@ -68,9 +68,10 @@ def render(
     if path in SPLITS and (scale != 1 or background == "transparent"):
         key, value = ("scale", f"{scale:g}") if scale != 1 else ("background", background)
         raise InputError("render", key, value, f"scale 1 and a colour beside photos (path {path})")
+    if output is not None:
+        check_output(output_path(output), background == "transparent")
     where, source = the_device(device), find_run(run)
     target = beside(source) / f"render_{Path(path).stem}.webp" if output is None else output_path(output)
-    check_output(target, background == "transparent")
     found = open_scene_run(source, where)
     scene: Any = None
     if path in SPLITS:

@@ -58,7 +58,7 @@ def view(
     try:
         print(f"{announce(page.name, host, port, page.port)}; Ctrl-C ends it", flush=True)
         page.run()
-    except Interrupted:
+    except (Interrupted, KeyboardInterrupt):
         pass
     finally:
         page.stop()

@@ -127,7 +127,8 @@ def train(
         report(results.summary, folder, trainer.logger)
     live = attached(trainer, Live)
     if live is not None:
-        live.stay_open(results.summary["psnr"])
+        in_sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+        live.finish(results.summary["psnr"], stay=not in_sweep)
     quality: float | None = results.summary["psnr"]
     return math.nan if quality is None else quality  # views of a field that has broken down may have none
 

@@ -128,9 +128,9 @@ class Page:
         """Checkboxes for what to show of the cameras."""
         gui = self.server.gui
         for word, group in self.groups.items():
-            self.switch(f"{word} cameras", group)
+            self.switch(word, group)
         self.switch("names", *self.names)
-        self.photos = gui.add_checkbox("photos in them", True)
+        self.photos = gui.add_checkbox("photos", True)
         self.photos.on_update(lambda _: self.show_photos())
         self.depth = gui.add_slider("camera size", 0.01, 0.5, 0.01, FRUSTUM_DEPTH)
         self.depth.on_update(lambda _: self.size_frusta())

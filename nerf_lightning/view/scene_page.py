@@ -44,7 +44,7 @@ class ScenePage(Page):
     def _add_surroundings(self) -> None:
         scene = self.server.scene
         if self.scene.points is not None:
-            self.points("/points", *colour_points(self.scene.points, self.scene.train), 0.004)
+            self.points("/points", *colour_points(self.scene.points, self.scene.train), 0.006)
         self.lines("/orbit", path_segments(self.scene.orbit), rgb(MAUVE))
         self.lines("/box", box_edges(self.scene.bounds.aabb), rgb(GREY))
         self.points("/focus", self.home.look_at[None], rgb(VERMILLION), 0.02)

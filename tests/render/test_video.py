@@ -1,4 +1,4 @@
-"""Frames become films, and interrupted ones go on."""
+"""Frames become videos, and interrupted ones continue."""
 
 import sys
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.render.film import check_output, even, make_film
+from nerf_lightning.render.video import check_output, write_video
 
 COLOURS = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
 
@@ -18,9 +18,9 @@ def plain(index: int, height: int = 9, width: int = 15) -> np.ndarray:
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp", ".mp4"])
-def test_films_show_the_frames_in_order_and_at_their_size(suffix: str, tmp_path: Path):
+def test_write_video_frames_are_in_order_and_at_their_size(suffix: str, tmp_path: Path):
     output = tmp_path / f"film{suffix}"
-    assert make_film({}, plain, 3, output, fps=10) == 0
+    assert write_video({}, plain, 3, output, fps=10) == 0
     film = imageio.imread(output, plugin="pyav" if suffix == ".mp4" else "pillow", index=...)
     assert film.shape == (3, *((10, 16) if suffix == ".mp4" else (9, 15)), 3)  # one more row and column, no resize
     for shown, colour in zip(film, COLOURS, strict=True):
@@ -28,16 +28,16 @@ def test_films_show_the_frames_in_order_and_at_their_size(suffix: str, tmp_path:
     assert [path.name for path in tmp_path.iterdir()] == [output.name]
 
 
-def test_transparency_survives(tmp_path: Path):
+def test_write_video_webp_keeps_transparency(tmp_path: Path):
     def half(index: int) -> np.ndarray:
         return np.concatenate([plain(index), np.full((9, 15, 1), 100, np.uint8)], axis=2)
 
-    make_film({}, half, 3, tmp_path / "film.webp", fps=10)
+    write_video({}, half, 3, tmp_path / "film.webp", fps=10)
     film = imageio.imread(tmp_path / "film.webp", plugin="pillow", mode="RGBA", index=...)
     assert film.shape == (3, 9, 15, 4) and (np.abs(film[..., 3].astype(int) - 100) < 5).all()
 
 
-def test_an_interrupted_film_goes_on_and_another_one_starts_anew(tmp_path: Path):
+def test_write_video_interrupted_continues_and_another_plan_starts_anew(tmp_path: Path):
     output, drawn = tmp_path / "film.gif", []
 
     def failing(index: int) -> np.ndarray:
@@ -47,29 +47,29 @@ def test_an_interrupted_film_goes_on_and_another_one_starts_anew(tmp_path: Path)
         return plain(index)
 
     with pytest.raises(KeyboardInterrupt):
-        make_film({"what": 1}, failing, 3, output, fps=10)
+        write_video({"what": 1}, failing, 3, output, fps=10)
     assert not output.exists()
-    assert make_film({"what": 1}, failing, 3, output, fps=10) == 2
+    assert write_video({"what": 1}, failing, 3, output, fps=10) == 2
     assert drawn == [0, 1, 2, 2]
     with pytest.raises(ZeroDivisionError):
-        make_film({"what": 1}, lambda index: plain(index // (1 - index)), 3, output, fps=10)
-    assert make_film({"what": 2}, plain, 3, output, fps=10) == 0, "frames of something else do not count"
+        write_video({"what": 1}, lambda index: plain(index // (1 - index)), 3, output, fps=10)
+    assert write_video({"what": 2}, plain, 3, output, fps=10) == 0, "frames of something else do not count"
 
 
 @pytest.mark.parametrize("name", ["film.gif", "frames"])
-def test_a_film_without_a_single_frame_leaves_nothing(name: str, tmp_path: Path):
+def test_write_video_failing_at_the_first_frame_leaves_nothing(name: str, tmp_path: Path):
     with pytest.raises(ZeroDivisionError):
-        make_film({"what": 1}, lambda index: plain(1 // index), 3, tmp_path / name, fps=10)
+        write_video({"what": 1}, lambda index: plain(1 // index), 3, tmp_path / name, fps=10)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_keeps_its_frames(tmp_path: Path):
-    assert make_film({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 0
+def test_write_video_folder_keeps_its_frames(tmp_path: Path):
+    assert write_video({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 0
     names = sorted(path.name for path in (tmp_path / "frames").iterdir())
     assert names == ["00000.png", "00001.png", "00002.png", "frames.json"]
-    assert make_film({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 3
+    assert write_video({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 3
     with pytest.raises(InputError, match="something else in it"):
-        make_film({"what": 2}, plain, 3, tmp_path / "frames", fps=10)
+        write_video({"what": 2}, plain, 3, tmp_path / "frames", fps=10)
 
 
 @pytest.mark.parametrize(
@@ -77,24 +77,19 @@ def test_a_folder_keeps_its_frames(tmp_path: Path):
     [
         ("film.avi", False, "a name ending in .gif, .mp4, .webp, or a folder"),
         ("film.gif", True, "transparent for .gif"),
-        ("film.mp4", True, "or output=FILE.webp"),
+        ("film.mp4", True, "or -o FILE.webp"),
         ("taken", False, "a file, expected a folder for PNGs"),
         ("folder.gif", False, "a folder, expected a file"),
     ],
 )
-def test_places_where_no_film_can_be(name: str, transparent: bool, message: str, tmp_path: Path):
+def test_check_output_refuses_what_cannot_be_written(name: str, transparent: bool, message: str, tmp_path: Path):
     (tmp_path / "taken").write_text("")
     (tmp_path / "folder.gif").mkdir()
     with pytest.raises(InputError, match=message):
         check_output(tmp_path / name, transparent)
 
 
-def test_even():
-    assert even(plain(0)).shape == (10, 16, 3)
-    assert np.array_equal(even(plain(0, 8, 4)), plain(0, 8, 4))
-
-
-def test_without_pyav_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_check_output_without_pyav_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[video\]'"):
         check_output(tmp_path / "film.mp4", False)

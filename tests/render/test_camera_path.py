@@ -1,4 +1,4 @@
-"""Which views a film shows, against circles whose geometry is known."""
+"""Which views a video shows, against circles whose geometry is known."""
 
 import json
 import math
@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from nerf_lightning.cameras import Cameras, orbit_around, resample_path, spiral_like
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
+from nerf_lightning.render.camera_path import build_path
 from nerf_lightning.render.path_file import read_path
-from nerf_lightning.render.route import find_route
 
 UP = torch.tensor([0.0, 0.6, 0.8])
 CENTRE = torch.tensor([1.0, -2.0, 0.5])
@@ -23,7 +23,7 @@ def circle(frames: int = 12, elevation: float = 0.5) -> Cameras:
     return Cameras.of_size(K.repeat(frames, 1, 1), orbit_around(CENTRE, UP, 3.0, elevation, frames), 16, 12)
 
 
-def test_more_frames_stand_between_those_of_the_path():
+def test_resample_path_more_frames_lie_between_those_of_the_path():
     path, fine = circle(12), resample_path(circle(12), 24, closed=True)
     torch.testing.assert_close(fine.c2w[::2], path.c2w, atol=1e-5, rtol=0)
     torch.testing.assert_close(fine.K, K.repeat(24, 1, 1))
@@ -33,7 +33,7 @@ def test_more_frames_stand_between_those_of_the_path():
     assert (fine.centres - expected[:, :3, 3]).norm(dim=1).max() < height + 1e-4
 
 
-def test_an_open_path_keeps_its_ends_and_fewer_frames_are_spread_over_it():
+def test_resample_path_open_keeps_its_ends_and_fewer_are_spread():
     path = circle(4)
     fine = resample_path(path, 9, closed=False)
     torch.testing.assert_close(fine.c2w[[0, -1]], path.c2w[[0, -1]], atol=1e-6, rtol=0)
@@ -42,7 +42,7 @@ def test_an_open_path_keeps_its_ends_and_fewer_frames_are_spread_over_it():
 
 
 @pytest.mark.parametrize("elevation", [0.0, 0.5, -0.3])
-def test_a_spiral_winds_up_to_the_axis_at_the_same_distance(elevation: float):
+def test_spiral_winds_up_to_the_axis_at_the_same_distance(elevation: float):
     spiral = spiral_like(circle(36, elevation), 60)
     offset = spiral.centres - CENTRE
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), 3.0), atol=1e-3, rtol=0)
@@ -60,9 +60,9 @@ def test_a_spiral_winds_up_to_the_axis_at_the_same_distance(elevation: float):
     ("path", "frames", "count"),
     [("orbit", None, 6), ("orbit", 9, 9), ("spiral", None, 120), ("test", None, 2), ("train", 3, 3)],
 )
-def test_words(path: str, frames: int | None, count: int):
+def test_build_path_words(path: str, frames: int | None, count: int):
     scene = bricks(size=16, train_views=4, val_views=2, orbit_views=6, cache="")
-    route = find_route(path, frames, scene.orbit, scene)
+    route = build_path(path, frames, scene.orbit, scene, torch.eye(4))
     assert len(route.cameras) == len(route.views) == count
     if path == "train":
         assert route.views == [0, 2, 3] or len(set(route.views)) == 3
@@ -72,7 +72,7 @@ def test_words(path: str, frames: int | None, count: int):
         assert (route.photos is None) == (path != "test")
 
 
-def test_own_files(tmp_path: Path):
+def test_read_path_own_and_nerfstudio_files(tmp_path: Path):
     path = circle(3)
     own = {"width": 16, "height": 12, "K": K.tolist(), "c2w": path.c2w.tolist()}
     (tmp_path / "own.json").write_text(json.dumps(own))
@@ -91,7 +91,7 @@ def test_own_files(tmp_path: Path):
     torch.testing.assert_close(read.K, path.K)
 
 
-def test_the_frame_of_a_path(tmp_path: Path, capsys: pytest.CaptureFixture):
+def test_read_path_frame_is_that_of_the_run_or_the_file(tmp_path: Path, capsys: pytest.CaptureFixture):
     """The file's frame is that of the run, turned, three times as large and shifted."""
     path, to_source = circle(5), torch.eye(4)
     to_source[:3, :3] = 3 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -116,19 +116,17 @@ def test_the_frame_of_a_path(tmp_path: Path, capsys: pytest.CaptureFixture):
         file = tmp_path / f"{name}.json"
         file.write_text(json.dumps(content))
         frame = "file" if name == "own" else "auto"
-        read = find_route(str(file), None, path, None, to_source, frame).cameras
+        read = build_path(str(file), None, path, None, to_source, frame).cameras
         torch.testing.assert_close(read.c2w, path.c2w, atol=1e-4, rtol=0)
         torch.testing.assert_close(read.K, path.K, atol=1e-3, rtol=0)
         assert (read.width, read.height) == (16, 12)
-        assert "in the world frame of the photos' own file (path_frame=run takes the other)" in capsys.readouterr().out
-        read = find_route(str(file), None, path, None, to_source, "run").cameras
+        assert (
+            "in the world frame of the photos' own file (--path-frame run takes the other)" in capsys.readouterr().out
+        )
+        read = build_path(str(file), None, path, None, to_source, "run").cameras
         torch.testing.assert_close(read.c2w, in_file, atol=1e-4, rtol=0)
         assert "in the run's frame" in capsys.readouterr().out
-    torch.testing.assert_close(find_route(str(file), None, path, None, to_source).cameras.c2w, in_file)
-    with pytest.raises(InputError, match="path_frame: found 'file' with path=orbit"):
-        find_route("orbit", None, path, None, to_source, "file")
-    with pytest.raises(InputError, match="path_frame: found 'world', expected one of auto, run, file"):
-        find_route("ngp.json", None, path, None, to_source, "world")
+    torch.testing.assert_close(build_path(str(file), None, path, None, to_source).cameras.c2w, in_file)
 
 
 THEIRS = (
@@ -159,15 +157,7 @@ PATH = '{"width": 4, "height": 4, "K": [[%s,0,2],[0,1,2],[0,0,1]], "c2w": %s}'
         (PATH % (1, "[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]"), "no rotation"),
     ],
 )
-def test_what_is_no_path_is_refused(content: str, message: str, tmp_path: Path):
+def test_read_path_damaged_file_is_refused(content: str, message: str, tmp_path: Path):
     (tmp_path / "path.json").write_text(content)
     with pytest.raises(InputError, match=message):
         read_path(tmp_path / "path.json", circle(), torch.eye(4))
-
-
-def test_other_words_are_refused():
-    words = r"path: found 'dolly', expected one of orbit, spiral, test, train, or a \.json file"
-    with pytest.raises(InputError, match=words):
-        find_route("dolly", None, circle(), None)
-    with pytest.raises(InputError, match=r"missing\.json: found nothing there"):
-        find_route("missing.json", None, circle(), None)

@@ -1,0 +1,110 @@
+"""nerf_lightning check: what is wrong with photos is named, what is right is not."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.check.findings import judge_photos
+from nerf_lightning.check.quality import sharpness
+from nerf_lightning.cli.check import check
+from nerf_lightning.dataset import Views, open_scene
+from nerf_lightning.drawing.camera_map import camera_map
+from nerf_lightning.errors import InputError
+from nerf_lightning.stability.toys import PILE, around, photograph
+from tests.dataset.colmap_files import cameras_of, photos, write_colmap
+
+Edit = Callable[[np.ndarray], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    """A pile on grey grain."""
+    cameras = around(16, 96)
+    images = photograph(PILE, cameras, (0.5, 0.5, 0.5)).numpy().astype(np.int16)
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 60, (96, 96)), (0, 0), 1.0)
+    grain = np.stack([np.roll(noise, 7 * i, axis=1) for i in range(16)])[..., None]
+    return Views.of(torch.from_numpy((images + grain).clip(0, 255).astype(np.uint8)), cameras)
+
+
+def capture(folder: Path, views: Views, edits: dict[int, Edit], points: np.ndarray | None = None) -> Path:
+    names = photos(folder / "images", views)
+    for i, edit in edits.items():
+        imageio.imwrite(folder / "images" / names[i], edit(imageio.imread(folder / "images" / names[i])))
+    given = {} if points is None else {"points": points}
+    write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views), **given)
+    return folder
+
+
+def troubles(folder: Path) -> dict[str, list[str]]:
+    found, _ = judge_photos(open_scene(str(folder)))
+    return {photo.name: [text.split(":")[0] for text in photo.troubles] for photo in found if photo.troubles}
+
+
+def test_judge_photos_good_photos_have_no_troubles(views: Views, tmp_path: Path):
+    assert troubles(capture(tmp_path, views, {})) == {}
+
+
+def test_judge_photos_names_each_trouble(views: Views, tmp_path: Path):
+    edits: dict[int, Edit] = {
+        2: lambda image: cv2.GaussianBlur(image, (0, 0), 1.2),
+        5: lambda image: (image.astype(float) * 1.9).clip(0, 255).astype(np.uint8),
+        7: lambda image: (image * 0.1).astype(np.uint8),
+    }
+    folder = capture(tmp_path, views, edits)
+    (folder / "images/0011.png").write_bytes((folder / "images/0010.png").read_bytes())
+    assert troubles(folder) == {
+        "0002.png": ["blurred"],
+        "0005.png": ["over-exposed", "brighter than the others"],
+        "0007.png": ["darker than the others"],
+        "0011.png": ["doubled"],
+    }
+
+
+def test_sharpness_does_not_depend_on_exposure(views: Views):
+    image = views.image(3).numpy()
+    dark = (image * 0.5).astype(np.uint8)
+    assert sharpness(dark) == pytest.approx(sharpness(image), rel=0.1)
+    assert sharpness(cv2.GaussianBlur(image, (0, 0), 1.5)) < 0.7 * sharpness(image)
+
+
+def test_check_page_shows_everything_the_worst_first(views: Views, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = capture(tmp_path / "a <b>", views, {9: lambda image: cv2.GaussianBlur(image, (0, 0), 1.5)})
+    (folder / "images/9999.png").write_bytes((folder / "images/0000.png").read_bytes())
+    page = tmp_path / "page.html"
+    found = check(folder, output=page, resize=64)
+    assert (
+        any(line.startswith("0009.png: blurred") for line in found) and "0009.png: blurred" in capsys.readouterr().out
+    )
+    text = page.read_text(encoding="utf-8")
+    assert "14 to train on, 2 held out" in text and "16 of 64 x 64" in text
+    assert "1 photos have no place in the model, 9999.png" in text and "<b>" not in text.split("<figure")[0]
+    assert "a &lt;b&gt;" in text and "http" not in text.replace("http-equiv", "")
+    figures = text.split("<figure")[1:]
+    assert len(figures) == 16 and "0009.png" in figures[0] and "0000.png" in figures[1]
+    assert all("data:image/jpeg" in figure for figure in figures)
+
+
+def test_camera_map_shows_points_and_box(views: Views, tmp_path: Path):
+    scene = open_scene(str(capture(tmp_path, views, {}, np.random.default_rng(0).normal(0, 0.3, (300, 3)))))
+    figure = camera_map(list(enumerate(scene.train.cameras.c2w.double().numpy())), scene, {})
+    assert scene.points is not None
+    above, beside = figure.axes
+    for axes, up in ((above, 1), (beside, 2)):
+        lines = [np.asarray(line.get_xydata()) for line in axes.lines]
+        assert any(len(xy) == 300 and np.allclose(xy, scene.points[:, [0, up]]) for xy in lines)
+        assert any(np.allclose(xy[[0, 2]], scene.bounds.aabb[:, [0, up]]) for xy in lines if len(xy) == 5)
+    assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "known points"
+
+
+def test_check_bad_input_is_refused_and_nothing_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="nowhere: found nothing there"):
+        check(Path("nowhere"))
+    with pytest.raises(InputError, match="holdout: found 1"):
+        check(Path("nowhere"), holdout=1)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,95 @@
+"""nerf_lightning render, on a run of seconds."""
+
+import shutil
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.cli.export import export_compact
+from nerf_lightning.cli.render import render
+from nerf_lightning.config.build import build_data
+from nerf_lightning.config.compose import composed
+from nerf_lightning.errors import InputError
+from nerf_lightning.renderer import over
+from nerf_lightning.runs.folder import load_run
+from nerf_lightning.system import NeRF3D
+from nerf_lightning.training.train import train
+
+
+@pytest.fixture
+def run(small_run: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(small_run, tmp_path / "run")
+
+
+def test_render_frames_show_what_the_system_renders(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    output = render(run, frames=2, output=tmp_path / "frames", background="0.2,0.4,0.6", device="cpu")
+    assert "2 frames of 16 x 16 pixels" in capsys.readouterr().out
+    found = load_run(run)
+    assert isinstance(found.system, NeRF3D) and found.orbit is not None
+    rays = found.orbit.view_rays(round(len(found.orbit) / 4 - 0.5))
+    expected = found.system.render(rays, background=(0.2, 0.4, 0.6)).rgb
+    shown = imageio.imread(output / "00000.png")
+    assert np.abs(shown.reshape(-1, 3) / 255 - expected.numpy()).max() <= 0.5 / 255 + 1e-6
+
+
+def test_render_channels_are_side_by_side_at_any_scale(run: Path, tmp_path: Path):
+    render(run, frames=3, channels="rgb,depth,opacity", scale=1.5, path="spiral", output=tmp_path / "video")
+    frames = [imageio.imread(path) for path in (tmp_path / "video").glob("*.png")]
+    assert [frame.shape for frame in frames] == [(24, 72, 3)] * 3
+    assert all((frame[:, 48:, 0] == frame[:, 48:, 1]).all() for frame in frames), "opacity is grey"
+
+
+def test_render_test_path_shows_photos_beside_renders(run: Path, tmp_path: Path):
+    render(run, path="test", channels="rgb,depth", output=tmp_path / "test")
+    frames = sorted((tmp_path / "test").glob("*.png"))
+    assert len(frames) == 2
+    frame = imageio.imread(frames[0])
+    assert frame.shape[1] == 4 * 160 and frame.shape[0] > 160, "truth, render, error, depth, magnified, and a caption"
+    data = build_data(load_run(run).cfg)
+    truth = over(data.held_out(0).pixels, torch.zeros(256, 3)).view(16, 16, 3).numpy()
+    assert np.abs(frame[5:160:10, 5:160:10] / 255 - truth).max() < 1 / 255
+
+
+def test_render_compact_file_and_the_same_command_reuses_frames(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    compact, frames = export_compact(run, loss_db=9), tmp_path / "frames"
+    for there in ("cpu", "2 of them there already"):
+        render(compact, frames=2, background="transparent", output=frames)
+        assert there in capsys.readouterr().out
+    assert imageio.imread(frames / "00001.png").shape == (16, 16, 4)
+    with pytest.raises(InputError, match="something else in it"):
+        render(compact, frames=2, background="white", output=frames)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"background": "pink"}, "background: found 'pink'"),
+        ({"background": "0.1,0.2"}, "background: found '0.1,0.2'"),
+        ({"background": "1,2,3"}, "background: found '1,2,3'"),
+        ({"channels": "rgb,normals"}, "channels: found 'rgb,normals'"),
+        ({"channels": "rgb,rgb"}, "channels: found 'rgb,rgb'"),
+        ({"frames": 0}, "frames: found 0"),
+        ({"fps": 0.0}, "fps: found 0"),
+        ({"scale": 2.0, "path": "test"}, "scale: found 2"),
+        ({"output": Path("film.mov")}, "output: found film.mov"),
+        ({"path": "dolly"}, "path: found 'dolly'"),
+        ({"path": "nowhere.json"}, "nowhere.json: found nothing there"),
+        ({"path_frame": "file"}, "path_frame: found 'file' with path=orbit"),
+    ],
+)
+def test_render_bad_options_are_refused_before_the_run_is_opened(given: dict, message: str):
+    with pytest.raises(InputError, match=message):
+        render(Path("nowhere"), **given)
+
+
+def test_render_refuses_an_images_run(tmp_path: Path):
+    given = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=2", "~logger"]
+    given += [f"callbacks.{one}=null" for one in ("training_gif", "charts", "baselines")]
+    train(composed(given, tmp_path / "flat"))
+    with pytest.raises(InputError, match="expected a scene's run"):
+        render(tmp_path / "flat")

@@ -1,0 +1,162 @@
+"""nerf_lightning view: the page about a scene, its server, and what a path is taken for."""
+
+import functools
+import http.client
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nerf_lightning.cli.view import is_run, view
+from nerf_lightning.dataset import Scene, Views, save_npz
+from nerf_lightning.errors import InputError
+from nerf_lightning.view.drawing import colour_points
+from nerf_lightning.view.scene_page import ScenePage
+from nerf_lightning.view.serve import announce, resolve_host
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def page(scene: Scene) -> Iterator[ScenePage]:
+    page = ScenePage(scene, "127.0.0.1", 0)
+    yield page
+    page.stop()
+
+
+def test_scene_page_is_served_with_cameras_where_they_are_and_no_rays(page: ScenePage, scene: Scene):
+    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
+    connection.request("GET", "/")
+    response = connection.getresponse()
+    assert response.status == 200
+    assert b"<html" in response.read()
+    connection.close()
+    nodes = page.server.scene.get_handle_by_name
+    for group, views in (("training", scene.train), ("held_out", scene.val)):
+        for i, c2w in enumerate(views.cameras.c2w.numpy()):
+            handle = nodes(f"/{group}/{i}")
+            np.testing.assert_allclose(handle.position, c2w[:3, 3])
+            w, x, y, z = handle.wxyz
+            third = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
+            np.testing.assert_allclose(third, c2w[:3, 2], atol=1e-5)  # z looks ahead, as OpenCV has it
+    for name in ("/orbit", "/box", "/focus", "/axes"):
+        assert nodes(name).visible
+    assert not nodes("/rays").visible and nodes("/rays/approach") is None
+
+
+def test_scene_page_controls_change_what_is_shown(page: ScenePage):
+    nodes = page.server.scene.get_handle_by_name
+    page.which.value = "one from each camera"
+    page.draw_rays()
+    first = nodes("/rays/approach").points.copy()
+    assert first.shape == (4, 2, 3)
+    page.draw_rays()
+    assert np.array_equal(nodes("/rays/approach").points, first)
+    page.draw_rays(again=True)
+    assert not np.array_equal(nodes("/rays/approach").points, first)
+    page.which.value, page.camera.value, page.count.value, page.samples.value = "many from one camera", 3, 5, 7
+    page.draw_rays()
+    centre = page.scene.train.cameras.centres[3].numpy()
+    np.testing.assert_allclose(nodes("/rays/approach").points[:, 0], np.tile(centre, (5, 1)))
+    assert len(nodes("/rays/samples").points) == 7 * len(nodes("/rays/inside").points)
+    page.which.value = "none"
+    page.draw_rays()
+    assert not nodes("/rays").visible
+    size = nodes("/training/0").scale
+    page.depth.value = 2 * page.depth.value
+    page.size_frusta()
+    assert nodes("/training/0").scale == pytest.approx(2 * size)
+    page.photos.value = False
+    page.show_photos()
+    assert nodes("/training/0").image is None
+
+
+def test_colour_points_takes_the_nearest_photos_colour(scene: Scene):
+    images = torch.zeros(4, 16, 16, 3, dtype=torch.uint8)
+    images[:] = torch.tensor([10, 20, 30, 40])[:, None, None, None]
+    views = Views.of(images, scene.train.cameras)
+    c2w = scene.train.cameras.c2w
+    near = c2w[2, :3, 3] + 0.5 * c2w[2, :3, 2]
+    behind = scene.train.cameras.centres.mean(0) + 1e3 * torch.tensor([0.0, 0.0, 1.0])
+    points, rgb = colour_points(torch.stack([near, behind]), views)
+    np.testing.assert_allclose(points[0], near)
+    assert rgb.tolist() == [[30] * 3, [128] * 3]
+
+
+def test_view_without_viser_names_the_extra(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[view\]'"):
+        view(Path("any.npz"))
+
+
+def test_scene_page_takes_the_next_port_where_one_is_taken(scene: Scene):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        page = ScenePage(scene, "127.0.0.1", port)
+        page.stop()
+    assert page.port > port
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "", "no such host"])
+def test_resolve_host_of_another_machine_is_refused(host: str):
+    with pytest.raises(InputError, match="127.0.0.1 for this machine alone"):
+        resolve_host(host)
+
+
+def test_announce_says_who_can_see_the_page():
+    assert announce("lego", "127.0.0.1", 8080, 8080) == "lego: http://127.0.0.1:8080"
+    assert announce("lego", "localhost", 8080, 8081).endswith("http://localhost:8081 (port 8080 is taken)")
+    assert "http://127.0.0.1:9000; shared with the network" in announce("lego", "0.0.0.0", 0, 9000)
+
+
+def test_is_run_tells_runs_from_scenes(scene: Scene, small_run: Path, tmp_path: Path):
+    save_npz(scene, tmp_path / "scene.npz")
+    shutil.copytree(small_run, tmp_path / "runs" / "first")
+    photos = tmp_path / "photos"
+    shutil.copytree(small_run, photos / "outputs" / "first")
+    (photos / "transforms.json").write_text("{}")
+    np.savez(tmp_path / "compact.npz", header=np.zeros(3, np.uint8))
+    found = {name: is_run(tmp_path / name) for name in ("scene.npz", "runs", "runs/first", "photos", "compact.npz")}
+    assert found == {"scene.npz": False, "runs": True, "runs/first": True, "photos": False, "compact.npz": True}
+
+
+def test_view_ends_with_ctrl_c_and_writes_nothing(scene: Scene, tmp_path: Path):
+    save_npz(scene, tmp_path / "small.npz")
+    code = "from nerf_lightning.cli.app import main; main()"
+    called = [sys.executable, "-c", code, "view", "small.npz", "--port", "0"]
+    # What runs in the background may ignore it.
+    listen = functools.partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(called, cwd=tmp_path, env=environment, preexec_fn=listen, **pipes)
+    try:
+        line = next(line for line in process.stdout if "http" in line)
+        assert line.startswith("small: http://127.0.0.1:"), line
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+    assert process.returncode in (0, 130)
+    assert list(tmp_path.iterdir()) == [tmp_path / "small.npz"]
+
+
+@pytest.mark.parametrize(
+    ("path", "given", "message"),
+    [
+        ("nowhere", {}, "nowhere: found nothing there"),
+        ("missing.npz", {}, "missing.npz: found nothing there"),
+        ("a.npz", {"holdout": 1}, "holdout: found 1"),
+        ("a.npz", {"side": 3}, "side: found 3"),
+        ("a.npz", {"port": 70000}, "port: found 70000"),
+    ],
+)
+def test_view_bad_input_is_refused(path: str, given: dict[str, int], message: str):
+    with pytest.raises(InputError, match=message):
+        view(Path(path), **given)
