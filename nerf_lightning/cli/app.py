@@ -10,6 +10,7 @@ from cyclopts import App, Parameter
 from cyclopts.exceptions import CycloptsError
 
 from nerf_lightning import __version__
+from nerf_lightning.cli.compare import compare
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.cli.train import is_override, train
 from nerf_lightning.errors import InputError
@@ -27,7 +28,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for function in (train, evaluate):
+for function in (train, evaluate, compare):
     app.command(function, sort_key=len(app.resolved_commands()))
 
 

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from nerf_lightning.config import conf_dir
 from nerf_lightning.errors import InputError
 
-OPTIONAL = ("callbacks", "logger", "recipe", "refine", "references", "renderer", "sampler")
+OPTIONAL = ("callbacks", "logger", "recipe", "refine", "renderer", "sampler")
 """Groups that a command can do without; a picture, without the sampler and the renderer that a scene needs."""
 NONE = "none"
 """Their option that stands for nothing: Hydra takes no null for a group."""

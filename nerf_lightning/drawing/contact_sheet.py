@@ -30,7 +30,7 @@ def contact_sheet(
     """Lays out images row by row on white.
 
     Args:
-        images: at least one; None leaves a grey box.
+        images: None leaves a grey box; none at all make a sheet of the heading alone.
         captions: of each image, in as many lines as they need.
         columns: images side by side, at most.
         width: of the sheet in pixels, to which images are scaled; None keeps their own sizes.
@@ -50,14 +50,15 @@ def contact_sheet(
     texts = [wrap(caption, cell, text_px) for caption in captions]
     title = wrap(heading, width - 2 * GAP, 3 * text_px // 2)
     line = round(1.3 * text_px)
-    tops = [GAP + (2 * line + GAP // 2) * len(title)]
+    tops = [GAP + 3 * line // 2 * len(title)]
     for first in range(0, len(images), columns):
         row = range(first, min(first + columns, len(images)))
         tops.append(tops[-1] + max(scaled[i].shape[0] + line * len(texts[i]) for i in row) + 2 * GAP)
 
     sheet = Image.new("RGB", (width, tops[-1]), "white")
     draw = ImageDraw.Draw(sheet)
-    draw.text((GAP, GAP), "\n".join(title), "black", _font(3 * text_px // 2))
+    for n, words in enumerate(title):
+        draw.text((GAP, GAP // 2 + n * (3 * line // 2)), words, "black", _font(3 * text_px // 2))
     for i, (image, text) in enumerate(zip(scaled, texts, strict=True)):
         row, column = divmod(i, columns)
         left, top = GAP + column * (cell + GAP), tops[row]

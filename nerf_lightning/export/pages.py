@@ -15,7 +15,6 @@ from nerf_lightning.export.options import ExportOptions
 from nerf_lightning.export.page import field_page, gallery_page, picture_page
 from nerf_lightning.export.reach import occupied_cells
 from nerf_lightning.export.smallest import held_out_psnr, smallest, some_cameras
-from nerf_lightning.gallery.figure import label
 from nerf_lightning.runs.compact import without_folders
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import RunFolder, plain_config
@@ -120,7 +119,8 @@ def side_by_side(options: ExportOptions, folder: Path, device: torch.device) -> 
             with atomic(address) as temporary:
                 temporary.write_bytes(page)
             print(f"{address}: {words}")
-        pages.append((address_from(output.parent, address), label(run, keys), line))
+        label = ", ".join(f"{key} {run.option(key)}" for key in keys) or run.folder.name
+        pages.append((address_from(output.parent, address), label, line))
     if not pages:
         raise InputError(folder, "", "no run that can be shown", "a folder of finished runs", "see what was left out")
     with atomic(output) as temporary:

@@ -18,7 +18,7 @@ LOCK = ".lock"
 RUN = ("config.yaml", "results.json", "checkpoints")
 """Any of these says that a folder holds a run."""
 MADE = (
-    *RUN, "scene.json", "error.txt", "hparams.yaml", "events.out.tfevents.*", "snapshots", "final.png", "orbit.gif",
+    *RUN, "scene.json", "error.txt", "events.out.tfevents.*", "snapshots", "final.png", "truth.png", "orbit.gif",
     "training.gif", "error.png", "spectrum.png", "curve.png", "csv", "wandb", "baselines.json", "enlarged.*", "enlarged_*",
     "compact.npz", "field.html", "mesh.ply", "mesh.obj", "mesh.glb", "mesh.stl", "points.ply", "voxels.npz", "posed",
     "render_*", "evaluation",

@@ -126,7 +126,7 @@ def _range_of(value: Any) -> str:
     return f"numbers are finite, whole ones at most {WHOLE:.3g}, others {SINGLE:.3g}"
 
 
-def _within(value: float, bound: Any) -> bool:
+def _within(value: Any, bound: Any) -> bool:
     """Whether a number keeps a bound; other annotations are none."""
     if isinstance(bound, AtLeast):
         return value >= bound.value

@@ -248,7 +248,7 @@ def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path
     assert code == 0, err
     assert sorted(path.name for path in (folder / "snapshots").iterdir()) == ["step_0000001.png", "step_0000003.png"]
     assert sorted(path.name for path in folder.iterdir()) == [
-        *("config.yaml", "final.png", "notes.txt", "results.json", "scene.json", "snapshots")
+        *("config.yaml", "final.png", "notes.txt", "results.json", "scene.json", "snapshots", "truth.png")
     ]
     assert "overwrite" not in (folder / "config.yaml").read_text()
     with owned(folder):

@@ -1,4 +1,4 @@
-"""Runs as web pages by the command line, from training to the chart that links to them."""
+"""Runs as web pages by the command line."""
 
 import json
 import re
@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from made_runs import results
 
-from nerf_lightning.chart.__main__ import main as chart
 from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.__main__ import task
@@ -65,7 +64,7 @@ def test_a_run_and_its_compact_file_become_pages(planes: Path, tmp_path: Path, c
     assert alone["photos"] is None and alone["orbit"] == about["orbit"]
 
 
-def test_a_folder_of_runs_becomes_pages_that_a_chart_links_to(sweep: Path, verb, capfd: pytest.CaptureFixture[str]):
+def test_a_folder_of_runs_becomes_pages(sweep: Path, capfd: pytest.CaptureFixture[str]):
     export(sweep, "format=html")
     out = capfd.readouterr().out
     assert "left out: " in out and "2 fields side by side" in out
@@ -77,9 +76,6 @@ def test_a_folder_of_runs_becomes_pages_that_a_chart_links_to(sweep: Path, verb,
     before = (sweep / "second/field.html").stat().st_mtime_ns
     export(sweep, "format=html")
     assert (sweep / "second/field.html").stat().st_mtime_ns == before, "a page that is there is kept"
-    code, _, errors = verb(chart, f"runs={sweep}", "output=chart")
-    assert code == 0, errors
-    assert '"page": "../sweep/' in (Path("chart") / "chart.html").read_text("utf-8")
 
 
 def test_a_folder_without_runs_is_refused(tmp_path: Path):
