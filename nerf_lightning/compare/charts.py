@@ -66,7 +66,9 @@ def draw_quality(points: pd.DataFrame) -> Figure:
 def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figure:
     """PSNR against a cost: bars from the worst to the best seed, the frontier, PSNR on the way; publications are hollow."""
     figure, axes = make_panel(f"Quality against {COSTS[cost].split(',')[0]}")
-    placed, training, texts = points[points[cost].notna()], cost == "train_seconds", []
+    placed, training = points[points[cost].notna()], cost == "train_seconds"
+    texts: list[Text] = []
+    xs: list[float] = placed[cost].tolist()
     front = placed[[cost in costs.split() for costs in placed["frontier"]]].sort_values([cost, "psnr"])
     for point in placed.itertuples():
         colour, marker = point.style
@@ -78,6 +80,7 @@ def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figu
     reach, label = MAX_TIME_RATIO * placed[cost].max(), "published, other hardware"
     for one in references.itertuples() if training else ():
         x, inside = min(one.seconds, reach), one.seconds <= reach
+        xs.append(x)
         axes.scatter([x], [one.psnr], 34, "none", marker="o" if inside else ">", edgecolor=GREY, label=label)
         name = one.name if inside else f"{one.name} ({one.seconds / 3600:.1f} h)"
         texts.append(add_name(axes, name, x, one.psnr, GREY))
@@ -94,17 +97,16 @@ def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figu
         for method, (colour, marker) in dict(zip(placed["method"], placed["style"], strict=True)).items():
             axes.plot([], [], marker, color=colour, label=readable(method))
     axes.set(xlabel=COSTS[cost], ylabel="held-out PSNR, dB")
-    scale_costs(axes, cost)
+    scale_costs(axes, cost, xs)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=7, frameon=False)
     adjust_text(texts, ax=axes, expand=(1.15, 1.5), arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.6})
     return figure
 
 
-def scale_costs(axes: Axes, cost: str) -> None:
+def scale_costs(axes: Axes, cost: str, values: list[float]) -> None:
     """A logarithmic axis where costs differ by much, with few round ticks."""
-    places = np.concatenate([np.ravel(mark.get_offsets()[:, 0]) for mark in axes.collections])
-    ratio = places.max() / places.min()
+    ratio = max(values) / min(values)
     if ratio > 8:
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if ratio < 300 else (1.0,)))

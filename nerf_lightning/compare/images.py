@@ -46,8 +46,8 @@ def collect_images(points: pd.DataFrame) -> list[tuple[str, UInt8[np.ndarray, "H
             for part in (image, image[top : top + rows, left : left + cols])
         )
         scale = whole.shape[1] / width
-        corners = [(round(scale * x), round(scale * y)) for x, y in ((left, top), (left + cols, top + rows))]
-        cv2.rectangle(whole, *corners, rgb(VERMILLION), 2)
+        box = [round(scale * x) for x in (left, top, cols, rows)]
+        cv2.rectangle(whole, box, rgb(VERMILLION), 2)
         shown.append(
             (caption, np.concatenate([np.pad(whole, GAP, constant_values=255), cv2.resize(crop, whole.shape[1::-1])]))
         )

@@ -106,52 +106,40 @@ def tabulate(comparisons: Sequence[Comparison], runs: Sequence[Run]) -> pd.DataF
 def draw_figure(comparisons: Sequence[Comparison], failures: Sequence[str]) -> UInt8[np.ndarray, "H W 3"]:
     """Panels, images and words of all comparisons, one below the other."""
 
-    def write(lines: Sequence[str], text_px: int) -> UInt8[np.ndarray, "H W 3"]:
+    def write(*lines: str, text_px: int = 12) -> UInt8[np.ndarray, "H W 3"]:
         return contact_sheet([], [], 1, SHEET_PX, heading="\n".join(lines), text_px=text_px)
 
     parts = []
     for one in comparisons[:MAX_COMPARISONS]:
-        parts += [write([one.title], 20), write([one.details, *one.advice, *one.remarks], 12)]
-        count = len(one.panels)
-        parts.append(contact_sheet(one.panels, [""] * count, choose_columns(count, 3), SHEET_PX))
-        if one.images:
-            captions, images = zip(*one.images, strict=True)
-            parts.append(contact_sheet(images, captions, choose_columns(len(images), 6), SHEET_PX, text_px=18))
-    left_out = len(comparisons) - MAX_COMPARISONS
-    if left_out > 0:
-        parts.append(write([f"{left_out} more comparisons are in compare.html"], 12))
+        parts += [write(one.title, text_px=20), write(one.details, *one.advice, *one.remarks)]
+        for captioned, most in ([("", panel) for panel in one.panels], 3), (one.images, 6):
+            captions, images = [caption for caption, _ in captioned], [image for _, image in captioned]
+            parts.append(contact_sheet(images, captions, choose_columns(len(images), most), SHEET_PX, text_px=18))
+    if len(comparisons) > MAX_COMPARISONS:
+        parts.append(write(f"{len(comparisons) - MAX_COMPARISONS} more comparisons are in compare.html"))
     if failures:
         more = len(failures) - MAX_FAILURES
         ends = [f"and {more} more, all in compare.csv"] if more > 0 else []
-        parts.append(write(["Failed, collapsed or cut short:", *failures[:MAX_FAILURES], *ends], 12))
+        parts.append(write("Failed, collapsed or cut short:", *failures[:MAX_FAILURES], *ends))
     return np.concatenate(parts)
 
 
 def choose_columns(count: int, most: int) -> int:
     """How many columns leave the fewest cells empty; of several the most, but not one alone."""
-    return min(range(min(count, most), 0, -1), key=lambda columns: -count % columns + (columns == 1) * most)
+    return min(range(max(1, min(count, most)), 0, -1), key=lambda columns: -count % columns + (columns == 1) * most)
 
 
 def fill_page(comparisons: Sequence[Comparison], failures: Sequence[str], folder: Path) -> str:
     """The page in a folder: rows link to the turnable page of a run, where it has one."""
 
-    def fill_row(point: Any) -> dict[str, Any]:
+    def find_page(point: Any) -> str | None:
         page = typical_run(point).folder / FIELD_PAGE
-        address = address_from(folder, page) if page.is_file() else None
-        return {"label": point.label, "cells": fill_cells(point), "page": address, "options": point.options}
+        return address_from(folder, page) if page.is_file() else None
 
-    shown = [
-        {
-            "comparison": one,
-            "rows": [fill_row(point) for point in one.points.itertuples()],
-            "images": [(caption, data_url(image, ".webp")) for caption, image in one.images],
-            "charts": [data_url(panel, ".png") for panel in one.panels],
-        }
-        for one in comparisons
-    ]
-    here, words = Path(__file__), {"headings": HEADINGS, "caption": CAPTION, "failures": failures}
-    style = here.with_name("compare.css")
-    return render_page(here.with_name("compare.html"), [style], title="Comparison", shown=shown, **words)
+    values: dict[str, Any] = {"cells": fill_cells, "find_page": find_page, "url": data_url, "headings": HEADINGS}
+    values |= {"comparisons": comparisons, "failures": failures, "caption": CAPTION}
+    here = Path(__file__)
+    return render_page(here.with_name("compare.html"), [here.with_name("compare.css")], title="Comparison", **values)
 
 
 def fill_cells(point: Any) -> list[str]:

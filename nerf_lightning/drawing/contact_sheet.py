@@ -60,8 +60,7 @@ def contact_sheet(
     for n, words in enumerate(title):
         draw.text((GAP, GAP // 2 + n * (3 * line // 2)), words, "black", _font(3 * text_px // 2))
     for i, (image, text) in enumerate(zip(scaled, texts, strict=True)):
-        row, column = divmod(i, columns)
-        left, top = GAP + column * (cell + GAP), tops[row]
+        left, top = GAP + i % columns * (cell + GAP), tops[i // columns]
         right, bottom = left + image.shape[1], top + image.shape[0]
         sheet.paste(Image.fromarray(image), (left, top))
         if i in flagged:

@@ -86,7 +86,7 @@ def tag_sheet(folders: Mapping[str, Sequence[Outcome]], aspect: float) -> UInt8[
         folders: their outcomes, by title.
         aspect: width / height of most photos.
     """
-    sheets = []
+    sheets: list[UInt8[np.ndarray, "H W 3"]] = []
     for title, outcomes in folders.items():
         shown = thinned(outcomes, MOST)
         columns = min(6, max(3, ceil(sqrt(1.5 * len(shown)))))
