@@ -18,7 +18,7 @@ def seen(background: torch.Tensor) -> Rendered:
     return Rendered(rgb, opacity, opacity * torch.tensor([0.0, 2.0, 4.0]))
 
 
-def test_the_background_shows_through_all_channels_but_opacity():
+def test_colours_background_shows_through_all_channels_but_opacity():
     blue = (0.0, 0.0, 1.0)
     style = Style(("rgb", "depth", "opacity"), blue, (2.0, 4.0))
     rendered = seen(torch.tensor(blue))
@@ -29,7 +29,7 @@ def test_the_background_shows_through_all_channels_but_opacity():
     torch.testing.assert_close(colours(rendered, "opacity", style), torch.tensor([[0.0], [0.5], [1.0]]).expand(3, 3))
 
 
-def test_transparent_colours_are_straight_and_give_any_background():
+def test_colours_transparent_are_straight_and_give_any_background():
     style = Style(("rgb",), None, (0.0, 1.0))
     straight = colours(seen(torch.zeros(3)), "rgb", style)
     assert straight.shape == (3, 4)
@@ -53,7 +53,7 @@ def test_depth_limits_are_percentiles():
     assert low == 3.0 < high
 
 
-def test_errors_are_magnified_and_told_in_decibels():
+def test_error_picture_is_magnified_and_told_in_decibels():
     truth = np.full((4, 5, 3), 100, np.uint8)
     shown = truth.copy()
     shown[..., 0] += 10
