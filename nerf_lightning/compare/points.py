@@ -57,7 +57,7 @@ def compute_points(runs: Sequence[Run]) -> list[tuple[Conditions, pd.DataFrame]]
     `utils/machine`), options, runs, and the costs of whose frontier a point is. Sorted by falling PSNR. A configuration of
     which half of the runs or more collapsed makes no point, nor do runs without a figure.
     """
-    table = pd.DataFrame([make_record(run) for run in runs if run.psnr is not None and run.figure("train_seconds")])
+    table = pd.DataFrame([make_record(run) for run in runs if has_figures(run)])
     found = []
     for conditions, group in table.groupby("conditions") if len(table) else ():
         points = group.groupby("key", sort=False).agg(
@@ -79,6 +79,11 @@ def compute_points(runs: Sequence[Run]) -> list[tuple[Conditions, pd.DataFrame]]
             points["frontier"] = [" ".join(cost for cost in COSTS if i in fronts[cost]) for i in points.index]
             found.append((Conditions(*conditions), points))
     return sorted(found, key=lambda pair: -len(pair[1]))
+
+
+def has_figures(run: Run) -> bool:
+    """Whether a run can be compared."""
+    return run.psnr is not None and (run.figure("train_seconds") or 0) > 0
 
 
 def make_record(run: Run) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from nerf_lightning.compare.advice import list_caveats, recommend
 from nerf_lightning.compare.charts import draw_panels
 from nerf_lightning.compare.images import collect_images
-from nerf_lightning.compare.points import COSTS, Conditions, compute_points, format_bytes, typical_run
+from nerf_lightning.compare.points import COSTS, Conditions, compute_points, format_bytes, has_figures, typical_run
 from nerf_lightning.drawing.contact_sheet import contact_sheet
 from nerf_lightning.drawing.panels import data_url, write_png
 from nerf_lightning.runs.index import FIELD_PAGE, Run
@@ -70,8 +70,7 @@ def write_comparison(
         origins = [f"Published, other hardware: {origin}." for origin in published["origin"].unique()]
         panels, images = draw_panels(points, published), collect_images(points)
         comparisons.append(Comparison(conditions, points, advice, [*list_caveats(points), *origins], panels, images))
-    failures = list_failures(runs)
-    table = tabulate(comparisons, runs)
+    failures, table = list_failures(runs), tabulate(comparisons, runs)
     with atomic(output / "compare.csv") as temporary:
         table.to_csv(temporary, index=False)
     write_png(output / "compare.png", draw_figure(comparisons, failures))
@@ -85,7 +84,7 @@ def write_comparison(
 def list_failures(runs: Sequence[Run]) -> list[str]:
     """A line for each run that did not end well, with its folder as seen from the one that holds all runs."""
     common = os.path.commonpath([run.folder.absolute().parent for run in runs])
-    bad = [run for run in runs if run.status not in ("finished", "stopped_early") or run.psnr is None]
+    bad = [run for run in runs if run.status not in ("finished", "stopped_early") or not has_figures(run)]
     return [f"{os.path.relpath(run.folder, common)}: {run.status}: {run.diagnosis}".rstrip(": ") for run in bad]
 
 
@@ -118,9 +117,7 @@ def draw_figure(comparisons: Sequence[Comparison], failures: Sequence[str]) -> U
     if len(comparisons) > MAX_COMPARISONS:
         parts.append(write(f"{len(comparisons) - MAX_COMPARISONS} more comparisons are in compare.html"))
     if failures:
-        more = len(failures) - MAX_FAILURES
-        ends = [f"and {more} more, all in compare.csv"] if more > 0 else []
-        parts.append(write("Failed, collapsed or cut short:", *failures[:MAX_FAILURES], *ends))
+        parts.append(write(f"Failed, collapsed or cut short ({len(failures)}):", *failures[:MAX_FAILURES]))
     return np.concatenate(parts)
 
 
