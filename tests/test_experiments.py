@@ -131,9 +131,12 @@ def test_what_a_run_leaves(tmp_path: Path):
     ]
     assert (tmp_path / "orbit.gif").stat().st_size > 0
     assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"best.ckpt", "last.ckpt"}
-    events = EventAccumulator(str(tmp_path)).Reload().Tags()
-    assert {"heldout/psnr", "test/psnr", "train/loss", "speed/rays_per_second", "final/psnr"} <= set(events["scalars"])
-    assert "snapshot" in events["images"]
+    (file,) = tmp_path.glob("events.out.tfevents.*")
+    events = EventAccumulator(str(file)).Reload()
+    scalars = set(events.Tags()["scalars"])
+    assert {"val/psnr", "val/ssim", "loss/rgb", "train/psnr", "speed/rays_per_second", "speed/train_seconds"} < scalars
+    assert {name.partition("/")[0] for name in scalars} == {"loss", "lr", "speed", "train", "val"}
+    assert events.Scalars("val/psnr")[-1].step == 60 and events.Tags()["images"] == ["images/view"]
     assert not list(tmp_path.glob("**/.*")), "no temporary file stays behind"
 
 

@@ -16,10 +16,11 @@ ORDER = (
     ("callbacks",),
     ("config",),
     ("runs",),
-    ("gallery",),
-    ("capture", "chart", "evaluate", "check", "export", "render", "view"),
+    ("capture", "check", "compare", "evaluate", "export", "render", "view"),
     ("training",),
-    ("stability", "rightsize", "api", "__main__"),
+    ("stability", "rightsize"),
+    ("cli",),
+    ("api", "__main__"),
     ("__init__",),
 )
 """Each room may import from those above it."""

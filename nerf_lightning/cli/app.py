@@ -12,6 +12,7 @@ from cyclopts.exceptions import CycloptsError
 
 from nerf_lightning import __version__
 from nerf_lightning.cli.check import check
+from nerf_lightning.cli.compare import compare
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.cli.export import export
 from nerf_lightning.cli.render import render
@@ -37,7 +38,7 @@ app = App(
 )
 _help = f"{inspect.cleandoc(train.__doc__ or '')}\n{describe_groups()}"
 app.command(train, help=_help, help_format="plaintext", usage="Usage: nerf_lightning train KEY=VALUE...\n")
-for _command in (check, view, render, evaluate, export):
+for _command in (check, view, render, evaluate, export, compare):
     app.command(_command)
 for _number, _name in enumerate(app.resolved_commands()):
     app[_name].sort_key = _number

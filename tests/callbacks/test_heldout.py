@@ -121,4 +121,4 @@ def test_ssim_of_large_pictures_is_left_to_the_end(clock, system, trainer_with, 
     for system.progress, largest in ((0.3, 12 * 16), (0.6, 12 * 16 - 1)):
         monkeypatch.setattr("nerf_lightning.callbacks.heldout.LARGE", largest)
         held_out.on_train_batch_end(trainer, system, None, None, 0)
-    assert logged == [["heldout/psnr", "heldout/ssim"], ["heldout/psnr"]]
+    assert logged == [["speed/train_seconds", "val/psnr", "val/ssim"], ["speed/train_seconds", "val/psnr"]]

@@ -148,11 +148,7 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
     before = {name: (run / name).read_bytes() for name in ("config.yaml", "scene.json", "results.json")}
     code, _, err = inside(f"resume={run}", "model.width=24")
     assert code == 2 and "last.ckpt: found " in err and err.count("\n") == 1
-<<<<<<< HEAD:tests/cli/test_train.py
-    assert {name: (run / name).read_bytes() for name in before} == before, "what goes on from this state stays"
-=======
     assert {name: (run / name).read_bytes() for name in before} == before, "the run stays as it was"
->>>>>>> w-guards:tests/config/test_cli.py
 
 
 def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path: Path):
@@ -171,7 +167,7 @@ def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path
     assert code == 0, err
     assert sorted(path.name for path in (folder / "snapshots").iterdir()) == ["step_0000001.png", "step_0000003.png"]
     assert sorted(path.name for path in folder.iterdir() if not path.name.startswith(".")) == [
-        *("config.yaml", "final.png", "results.json", "scene.json", "snapshots")
+        *("config.yaml", "final.png", "results.json", "scene.json", "snapshots", "truth.png")
     ]
     assert "overwrite" not in (folder / "config.yaml").read_text()
     with owned(folder):
