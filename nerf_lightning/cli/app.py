@@ -11,6 +11,8 @@ from cyclopts.exceptions import CycloptsError
 
 from nerf_lightning import __version__
 from nerf_lightning.cli.evaluate import evaluate
+from nerf_lightning.cli.rightsize import rightsize
+from nerf_lightning.cli.stability import stability
 from nerf_lightning.cli.train import is_override, train
 from nerf_lightning.errors import InputError
 
@@ -27,7 +29,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for function in (train, evaluate):
+for function in (train, evaluate, rightsize, stability):
     app.command(function, sort_key=len(app.resolved_commands()))
 
 
