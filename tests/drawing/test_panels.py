@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from nerf_lightning.drawing.depth import colorize_depth
 from nerf_lightning.drawing.panels import (
     SMALLEST_SIDE,
-    depth_colours,
     panel,
     result_panel,
     to_bytes,
@@ -53,43 +53,13 @@ def test_captions_fit(caption):
     assert (strip[:, -4:] == 24).all() and (strip[:, :3] == 24).all(), "nothing is cut off"
 
 
-def test_near_is_bright_and_what_is_empty_is_black():
-    depth = torch.linspace(1, 2, 100).repeat(10, 1)
-    opacity = torch.ones(10, 100)
-    opacity[:, 90:] = 0
-    colours = depth_colours(depth, opacity).astype(int)
-    light = colours.sum(-1)
-    assert colours[0, 30, 0] > 2 * colours[0, 30, 2], "in between it glows red"
-    assert (light[:, 90:] == 0).all()
-    assert (np.diff(light[0, :90]) <= 0).all() and light[0, 0] > light[0, 40] > light[0, 85]
-
-
-def test_empty_pixels_do_not_stretch_the_range():
-    depth = torch.linspace(1, 2, 100).repeat(10, 1)
-    opacity = torch.ones(10, 100)
-    opacity[:5] = 0
-    wild = depth.clone()
-    wild[:5] = torch.tensor([0.0, 1e6]).repeat(50)
-    assert np.array_equal(depth_colours(wild, opacity), depth_colours(depth, opacity))
-    half = torch.where(opacity > 0, 1.0, 0.5)  # half covered does not count, but shows at half brightness
-    mixed = depth_colours(wild, half)
-    assert np.array_equal(mixed[5:], depth_colours(depth, opacity)[5:]) and mixed[:5].max() > 0
-
-
-@pytest.mark.parametrize("opacity", [0.0, 1.0])
-def test_depth_of_nothing_or_of_one_distance(opacity):
-    colours = depth_colours(torch.full((4, 5), 3.0), torch.full((4, 5), opacity))
-    assert colours.shape == (4, 5, 3) and (colours == colours[0, 0]).all()
-    assert (colours.max() == 0) == (opacity == 0)
-
-
 @pytest.mark.parametrize("with_depth", [True, False])
 def test_a_result_shows_truth_render_and_depth_or_error(with_depth):
     rgb, truth = torch.full((200, 100, 3), 0.5), torch.full((200, 100, 3), 0.4)
     maps = (torch.ones(200, 100), torch.ones(200, 100)) if with_depth else (None, None)
     made = result_panel(ViewResult(rgb, truth, 20.0, 1.0, *maps), "caption")
     assert (made[100, 50] == 102).all() and (made[100, 150] == 128).all()
-    third = depth_colours(*maps)[0, 0] if with_depth else 102  # four times 0.1
+    third = colorize_depth(np.ones(1), 1.0, 2.0)[0] if with_depth else 102  # four times 0.1
     assert (made[100, 250] == third).all()
 
 
