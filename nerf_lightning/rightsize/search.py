@@ -63,7 +63,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> dic
     Returns:
         The content of rightsize.json: `target`; `growing`, the rungs as they were while growing; `full`, those trained with the
         whole budget, by number; `rung`, the chosen one, with its options of `model` and `sampler`, and the `psnr` and
-        `artifact_bytes` of its compact file; whether it `reached` the target; `noise_db`, by which seeds differ; and the
+        `artifact_bytes` of its compact file; whether it `reached` the target; the `device`; `noise_db`, by which seeds differ; and the
         `search_seconds` of training in all.
 
     Raises:
@@ -109,6 +109,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> dic
     return {
         "target": asdict(target),
         "reached": reached,
+        "device": str(device),
         "rung": choice,
         "model": ladder.rungs[choice],
         "sampler": sampler,

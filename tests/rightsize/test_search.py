@@ -121,7 +121,10 @@ def test_describe_scene_tells_experiments_scenes_and_images_apart(tmp_path: Path
     ("recipe", "rungs"),
     [
         ("hashgrid_small", [{"width": 16, "levels": 3}, {"width": 8, "levels": 3}, {"width": 8, "levels": 2}]),
-        ("tensorf_small", [{**RUNGS[1], "width": None}, {**RUNGS[1], "width": 8}, {**RUNGS[1], "colour_components": 3}]),
+        (
+            "tensorf_small",
+            [{**RUNGS[1], "width": None}, {**RUNGS[1], "width": 8}, {**RUNGS[1], "colour_components": 3}],
+        ),
     ],
 )
 def test_climb_rung_smaller_in_something_starts_anew(recipe: str, rungs: list[dict], scene: str, tmp_path: Path):

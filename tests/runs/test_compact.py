@@ -18,7 +18,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.export.__main__ import task
 from nerf_lightning.runs.compact import decode, load_compact
 from nerf_lightning.runs.folder import load_run
-from nerf_lightning.stability.toys import MARBLE, toy
+from nerf_lightning.synthetic.objects import MARBLE, make_scene
 from nerf_lightning.training.train import train
 
 
@@ -27,7 +27,7 @@ def export(folder: Path, *given: str) -> None:
 
 
 def trained(folder: Path, recipe: str = "tensorf_small", *more: str) -> Path:
-    save_npz(toy(MARBLE, size=20, views=10, held_out=2), folder / "scene.npz")
+    save_npz(make_scene(MARBLE, size=20, views=10, held_out=2), folder / "scene.npz")
     given = [
         "dataset=photos",
         f"dataset.path={folder}/scene.npz",

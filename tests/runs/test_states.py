@@ -12,13 +12,13 @@ from nerf_lightning.callbacks import Budget, Guard, HeldOut, Throughput
 from nerf_lightning.callbacks.plateau import Plateau
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.refine import Corrections
-from nerf_lightning.stability.toys import MARBLE, toy
+from nerf_lightning.synthetic.objects import MARBLE, make_scene
 
 WRONG = (None, "text", [], {}, [None], {"a": 1}, math.nan, -math.inf, 10**400, -(10**12), torch.zeros(2, 2))
 
 
 def data(learned: bool) -> tuple[Callable[[], dict], Callable[[dict], None]]:
-    module = RayDataModule(toy(MARBLE, size=16, views=3, held_out=1), rays=50, samples=None)
+    module = RayDataModule(make_scene(MARBLE, size=16, views=3, held_out=1), rays=50, samples=None)
     if learned:
         for step in range(20):
             module.note_errors(module.draw(step).pixels.float().mean(1) / 255)
@@ -55,7 +55,7 @@ def throughput(learned: bool) -> tuple[Callable[[], dict], Callable[[dict], None
 
 
 def corrections(learned: bool) -> tuple[Callable[[], dict], Callable[[dict], None]]:
-    scene = toy(MARBLE, size=16, views=3, held_out=1)
+    scene = make_scene(MARBLE, size=16, views=3, held_out=1)
     made = Corrections(scene.train.cameras, scene.bounds, auto=True)
     if learned:
         made.note(30, 0.1, {"poses": 1.0, "light": 0.0, "stated": 0.0})

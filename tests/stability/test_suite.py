@@ -49,7 +49,9 @@ def test_make_waves_holds_all_frequencies_down_to_six_pixels_of_training():
 
 
 def test_list_trials_takes_one_seed_of_hopeless_conditions():
-    trials = list_trials(["clean", "OpenGL poses", "tiny hash table", "2D: clean"], ["hashgrid", "mlp", "2D mlp"], 2, 10)
+    trials = list_trials(
+        ["clean", "OpenGL poses", "tiny hash table", "2D: clean"], ["hashgrid", "mlp", "2D mlp"], 2, 10
+    )
     assert [(one.condition, one.method, one.seed) for one in trials] == [
         ("clean", "hashgrid", 0), ("clean", "hashgrid", 1), ("clean", "mlp", 0), ("clean", "mlp", 1),
         ("OpenGL poses", "hashgrid", 0), ("OpenGL poses", "mlp", 0),
@@ -58,7 +60,9 @@ def test_list_trials_takes_one_seed_of_hopeless_conditions():
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("method", [name for name, one in METHODS.items() if one.guarded is None and name != "relu mlp"])
+@pytest.mark.parametrize(
+    "method", [name for name, one in METHODS.items() if one.guarded is None and name != "relu mlp"]
+)
 def test_run_trial_every_method_learns_something(method: str, tmp_path: Path):
     outcome = run_trial(Trial("2D: clean" if METHODS[method].flat else "black, small object", method, 0, 30), tmp_path)
     assert outcome.status == "finished", outcome
@@ -154,7 +158,9 @@ def test_find_rescues_compares_guarded_twin_with_undisturbed_runs():
 
 def test_write_report_tells_failures(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     outcomes = [replace(GOOD, seed=seed, psnr=30.0 - seed) for seed in range(3)]
-    outcomes += [replace(GOOD, condition="white, small object", seed=seed, psnr=33.0, recoveries=1) for seed in range(2)]
+    outcomes += [
+        replace(GOOD, condition="white, small object", seed=seed, psnr=33.0, recoveries=1) for seed in range(2)
+    ]
     bad = replace(GOOD, condition="white, small object", seed=2, psnr=18.0, status="collapsed", diagnosis="no density")
     outcomes += [bad, replace(GOOD, condition="OpenGL poses", psnr=None, status="refused", diagnosis="backs")]
     outcomes += [replace(GOOD, condition="shuffled poses", psnr=16.0, alarm="outlines that no body has")]
@@ -174,7 +180,9 @@ def test_write_report_tells_failures(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert (imageio.imread(tmp_path / "worst.png") == 90).all(-1).mean() > 0.1
 
 
-@pytest.mark.parametrize(("options", "word"), [({"suite": "all"}, "suite"), ({"methods": ["nerf"]}, "nerf"), ({"methods": []}, "none")])
+@pytest.mark.parametrize(
+    ("options", "word"), [({"suite": "all"}, "suite"), ({"methods": ["nerf"]}, "nerf"), ({"methods": []}, "none")]
+)
 def test_stability_refuses_unknown_names(options: dict, word: str, tmp_path: Path):
     with pytest.raises(InputError, match=word):
         stability(output=tmp_path / "out", **options)

@@ -88,7 +88,9 @@ def test_make_room_scene_is_photographed_from_ring_around_subject():
     assert not torch.equal(scene.train.cameras.c2w, other.train.cameras.c2w)
 
 
-@pytest.mark.parametrize("change", [corruptions.shuffle_poses, lambda s, seed: corruptions.add_image_noise(s, seed, 0.1)])
+@pytest.mark.parametrize(
+    "change", [corruptions.shuffle_poses, lambda s, seed: corruptions.add_image_noise(s, seed, 0.1)]
+)
 def test_corruptions_depend_on_the_seed_alone(change):
     scene = make_scene(PILE, size=8)
     first, again, other = ((v.train.images, v.train.cameras.c2w) for v in (change(scene, s) for s in (1, 1, 2)))

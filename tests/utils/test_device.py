@@ -26,8 +26,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.evaluate.__main__ import task as evaluate
 from nerf_lightning.export.__main__ import task as export
 from nerf_lightning.render.__main__ import task as render
-from nerf_lightning.rightsize.__main__ import task as rightsize
-from nerf_lightning.stability.toys import MARBLE, toy
+from nerf_lightning.synthetic.objects import MARBLE, make_scene
 from nerf_lightning.system import NeRF2D
 from nerf_lightning.utils.device import CPU, devices, synchronize, the_device
 from nerf_lightning.utils.machine import accelerator, device_in_words
@@ -37,7 +36,6 @@ ROOT = Path(__file__).resolve().parents[2]
 VERBS: dict[str, tuple[Callable[[], None], list[str]]] = {
     "train": (train, ["dataset.path=nowhere.npz", "dataset=photos"]),
     "sweep": (train, ["-m", "+experiment=smoke_2d", "seed=0,1"]),
-    "rightsize": (partial(cli.run, "rightsize", rightsize), ["dataset=photos", "dataset.path=nowhere.npz"]),
     "render": (partial(cli.run, "render", render), ["run=nowhere"]),
     "view": (partial(cli.run, "view", view), ["run=nowhere"]),
     "evaluate": (partial(cli.run, "evaluate", evaluate), ["run=nowhere"]),
@@ -194,7 +192,7 @@ def test_each_device_has_limits_of_its_own_that_a_run_overrides(device: str, bat
 def test_a_system_renders_as_much_at_once_as_its_device_takes(tmp_path: Path):
     from nerf_lightning.config.build import PictureFrame, frame_of
 
-    cfg, data = composed([], tmp_path), RayDataModule(toy(MARBLE, size=4, views=3, held_out=1))
+    cfg, data = composed([], tmp_path), RayDataModule(make_scene(MARBLE, size=4, views=3, held_out=1))
     assert build_system(cfg, frame_of(data)).chunk == 32768
     system = build_system(cfg, frame_of(data), torch.device("cuda"))
     assert system.chunk == system.sampler.chunk == 524288
@@ -216,7 +214,7 @@ def test_batches_of_other_devices():
     picture = PixelDataModule(Picture("sunset", "test", builtin_picture(8)), pixels=10)
     picture.enlarge(4)
     assert len(picture.draw(0).uv) == 40
-    scene = toy(MARBLE, size=4, views=3, held_out=1)
+    scene = make_scene(MARBLE, size=4, views=3, held_out=1)
     small, large, fixed = (RayDataModule(scene, 100, samples) for samples in (1000, 1000, None))
     large.enlarge(8)
     fixed.enlarge(8)
