@@ -35,27 +35,18 @@ class Measured:
     """Of training."""
 
 
-def is_worth(before: Measured, after: Measured, slack: float, noise: float) -> bool:
-    """Whether the step from one rung to the next gains enough for its bytes, and more than seeds differ.
-
-    Args:
-        slack: dB that the choice may be below the best.
-        noise: dB by which seeds differ.
-    """
-    doublings = max(math.log2(after.size / before.size), 1.0)
-    return after.psnr - before.psnr > max(noise, slack / GAIN_SHARE * doublings)
-
-
 def stop_growing(rungs: Sequence[Measured], target: Target, noise: float) -> str:
-    """Why there is no point in growing further; "" where there is one."""
+    """Why there is no point in growing further; "" where there is one. `noise` is the dB by which seeds differ."""
     if target.psnr is not None:
         return "the target is near" if rungs[-1].psnr >= target.psnr - FULL_GAIN_DB else ""
     if len(rungs) <= MAX_IDLE:
         return ""
     # The best before counts, not the last: two rungs that fall and rise again have gained nothing.
     base = max(rungs[:-MAX_IDLE], key=lambda one: one.psnr)
-    if any(is_worth(base, one, target.within_db, noise) for one in rungs[-MAX_IDLE:]):
-        return ""
+    for one in rungs[-MAX_IDLE:]:
+        doublings = max(math.log2(one.size / base.size), 1.0)
+        if one.psnr - base.psnr > max(noise, target.within_db / GAIN_SHARE * doublings):
+            return ""
     return f"the last {MAX_IDLE} rungs gained less than they cost"
 
 

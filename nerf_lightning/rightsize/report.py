@@ -21,13 +21,7 @@ GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule")
 
 
 def write_report(found: dict[str, Any], cfg: DictConfig, output: Path) -> None:
-    """Writes all files.
-
-    Args:
-        found: by `search`.
-        cfg: the configuration, before options of a rung.
-        output: the folder.
-    """
+    """Writes all files, from what `search` found and the configuration before options of a rung."""
     write_png(output / "chart.png", pixels_of(draw_chart(found)))
     with atomic(output / "best.yaml") as temporary:
         temporary.write_text(format_experiment(found, cfg), encoding="utf-8")

@@ -29,7 +29,6 @@ from nerf_lightning.runs.owner import LOCK
 from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.before import left_of
-from nerf_lightning.training.room import check_room
 from nerf_lightning.training.train import prepare, train, warm_up
 from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic, write_json
@@ -63,8 +62,8 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> dic
     Returns:
         The content of rightsize.json: `target`; `growing`, the rungs as they were while growing; `full`, those trained with the
         whole budget, by number; `rung`, the chosen one, with its options of `model` and `sampler`, and the `psnr` and
-        `artifact_bytes` of its compact file; whether it `reached` the target; the `device`; `noise_db`, by which seeds differ; and the
-        `search_seconds` of training in all.
+        `artifact_bytes` of its compact file; whether it `reached` the target; the `device`; `noise_db`, by which seeds differ;
+        and the `search_seconds` of training in all.
 
     Raises:
         InputError: where the device, the data or an option of the ladder is no good; or the folder holds something else.
@@ -87,20 +86,19 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> dic
         rungs.append(rung)
         systems.append(system)
         if len(rungs) == 1:
-            noise, seconds = measure_noise(cfg, data, ladder.rungs, rung.psnr, output)
+            seeds = [set_options(cfg, "", {"seed": cfg.seed + extra}) for extra in range(1, EXTRA_SEEDS + 1)]
+            others = [next(climb(one, data, ladder.rungs, output))[1] for one in seeds]
+            noise, seconds = stdev(one.psnr for one in (rung, *others)), sum(one.seconds for one in others)
         if reason := stop_growing(rungs, target, noise):
             stop = reason
             break
     first = choose_first(rungs, target)
     print(f"climbed to rung {len(rungs) - 1}: {stop}; rung {first} seems enough", flush=True)
     sampler = find_sampler(set_options(cfg, "model", ladder.rungs[first]), data, systems[first], ladder.samplers)
-    full: dict[int, Measured] = {}
-    chosen: int | None = first
-    while chosen is not None:
-        print(f"training rung {chosen} in full", flush=True)
-        full[chosen] = train_in_full(cfg, ladder.rungs[chosen], sampler, data, output / f"rung_{chosen}")
-        last = len(ladder.rungs) - 1
-        chosen = choose_second(first, full[first].psnr, rungs, target, last) if len(full) == 1 else None
+    full = {first: train_in_full(cfg, ladder.rungs[first], sampler, data, output / f"rung_{first}")}
+    second = choose_second(first, full[first].psnr, rungs, target, len(ladder.rungs) - 1)
+    if second is not None:
+        full[second] = train_in_full(cfg, ladder.rungs[second], sampler, data, output / f"rung_{second}")
     choice, reached = choose_final(full, target)
     run = load_run(output / f"rung_{choice}", device=device)
     compact = smallest(run.system, data, plain_config(run.cfg), MAX_COMPACT_LOSS_DB)
@@ -137,10 +135,10 @@ def begin(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None
 
 
 def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
-    """A copy of a configuration with other options in a group; unknown ones raise when the group is built."""
+    """A copy of a configuration with other options in a group, or at the top for ""; unknown ones raise when the group is built."""
     changed = copy.deepcopy(cfg)
     for key, value in options.items():
-        OmegaConf.update(changed, f"{group}.{key}", value, force_add=True)
+        OmegaConf.update(changed, f"{group}.{key}".lstrip("."), value, force_add=True)
     return changed
 
 
@@ -165,7 +163,6 @@ def train_rung(cfg: DictConfig, data: Data, folder: Path, smaller: System | None
         data.start_again()
     device = build.device_of(cfg)
     system = build.build_system(cfg, build.frame_of(data), device)
-    check_room(system, data, device)
     if smaller is not None and as_wide(system.field, smaller.field):
         system.warm_start_from(smaller.cpu())  # where a new system is
         smaller.to(device)
@@ -215,27 +212,9 @@ def compact_bytes(cfg: DictConfig, system: System, data: Data) -> int:
     return len(encode(confined_to(system, seen), "byte", plain_config(cfg), scene_content(data)))
 
 
-def measure_noise(
-    cfg: DictConfig, data: Data, ladder: Sequence[Options], psnr: float, folder: Path
-) -> tuple[float, float]:
-    """The standard deviation of the smallest rung's dB over a few seeds, of which one gave `psnr`; and the seconds it took."""
-    figures, spent = [psnr], 0.0
-    for extra in range(1, EXTRA_SEEDS + 1):
-        part = configure_rung(cfg, ladder, 0)
-        part.seed = cfg.seed + extra
-        system, seconds = train_rung(part, data, folder)
-        figures.append(measure_psnr(system, data))
-        spent += seconds
-    return stdev(figures), spent
-
-
 def find_sampler(cfg: DictConfig, data: Data, system: System, samplers: Sequence[Options]) -> Options:
-    """The coarsest of some samplers with which a trained field renders as well as with the best.
-
-    Args:
-        cfg: with whose sampler the field was trained.
-        samplers: options, coarsest first; those that this kind of sampler does not have are left out.
-    """
+    """The coarsest of some samplers with which a trained field renders as well as with the best; options that its kind of
+    sampler does not have are left out."""
     if not isinstance(system, NeRF3D) or not isinstance(data, RayDataModule):
         return {}
     known = inspect.signature(build.target_of(cfg, "sampler")).parameters
@@ -243,7 +222,6 @@ def find_sampler(cfg: DictConfig, data: Data, system: System, samplers: Sequence
     for options in (one for one in samplers if one.keys() <= known.keys()):
         probe = build.build_system(set_options(cfg, "sampler", options), build.frame_of(data), system.device)
         assert isinstance(probe, NeRF3D)  # of the same data
-        check_room(probe, data, system.device)
         probe.field = system.field
         probe.to(system.device)
         probe.sampler.look_through(data.scene.train.cameras)
@@ -261,6 +239,7 @@ def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Data,
     was interrupted continues."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
     whole = set_options(whole, "budget", {"alone": True})
+    print(f"{folder}: {', '.join(f'{key}={value}' for key, value in model.items())}, in full", flush=True)
     done, checkpoint = left_of(read_run(folder), whole)
     if done is None:
         train(whole, checkpoint, folder)

@@ -8,7 +8,6 @@ from nerf_lightning.rightsize.choose import (
     choose_final,
     choose_first,
     choose_second,
-    is_worth,
     stop_growing,
 )
 
@@ -21,11 +20,12 @@ def rungs(*psnrs: float) -> list[Measured]:
 
 
 @pytest.mark.parametrize(
-    ("gain", "times", "noise", "expected"),
-    [(0.2, 2, 0.0, True), (0.05, 2, 0.0, False), (0.2, 8, 0.0, False), (0.2, 2, 0.3, False), (0.2, 0.5, 0.0, True)],
+    ("gain", "times", "noise", "stops"),
+    [(0.2, 2, 0.0, False), (0.05, 2, 0.0, True), (0.2, 8, 0.0, True), (0.2, 2, 0.3, True), (0.2, 0.5, 0.0, False)],
 )
-def test_is_worth_weighs_gain_against_bytes_and_noise(gain: float, times: float, noise: float, expected: bool):
-    assert is_worth(Measured(20, 1000), Measured(20 + gain, int(1000 * times)), 0.3, noise) is expected
+def test_stop_growing_weighs_gain_against_bytes_and_noise(gain: float, times: float, noise: float, stops: bool):
+    after = Measured(20 + gain, int(1000 * times))
+    assert bool(stop_growing([Measured(20, 1000), after, after], NEAR, noise)) is stops
 
 
 @pytest.mark.parametrize(
