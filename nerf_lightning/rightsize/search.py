@@ -135,7 +135,7 @@ def begin(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None
 
 
 def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
-    """A copy of a configuration with other options in a group, or at the top for ""; unknown ones raise when the group is built."""
+    """A copy of a configuration with other options in a group, "" for the top; unknown ones raise when the group is built."""
     changed = copy.deepcopy(cfg)
     for key, value in options.items():
         OmegaConf.update(changed, f"{group}.{key}".lstrip("."), value, force_add=True)

@@ -102,7 +102,8 @@ def draw_heatmap(verdicts: Sequence[Verdict], suite: str) -> Figure:
     axes.set_yticks(range(len(conditions)), conditions, fontsize=9)
     axes.tick_params(length=0)
     seeds = max(len(one.outcomes) for one in verdicts)
-    axes.set_xlabel(f"held-out dB of the worst of {seeds} seeds; suite {suite}", color=GREY, fontsize=9)
+    note = "" if len(cells) == len(conditions) * len(methods) else "; –: does not apply"
+    axes.set_xlabel(f"worst seed of {seeds}, held out; suite {suite}{note}", color=GREY, fontsize=9)
     axes.spines[:].set_visible(False)
     return figure
 

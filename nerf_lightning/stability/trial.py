@@ -64,7 +64,8 @@ def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Iterator[Ou
     from joblib.externals.loky import ProcessPoolExecutor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    pool = ProcessPoolExecutor(workers, env={"OMP_NUM_THREADS": "1"})
+    # Should this process be killed, they end when they have been idle for a minute.
+    pool = ProcessPoolExecutor(workers, timeout=60, env={"OMP_NUM_THREADS": "1"})
     try:
         yield from pool.map(run_trial, trials, repeat(root))
     except TerminatedWorkerError as error:
