@@ -1,8 +1,6 @@
 """python -m benchmarks: what methods, kernels, framework, cameras, captures, photos, 2D fields, sizes, shapes and videos give.
 
 `python -m benchmarks device` tells whether the GPU at hand gives what the CPU gives, and how fast: its last line says it.
-`python -m benchmarks hostile` tells what becomes of inputs that are damaged, absurd or malicious (where there is fork).
-`python -m benchmarks signals` tells what is lost where long commands are interrupted or killed at any moment.
 """
 
 import argparse
@@ -28,7 +26,6 @@ from benchmarks import (
     photos,
     pictures,
     shapes,
-    signals,
     sizes,
     video,
 )
@@ -51,7 +48,7 @@ PARTS = (
     "shapes",
     "video",
 )
-ALONE = ("device", "hostile", "signals")
+ALONE = ("device",)
 """Run only when they are named."""
 
 
@@ -87,12 +84,6 @@ def main() -> None:
     )
     parser.add_argument("--recipes", default="", help="of the parts cameras and captures: what to train")
     parser.add_argument("--device", default="auto", help="of the part device: auto, cpu, cuda or mps")
-    parser.add_argument("--cases", type=int, default=5000, help="of the part hostile: inputs of each seed")
-    parser.add_argument("--case", type=int, help="of the part hostile: the number of one input, to see it in full")
-    parser.add_argument("--moments", type=int, default=30, help="of the part signals: of each command and seed")
-    parser.add_argument(
-        "--commands", default="", help="of the part signals: some of those it tries, separated by commas"
-    )
     parser.add_argument("--output", type=Path, default=Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S"))
     arguments = parser.parse_intermixed_args()  # overrides may stand behind options
     overrides = [part for part in arguments.parts if "=" in part]
@@ -100,8 +91,6 @@ def main() -> None:
     unknown = sorted(set(parts) - {*PARTS, *ALONE})
     if unknown:
         parser.error(f"found {unknown[0]}, expected some of {', '.join([*PARTS, *ALONE])}, or overrides KEY=VALUE")
-    if "hostile" in parts and not hasattr(os, "fork"):
-        parser.error("hostile: found a system without fork, expected one that has it, such as Linux")
     try:
         chosen_device = the_device(arguments.device)
     except InputError as error:
@@ -133,13 +122,6 @@ def main() -> None:
                 flush=True,
             )
             tables, unequal = device.measure(chosen_device, overrides, budgets[0], seeds[0], arguments.output)
-        elif part == "hostile":
-            from benchmarks.hostile.measure import measure as hostile  # where there is fork
-
-            tables = hostile(seeds, arguments.cases, arguments.case, arguments.output)
-        elif part == "signals":
-            commands = [name for name in arguments.commands.split(",") if name]
-            tables = signals.measure(seeds, arguments.moments, commands, arguments.output)
         elif part == "capture":
             tables = capture.measure(seeds, arguments.output)
         elif part == "cameras":

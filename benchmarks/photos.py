@@ -14,7 +14,7 @@ import nerf_lightning as nl
 from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 from nerf_lightning.dataset import Scene, Views, draw_rays
 from nerf_lightning.dataset.views import Runs
-from nerf_lightning.synthetic.objects import PILE, place_cameras, bound_bodies, render_photos, make_scene
+from nerf_lightning.synthetic.objects import PILE, bound_bodies, make_scene, place_cameras, render_photos
 
 Rows = list[dict[str, Any]]
 SIZE, VIEWS, HELD_OUT = 128, 48, 6

@@ -12,7 +12,7 @@ from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import prepare
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.libraries import silence_lightning
 
 METHODS = ("tensorf", "hashgrid", "voxels", "mlp")
 """In 3D; the recipe of each in its usual size ends in _medium."""
@@ -26,7 +26,7 @@ def on_device(device: torch.device) -> list[str]:
 def built(overrides: list[str], folder: Path, device: torch.device = CPU) -> tuple[DictConfig, RayDataModule, NeRF3D]:
     """Configuration, data and system of a 3D run, the process prepared as for training on a device, the system there."""
     cfg = composed(overrides, folder)
-    quiet()
+    silence_lightning()
     prepare(cfg)
     data = build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)

@@ -12,6 +12,9 @@ import pytest
 import torch
 import yaml
 from every_model import MODELS
+from nerf_lightning.evaluate.__main__ import task as evaluate
+from nerf_lightning.export.__main__ import task as export
+from nerf_lightning.render.__main__ import task as render
 from on_device import ON_IT, SCENES, options
 from once import once
 from pretend import NAME, Module
@@ -21,20 +24,17 @@ from nerf_lightning.config import cli
 from nerf_lightning.config.build import build_data, build_system, build_trainer, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.evaluate.__main__ import task as evaluate
-from nerf_lightning.export.__main__ import task as export
-from nerf_lightning.render.__main__ import task as render
 from nerf_lightning.runs.open import open_scene_run
 from nerf_lightning.synthetic.objects import PILE, make_scene
 from nerf_lightning.system import System
 from nerf_lightning.training.train import train
-from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.view.painter import Painter, Wish
 
 
 @pytest.fixture(autouse=True)
 def without_lightnings_hints() -> None:
-    quiet()
+    silence_lightning()
 
 
 def trained(name: str, folder: Path, *more: str) -> dict:

@@ -10,6 +10,9 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+from nerf_lightning.evaluate.__main__ import task as evaluate
+from nerf_lightning.export.__main__ import task as export
+from nerf_lightning.render.__main__ import task as render
 
 import nerf_lightning as nl
 from nerf_lightning.callbacks import results
@@ -17,9 +20,6 @@ from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
-from nerf_lightning.evaluate.__main__ import task as evaluate
-from nerf_lightning.export.__main__ import task as export
-from nerf_lightning.render.__main__ import task as render
 from nerf_lightning.renderer import Rendered
 from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
 from nerf_lightning.system import NeRF3D

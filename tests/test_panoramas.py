@@ -10,6 +10,7 @@ import pytest
 import torch
 from cameras.test_equirectangular import panoramas
 from export.balls import CENTRE, RADIUS, ball_run
+from nerf_lightning.inspect.verb import facts_of
 
 import nerf_lightning as nl
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at, orbit_around
@@ -22,7 +23,6 @@ from nerf_lightning.export.page import field_page
 from nerf_lightning.export.photos import write_photos
 from nerf_lightning.export.smallest import smallest
 from nerf_lightning.export.volume import sample_volume
-from nerf_lightning.inspect.verb import facts_of
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.open import open_run
 from nerf_lightning.synthetic.objects import trace_rays

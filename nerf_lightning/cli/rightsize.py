@@ -53,7 +53,7 @@ def rightsize(
     from nerf_lightning.rightsize.search import begin, search
     from nerf_lightning.runs.owner import owned
     from nerf_lightning.utils.files import output_path
-    from nerf_lightning.utils.untrusted import read_json
+    from nerf_lightning.utils.parsing import read_json
 
     folder = output_path(output)
     cfg = composed([*describe_scene(scene), *(overrides or [])], folder)

@@ -30,11 +30,11 @@ from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.before import left_of
 from nerf_lightning.training.train import prepare, train, warm_up
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic, write_json
-from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.libraries import silence_lightning
+from nerf_lightning.utils.parsing import read_json
 from nerf_lightning.utils.seeding import Stream, step_generator
-from nerf_lightning.utils.untrusted import read_json
+from nerf_lightning.utils.text import subsample
 
 Data = RayDataModule | PixelDataModule
 LADDER_SHARE = 0.75
@@ -69,7 +69,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> dic
         InputError: where the device, the data or an option of the ladder is no good; or the folder holds something else.
     """
     device = build.device_of(cfg)
-    quiet()
+    silence_lightning()
     prepare(cfg)
     data = build.build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)
@@ -200,7 +200,7 @@ def measure_psnr(system: System, data: Data) -> float:
     Raises:
         InputError: where what it shows is not finite.
     """
-    found = held_out_psnr(system, data, evenly(data.held_out_views, VIEWS))
+    found = held_out_psnr(system, data, subsample(data.held_out_views, VIEWS))
     if not math.isfinite(found):
         raise InputError("rightsize", "", "images that are not finite", "a field that learns", "lower optimizer.lr")
     return found

@@ -10,8 +10,8 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.seeding import Stream, step_generator
+from nerf_lightning.utils.text import subsample
 
 Poses = Callable[[Float[Tensor, "V 4 4"]], Float[Tensor, "V 4 4"]]
 Photos = Callable[[Float[Tensor, "V H W 3"]], Float[Tensor, "V H W 3"]]
@@ -44,7 +44,7 @@ def shuffle_poses(scene: Scene, seed: int) -> Scene:
 
 def swap_poses(scene: Scene, seed: int, count: int) -> Scene:
     """So many training photos, evenly spaced, have the pose of the next of them."""
-    wrong, order = evenly(len(scene.train), count), torch.arange(len(scene.train))
+    wrong, order = subsample(len(scene.train), count), torch.arange(len(scene.train))
     order[wrong] = torch.tensor([*wrong[1:], wrong[0]])
     return replace(scene, train=change_poses(scene.train, lambda c2w: c2w[order]))
 

@@ -21,7 +21,7 @@ from nerf_lightning.stability.conditions import METHODS
 from nerf_lightning.synthetic.objects import MARBLE, make_scene
 from nerf_lightning.system import NeRF2D, StepStats, constant
 from nerf_lightning.training.train import train
-from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.libraries import silence_lightning
 
 
 class Blob(PictureField):
@@ -99,7 +99,7 @@ def run(system: NeRF2D, guard: Guard, tmp_path: Path, steps: int = 400, picture:
 
 @pytest.fixture(autouse=True)
 def without_lightnings_hints() -> None:
-    quiet()
+    silence_lightning()
 
 
 @pytest.mark.parametrize("how", ["not at all", "spike"])

@@ -6,7 +6,7 @@ import pytest
 from nerf_lightning.callbacks import Budget, HeldOut
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 
 @pytest.mark.parametrize(
@@ -21,13 +21,13 @@ from nerf_lightning.utils.evenly import evenly
     ],
 )
 def test_evenly(total, count, expected):
-    assert evenly(total, count) == expected
+    assert subsample(total, count) == expected
 
 
 def test_evenly_never_takes_a_view_twice_and_spreads_them():
     for total in range(1, 60):
         for count in range(1, total):
-            chosen = evenly(total, count)
+            chosen = subsample(total, count)
             assert len(set(chosen)) == count and chosen == sorted(chosen)
             assert chosen[0] >= 0 and chosen[-1] < total
             gaps = [b - a for a, b in zip([-1, *chosen], [*chosen, total], strict=True)]

@@ -16,7 +16,7 @@ from nerf_lightning.dataset.hypotheses import FLIP, Hypothesis, Matches, convent
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.dataset.scene import BUILT_IN
 from nerf_lightning.errors import InputError
-from nerf_lightning.synthetic.corruptions import change_poses, shuffle_poses, scale_focal_length
+from nerf_lightning.synthetic.corruptions import change_poses, scale_focal_length, shuffle_poses
 from nerf_lightning.synthetic.objects import trace_rays
 from nerf_lightning.synthetic.rooms import ROOMS, photograph_room
 

@@ -16,7 +16,7 @@ from nerf_lightning.dataset.extent import border_colour
 from nerf_lightning.dataset.plausible import check_scene, off_centre
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.errors import InputError
-from nerf_lightning.synthetic.corruptions import change_poses, shuffle_poses, flip_axes
+from nerf_lightning.synthetic.corruptions import change_poses, flip_axes, shuffle_poses
 from nerf_lightning.synthetic.objects import MARBLE, PILE, ROD, make_scene
 
 WHITE = (1.0, 1.0, 1.0)

@@ -15,7 +15,7 @@ from nerf_lightning.model import tensorf as planes
 from nerf_lightning.model.tensorf import FINEST
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.sampler import OccupancySampler
-from nerf_lightning.synthetic.objects import MARBLE, place_cameras, make_scene
+from nerf_lightning.synthetic.objects import MARBLE, make_scene, place_cameras
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train
 

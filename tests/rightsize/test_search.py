@@ -91,7 +91,7 @@ def test_rightsize_takes_images_and_any_distance(tmp_path: Path):
         ([], {"psnr": 3.0, "within_db": 1.0}, "one of the two"),
         ([], {"within_db": -1.0}, "within_db"),
         ([], {"ladder": "none_such"}, "none_such"),
-        ([], {"output": Path()}, "something else in it"),
+        ([], {"output": Path()}, "in it"),
         (["threads=0"], {}, "threads"),
         (["sampler.samples=-1"], {}, "sampler.samples"),
     ],
