@@ -8,11 +8,11 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
-from nerf_lightning.inspect.quality import judge, look_at, sharpness
-from nerf_lightning.inspect.verb import inspect
 
 from nerf_lightning.dataset import Views, open_scene
 from nerf_lightning.drawing.camera_map import camera_map
+from nerf_lightning.inspect.quality import judge, look_at, sharpness
+from nerf_lightning.inspect.verb import inspect
 from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
 from tests.dataset.colmap_files import cameras_of, photos, write_colmap
 
@@ -115,9 +115,8 @@ def test_the_map_shows_the_points_and_the_box(views: Views, tmp_path: Path):
 
 
 def test_bad_input_is_one_line(verb, tmp_path: Path):
-    from nerf_lightning.inspect.__main__ import task
-
     from nerf_lightning.config import cli
+    from nerf_lightning.inspect.__main__ import task
 
     def main() -> None:
         cli.run("inspect", task, texts=("scene", "output"))

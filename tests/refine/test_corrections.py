@@ -7,8 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 from blob import BOX, around_it, blob
-from nerf_lightning.export.options import ExportOptions
-from nerf_lightning.export.verb import export
 from torch import Tensor
 
 import nerf_lightning as nl
@@ -16,6 +14,8 @@ from nerf_lightning.cameras import Cameras, Rays, in_other_frame
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
+from nerf_lightning.export.options import ExportOptions
+from nerf_lightning.export.verb import export
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
 from nerf_lightning.refine import Corrections, summary, told

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nerf_lightning.export.__main__ import task
 from once import once
 
 from nerf_lightning.config import cli
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
+from nerf_lightning.export.__main__ import task
 from nerf_lightning.runs.compact import decode, load_compact
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.synthetic.objects import MARBLE, make_scene

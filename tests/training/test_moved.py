@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 import yaml
-from nerf_lightning.evaluate.__main__ import task as evaluate
 
 from nerf_lightning.config import cli
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.evaluate.__main__ import task as evaluate
 
 SMALL = (
     *("dataset.rays=64", "dataset.samples=null", "budget.steps=2", "callbacks.throughput=null"),

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nerf_lightning.view.__main__ import main
 
 from nerf_lightning.dataset import Scene, save_npz
 from nerf_lightning.errors import InputError
+from nerf_lightning.view.__main__ import main
 from nerf_lightning.view.serve import announcement, find_port
 
 ROOT = Path(__file__).resolve().parents[2]
