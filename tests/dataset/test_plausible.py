@@ -165,7 +165,9 @@ def test_doubtful_scenes_are_warned_of(pile: Scene):
     assert "near=3.6 cuts" in doubt.text
     assert check_scene(limited(0.1, 40.0)(pile)) == [], "wider than the box: the box decides"
 
-    (doubt,) = check_scene(replace(pile, train=change_poses(pile.train, lambda c2w: c2w[[0, 1, 2, 3, 4, 4, *range(6, 24)]])))
+    (doubt,) = check_scene(
+        replace(pile, train=change_poses(pile.train, lambda c2w: c2w[[0, 1, 2, 3, 4, 4, *range(6, 24)]]))
+    )
     assert "1 of 24 training photos have the pose of another" in doubt.text
 
     images, poses = pile.val.images.clone(), pile.val.cameras.c2w.clone()
