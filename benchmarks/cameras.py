@@ -19,7 +19,7 @@ from nerf_lightning.dataset import Scene
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.runs.data import seen_by_corrected
 from nerf_lightning.runs.scene_file import load_scene as content_of
-from nerf_lightning.stability import damage
+from nerf_lightning.synthetic import corruptions
 
 RECIPES = ("tensorf_medium", "voxels_medium", "hashgrid_medium")
 STEPS = 2500
@@ -30,11 +30,11 @@ Damage = Callable[[Scene, int], Scene]
 
 
 def light(scene: Scene, seed: int) -> Scene:
-    return damage.with_exposure_drift(scene, seed, 0.3, 0.1)
+    return corruptions.vary_exposure(scene, seed, 0.3, 0.1)
 
 
 def poses(degrees: float, moved: float) -> Damage:
-    return lambda scene, seed: damage.with_pose_noise(scene, seed, degrees, moved)
+    return lambda scene, seed: corruptions.add_pose_noise(scene, seed, degrees, moved)
 
 
 def both(scene: Scene, seed: int) -> Scene:
@@ -46,11 +46,11 @@ def exact(scene: Scene, seed: int) -> Scene:
 
 
 def long_lens(scene: Scene, seed: int) -> Scene:
-    return damage.with_focal_length(scene, seed, 1.03)
+    return corruptions.scale_focal_length(scene, seed, 1.03)
 
 
 def dark_corners(scene: Scene, seed: int) -> Scene:
-    return damage.with_dark_corners(light(scene, seed), seed, 0.5)
+    return corruptions.add_vignetting(light(scene, seed), seed, 0.5)
 
 
 CONDITIONS: dict[str, tuple[int | None, Damage, list[str]]] = {
@@ -61,7 +61,7 @@ CONDITIONS: dict[str, tuple[int | None, Damage, list[str]]] = {
     "light": (None, light, []),
     "light, dark corners": (None, dark_corners, ["refine.vignetting=true"]),
     "focal length 3 % too long": (None, long_lens, ["refine.focal=true"]),
-    "both, 3 wrong": (None, lambda scene, seed: damage.with_wrong_poses(both(scene, seed), seed, WRONG), []),
+    "both, 3 wrong": (None, lambda scene, seed: corruptions.swap_poses(both(scene, seed), seed, WRONG), []),
     "exact, 12 photos": (FEW, exact, []),
     "both, 12 photos": (FEW, both, []),
 }
@@ -99,7 +99,7 @@ def measure(
     for whole in [nl.load_scene(path) for path in scenes] or [bricks()]:
         for condition, recipe, refine in itertools.product(CONDITIONS, recipes, ("none", "auto")):
             views, spoil, besides = CONDITIONS[condition]
-            truth = whole if views is None else damage.with_views(whole, 0, views)
+            truth = whole if views is None else corruptions.drop_views(whole, 0, views)
             found = []
             for seed in seeds:
                 print(f"cameras: {whole.name}, {condition}, {recipe}, refine={refine}, seed {seed}", flush=True)

@@ -13,7 +13,7 @@ from benchmarks.methods import train
 from benchmarks.synthetic.rooms import photos_that_show, true_view, write_room
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import Scene
-from nerf_lightning.stability.rooms import ROOMS, Room
+from nerf_lightning.synthetic.rooms import ROOMS, Room
 from nerf_lightning.system import NeRF3D
 
 RECIPES = ("hashgrid_capture", "tensorf_medium", "voxels_medium")

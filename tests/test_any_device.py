@@ -19,13 +19,13 @@ from on_device import ON_IT, SCENES, options
 from once import once
 from pretend import NAME, Module
 
+from nerf_lightning.cli.rightsize import rightsize
 from nerf_lightning.config import cli
 from nerf_lightning.config.build import build_data, build_system, build_trainer, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.rightsize.__main__ import task as rightsize
 from nerf_lightning.runs.open import open_scene_run
-from nerf_lightning.stability.toys import PILE, toy
+from nerf_lightning.synthetic.objects import PILE, make_scene
 from nerf_lightning.system import System
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.libraries import silence_lightning
@@ -179,17 +179,12 @@ def test_the_viewer_paints(device: torch.device, run: Path):
 
 @pytest.mark.long
 def test_a_search_finds_the_smallest_that_is_enough(device: torch.device, tmp_path: Path):
-    save_npz(toy(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
+    save_npz(make_scene(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
     rungs = [{"density_components": 8, "colour_components": 8, "coarsest": 4, "finest": side} for side in (4, 8)]
     ladder = {"rungs": rungs, "samplers": [{"samples": 32, "resolution": 8}]}
     (tmp_path / "ladder.yaml").write_text(yaml.safe_dump(ladder))
-    given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "budget.steps=6"]
-    where = ["device=pretend", "+trainer.inference_mode=false", "callbacks.orbit=null", "callbacks.snapshots=null"]
-    cfg = composed(
-        [*given, *where, f"ladder={tmp_path}/ladder.yaml", f"output={tmp_path}/found", "target.psnr=8"],
-        tmp_path,
-        "rightsize",
-    )
-    rightsize(cfg)
-    found = json.loads((tmp_path / "found" / "rightsize.json").read_text())
+    given = ["recipe=tensorf_medium", "budget.steps=6", "callbacks.orbit=null", "callbacks.snapshots=null"]
+    given += ["device=pretend", "+trainer.inference_mode=false"]
+    own = {"ladder": str(tmp_path / "ladder.yaml"), "output": tmp_path / "found"}
+    found = rightsize(str(tmp_path / "scene.npz"), given, psnr=8.0, **own)
     assert found["device"].startswith(NAME) and found["reached"]

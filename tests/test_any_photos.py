@@ -10,6 +10,8 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+from nerf_lightning.evaluate.__main__ import task as evaluate
+from nerf_lightning.render.__main__ import task as render
 
 import nerf_lightning as nl
 from nerf_lightning.callbacks import results
@@ -20,7 +22,7 @@ from nerf_lightning.cli.render import render
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.renderer import Rendered
-from nerf_lightning.stability.toys import PILE, around, photograph
+from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.view.drawing import frusta
 from tests.dataset.colmap_files import cameras_of, photos, write_colmap
@@ -32,7 +34,7 @@ K1, STEPS = 0.02, 12
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """16 photos on grey: every second is twice as wide as high; a box is masked in every third."""
     root = tmp_path_factory.mktemp("capture")
-    cameras = around(16, 24)
+    cameras = place_cameras(16, 24)
     lenses = Lenses(torch.tensor([Distortion(K1)]).repeat(16, 1), torch.full((16,), Projection.FISHEYE))
     square = Cameras(cameras.K, cameras.c2w, cameras.sizes, lenses)
     K = cameras.K.clone()
@@ -41,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     names, sizes = [], {}
     for i in range(16):
         camera = (wide if i % 2 else square)[i]
-        some = Views.of(photograph(PILE, camera, (0.5, 0.5, 0.5)), camera)
+        some = Views.of(render_photos(PILE, camera, (0.5, 0.5, 0.5)), camera)
         names += photos(root / "images", some, first=i)
         sizes[i + 1] = cameras_of(some, "SIMPLE_RADIAL_FISHEYE", (K1,))[1]
         mask = np.full((24, camera.width), 255, np.uint8)

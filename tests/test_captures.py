@@ -11,7 +11,8 @@ from benchmarks.synthetic import rooms
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.dataset import open_scene
 from nerf_lightning.sampler import UniformSampler
-from nerf_lightning.stability.rooms import ROOMS
+from nerf_lightning.synthetic.objects import trace_rays
+from nerf_lightning.synthetic.rooms import ROOMS
 
 
 def test_a_scene_of_a_room_knows_what_its_rays_meet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -29,7 +30,7 @@ def test_a_scene_of_a_room_knows_what_its_rays_meet(tmp_path: Path, monkeypatch:
     places = rays.origins + distance[:, None] * rays.directions
     floor = places[body == room.floor]
     assert len(floor) > 50 and float(floor[:, 2].std()) < 0.15 * float(places.std())
-    seen = room.see(Rays(*(x.float() for x in (rays_in_the_room(rays, scene)))))[0]
+    seen = trace_rays(room.bodies, Rays(*(x.float() for x in (rays_in_the_room(rays, scene)))))[0]
     off = (seen - scene.val.image(0).view(-1, 3) / 255).abs()
     assert float(off.median()) < 0.05
     own = scene.train.cameras.view_rays(3)

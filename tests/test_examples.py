@@ -14,7 +14,7 @@ from nbclient import NotebookClient
 
 from benchmarks.synthetic.photos import Truth
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.stability.toys import PILE, toy
+from nerf_lightning.synthetic.objects import PILE, make_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
@@ -36,7 +36,7 @@ def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., No
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
     path = tmp_path / "pile.npz"
-    save_npz(toy(PILE, size=16, views=8, held_out=2), path)
+    save_npz(make_scene(PILE, size=16, views=8, held_out=2), path)
     return path
 
 

@@ -25,11 +25,12 @@ from nerf_lightning.export.smallest import smallest
 from nerf_lightning.export.volume import sample_volume
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.open import open_run
-from nerf_lightning.stability.rooms import Room, pile, walls
+from nerf_lightning.synthetic.objects import trace_rays
+from nerf_lightning.synthetic.rooms import make_pile, make_walls
 from nerf_lightning.utils.device import CPU
 
 WIDTH, HEIGHT, STEPS = 64, 32, 80
-ROOM = Room([*pile(0.5, 2.0), *walls(3.0, -0.5, 2.5, 0.6, 0.8)], 3)
+ROOM = [*make_pile(0.5, 2.0), *make_walls(3.0, -0.5, 2.5, 0.6, 0.8)]
 UP = torch.tensor([0.0, 0.0, 1.0])
 
 
@@ -48,7 +49,7 @@ def photograph(c2w: torch.Tensor) -> torch.Tensor:
     latitude = ((torch.arange(2 * HEIGHT) + 0.5) / (2 * HEIGHT) - 0.5)[:, None] * math.pi
     right, down, ahead = longitude.sin() * latitude.cos(), latitude.sin(), longitude.cos() * latitude.cos()
     local = torch.stack([right, down.expand_as(right), ahead], dim=2).view(-1, 3)
-    colours, _, _ = ROOM.see(Rays(c2w[:3, 3].expand_as(local), local @ c2w[:3, :3].T))
+    colours, _, _ = trace_rays(ROOM, Rays(c2w[:3, 3].expand_as(local), local @ c2w[:3, :3].T))
     return (colours.view(HEIGHT, 2, WIDTH, 2, 3).mean((1, 3)).clamp(0, 1) * 255).round().to(torch.uint8)
 
 

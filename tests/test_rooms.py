@@ -9,6 +9,7 @@ ORDER = (
     ("utils", "cameras"),
     ("kernels",),
     ("dataset", "model", "refine"),
+    ("synthetic",),
     ("sampler",),  # some have a small field of their own
     ("renderer",),
     ("system",),

@@ -17,8 +17,8 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Picture, PixelDataModule, save_npz
 from nerf_lightning.model import HashGridField, PictureField, SirenField
 from nerf_lightning.runs.folder import load_run
-from nerf_lightning.stability.methods import METHODS
-from nerf_lightning.stability.toys import MARBLE, toy
+from nerf_lightning.stability.conditions import METHODS
+from nerf_lightning.synthetic.objects import MARBLE, make_scene
 from nerf_lightning.system import NeRF2D, StepStats, constant
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.libraries import silence_lightning
@@ -186,7 +186,7 @@ def test_slow_but_steady_is_no_failure(tmp_path: Path):
 
 def test_the_checkpoint_says_what_replaced_the_relu(tmp_path: Path):
     """Of the seeds 0 to 7 this one dies: its density is zero everywhere, and no gradient comes back."""
-    save_npz(toy(MARBLE, (1.0, 1.0, 1.0)), tmp_path / "scene.npz")
+    save_npz(make_scene(MARBLE, (1.0, 1.0, 1.0)), tmp_path / "scene.npz")
     given = [
         "dataset=photos",
         f"dataset.path={tmp_path}/scene.npz",
@@ -239,7 +239,7 @@ def test_a_hash_grid_starts_again_from_thin_fog():
 
 @pytest.mark.parametrize(("optimizer", "lowered"), [(torch.optim.Adam, True), (torch.optim.SGD, False)])
 def test_rates_are_lowered_for_adam_alone(optimizer: type, lowered: bool, tmp_path: Path):
-    save_npz(toy(MARBLE), tmp_path / "scene.npz")
+    save_npz(make_scene(MARBLE), tmp_path / "scene.npz")
     given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", *METHODS["relu mlp"].options, "budget.steps=2"]
     cfg = composed([*given, "optimizer.lr=0.5", "callbacks.orbit=null", "threads=1"], tmp_path)
     cfg.optimizer = {"_target_": f"torch.optim.{optimizer.__name__}", "_partial_": True, "lr": 0.5}

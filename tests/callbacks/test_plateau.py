@@ -11,7 +11,7 @@ from nerf_lightning.callbacks.plateau import FIRST, SPACING, Plateau
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
-from nerf_lightning.stability.toys import PILE, toy
+from nerf_lightning.synthetic.objects import PILE, make_scene
 from nerf_lightning.training.train import train
 
 
@@ -52,7 +52,7 @@ def test_a_broken_or_worthless_patience_is_refused():
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    save_npz(toy(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
+    save_npz(make_scene(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
     return tmp_path / "scene.npz"
 
 

@@ -15,7 +15,7 @@ from nerf_lightning.model import tensorf as planes
 from nerf_lightning.model.tensorf import FINEST
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.sampler import OccupancySampler
-from nerf_lightning.stability.toys import MARBLE, around, toy
+from nerf_lightning.synthetic.objects import MARBLE, make_scene, place_cameras
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train
 
@@ -40,7 +40,7 @@ Resolutions = Callable[[Bounds, int, int, str], list[int]]
 
 
 def test_a_pixel_shows_its_share_of_the_distance():
-    cameras = around(9, size=40, distance=4.0)
+    cameras = place_cameras(9, size=40, distance=4.0)
     assert cameras.pixel_width(torch.zeros(3)) == pytest.approx(4 / float(cameras.K[0, 0, 0]))
 
 
@@ -87,7 +87,7 @@ def test_fields_say_in_a_line_what_their_size_follows_from():
 
 
 def test_a_run_folder_knows_the_size_without_its_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    save_npz(toy(MARBLE, size=16, views=6, held_out=1), tmp_path / "scene.npz")
+    save_npz(make_scene(MARBLE, size=16, views=6, held_out=1), tmp_path / "scene.npz")
     given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_small", "budget.steps=3"]
     train(composed([*given, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "~logger"], tmp_path / "run"))
     (tmp_path / "scene.npz").unlink()
@@ -101,7 +101,7 @@ def test_a_run_on_large_photos_trains_a_finer_field_resumes_and_opens_again(
     monkeypatch.setattr(bounds, "USUAL_WIDTH", 4)  # so that small photos count as large
     monkeypatch.setattr(planes, "SETTLED", 2)
     scene = tmp_path / "scene.npz"
-    save_npz(toy(MARBLE, size=24, views=5, held_out=1), scene)
+    save_npz(make_scene(MARBLE, size=24, views=5, held_out=1), scene)
     given = ["dataset=photos", f"dataset.path={scene}", "recipe=tensorf_medium", "model.coarsest=8", "model.size=fixed"]
     given += ["model.width=8", "model.stages=3", "dataset.samples=500", "device=cpu", "callbacks.orbit=null"]
     given += ["callbacks.snapshots.steps=[]", "~logger", "callbacks.checkpoints.every_seconds=1e-6"]

@@ -25,7 +25,7 @@ from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config
 from nerf_lightning.runs.scene_file import load_scene
 from nerf_lightning.sampler import Samples, UniformSampler
-from nerf_lightning.stability import damage
+from nerf_lightning.synthetic import corruptions
 from nerf_lightning.system import aligned
 from nerf_lightning.training.train import train
 
@@ -247,7 +247,7 @@ def test_a_run_says_what_it_corrected_and_is_rendered_without_its_photos(tmp_pat
 def test_poses_by_which_outlines_hardly_fit_are_corrected_before_any_trial(tmp_path: Path):
     size = {"size": 16, "train_views": 12, "val_views": 1}
     options = ["+experiment=smoke_3d", "refine=auto", "dataset.rays=64", f"budget.steps={FIRST - 1}"]
-    for scene, wanted in ((bricks(**size), False), (damage.with_pose_noise(bricks(**size), 0, 15.0, 0.1), True)):
+    for scene, wanted in ((bricks(**size), False), (corruptions.add_pose_noise(bricks(**size), 0, 15.0, 0.1), True)):
         folder = tmp_path / str(wanted)
         train(composed(options, folder), folder=folder, scene=scene)
         results = json.loads((folder / "results.json").read_text())

@@ -18,7 +18,7 @@ from nerf_lightning.export import smallest
 from nerf_lightning.runs.compact import decode, encode, load_compact, without_folders
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.scene_file import scene_content
-from nerf_lightning.stability.toys import MARBLE, toy
+from nerf_lightning.synthetic.objects import MARBLE, make_scene
 from nerf_lightning.system import System
 
 Run = tuple[System, RayDataModule | PixelDataModule, dict]
@@ -32,7 +32,7 @@ def make_run(folder: Path, *given: str) -> Run:
     if picture:
         data = PixelDataModule(Picture("sunset", "test", builtin_picture(64)), pixels=10)
     else:
-        data = RayDataModule(toy(MARBLE, size=12, views=4, held_out=2))
+        data = RayDataModule(make_scene(MARBLE, size=12, views=4, held_out=2))
     system = build_system(cfg, frame_of(data)).eval()
     with torch.no_grad():
         for parameter in system.field.parameters():
