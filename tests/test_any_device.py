@@ -11,10 +11,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from every_model import MODELS
-from on_device import ON_IT, SCENES, options
-from once import once
-from pretend import NAME, Module
 
 from nerf_lightning.config import cli
 from nerf_lightning.config.build import build_data, build_system, build_trainer, frame_of
@@ -30,6 +26,10 @@ from nerf_lightning.system import System
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.quiet import quiet
 from nerf_lightning.view.painter import Painter, Wish
+from tests.helpers.device_runs import ON_IT, SCENES, options
+from tests.helpers.fake_device import NAME, Module
+from tests.helpers.shared_fixtures import make_once
+from tests.helpers.train_models import MODELS
 
 
 @pytest.fixture(autouse=True)
@@ -51,7 +51,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
         train(composed([*options("tensorf"), "budget.steps=60", "~logger", "callbacks.orbit=null"], folder))
         return folder
 
-    return once(tmp_path_factory, "any_device", make)
+    return make_once(tmp_path_factory, "any_device", make)
 
 
 def test_the_device_keeps_to_itself(device: torch.device):

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 import torch
-from every_model import SCENE
-from on_device import SAMPLERS, SCENES, options, stepped, system_of
-from pretend import NAME
 
 from benchmarks.count import Count
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.seeding import Stream, step_generator
+from tests.helpers.device_runs import SAMPLERS, SCENES, options, stepped, system_of
+from tests.helpers.fake_device import NAME
+from tests.helpers.train_models import SCENE
 
 VARIANTS = {
     **{name: options(name) for name in SCENES},

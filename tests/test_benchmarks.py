@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from blob import around_it
 from torch import Tensor
 
 from benchmarks import __main__ as command
@@ -18,6 +17,7 @@ from nerf_lightning import kernels
 from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.dataset.picture import load_picture
 from nerf_lightning.utils.device import CPU
+from tests.helpers.soft_ball import cameras_around_ball
 
 CURVE = [[2.0, 100, 20.0], [8.0, 400, 24.5], [10.5, 500, 26.0], [30.0, 1500, 29.0]]
 
@@ -80,7 +80,7 @@ def test_one_command_writes_table_and_json(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_cameras_are_as_good_wherever_all_of_them_stand_together():
-    truth, centre = around_it(6, 8), torch.zeros(3)
+    truth, centre = cameras_around_ball(6, 8), torch.zeros(3)
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.4, 0.1], [0.4, 0.0, 0.2], [-0.1, -0.2, 0.0]]))
     elsewhere = torch.eye(4)
     elsewhere[:3, :3], elsewhere[:3, 3] = 1.7 * turn, torch.tensor([1.0, -2.0, 0.5])

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from once import once
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import SirenField
 from nerf_lightning.system.compiled import BACKEND, check_compiler, part
 from nerf_lightning.utils.device import CPU
+from tests.helpers.shared_fixtures import make_once
 
 ROOT = Path(__file__).resolve().parents[1]
 SOME, OTHERS = ("mlp", "voxels"), ("hashgrid", "tensorf")
@@ -22,8 +22,8 @@ RUN = ("+experiment=smoke_2d", "device=cpu")
 
 
 def compiling(cache: Path, *what: str) -> dict:
-    """What compiling.py found."""
-    line = [sys.executable, str(ROOT / "tests" / "compiling.py"), *what]
+    """What compile_models.py found."""
+    line = [sys.executable, str(ROOT / "tests" / "helpers" / "compile_models.py"), *what]
     paths = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(cache)}
     done = subprocess.run(line, env={**os.environ, **paths}, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -32,7 +32,7 @@ def compiling(cache: Path, *what: str) -> dict:
 
 @pytest.fixture(scope="session")
 def found(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> dict:
-    return once(tmp_path_factory, "compiled", lambda folder: compiling(folder / "kernels", *SOME, str(folder)))
+    return make_once(tmp_path_factory, "compiled", lambda folder: compiling(folder / "kernels", *SOME, str(folder)))
 
 
 def same(field: dict) -> None:

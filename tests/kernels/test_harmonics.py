@@ -3,10 +3,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from agreement import agree
 from torch.nn.functional import normalize
 
 from nerf_lightning.kernels import spherical_harmonics
+from tests.helpers.assert_close import assert_agrees
 
 PRECISIONS = pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-12), (torch.float32, 3e-6)])
 """The reference alone speaks double precision."""
@@ -44,9 +44,9 @@ def test_each_degree_of_spherical_harmonics_is_in_its_place(degree: int, dtype: 
 @pytest.mark.parametrize("samples", [0, 1, 2, 1000])
 def test_harmonics_agree_with_the_reference(samples: int):
     d = normalize(torch.randn(samples, 3), dim=-1)
-    agree(spherical_harmonics, [d], constants=(0,), rtol=1e-5)
-    agree(lambda x: spherical_harmonics(x.T), [d.T.contiguous()], constants=(0,), rtol=1e-5)
-    agree(spherical_harmonics, [d], rtol=1e-5)  # with a gradient
+    assert_agrees(spherical_harmonics, [d], constants=(0,), rtol=1e-5)
+    assert_agrees(lambda x: spherical_harmonics(x.T), [d.T.contiguous()], constants=(0,), rtol=1e-5)
+    assert_agrees(spherical_harmonics, [d], rtol=1e-5)  # with a gradient
 
 
 def test_a_direction_that_is_not_a_number_shows(kernels: str):

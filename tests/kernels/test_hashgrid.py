@@ -3,10 +3,10 @@ import math
 
 import pytest
 import torch
-from agreement import agree
 from torch import Tensor
 
 from nerf_lightning.kernels import hash_interpolate, use_kernels
+from tests.helpers.assert_close import assert_agrees
 
 NAN = float("nan")
 CASES = {
@@ -127,13 +127,13 @@ def test_gradients_of_tables_and_positions(cells: Levels, sizes: list[int], kern
 @pytest.mark.parametrize(("cells", "sizes"), [*CASES.values(), ([(n,) * 3 for n in (2, 4, 7, 12, 20)], [32] * 5)])
 def test_interpolation_agrees_with_the_reference(cells: Levels, sizes: list[int], samples: int):
     tables, unit = torch.randn(sum(sizes), 2), 1.2 * torch.rand(samples, len(cells[0])) - 0.1
-    agree(lambda t, u: hash_interpolate(t, u, cells, sizes), [tables, unit], atol=3e-6)
+    assert_agrees(lambda t, u: hash_interpolate(t, u, cells, sizes), [tables, unit], atol=3e-6)
 
 
 def test_entries_may_hold_another_number_of_features():
     cells, sizes = CASES["2D, dense and hashed"]
     inputs = [torch.randn(sum(sizes), 4), torch.rand(300, 2)]
-    agree(lambda t, u: hash_interpolate(t, u, cells, sizes), inputs, constants=(1,))
+    assert_agrees(lambda t, u: hash_interpolate(t, u, cells, sizes), inputs, constants=(1,))
 
 
 @LEVELS

@@ -5,7 +5,6 @@ from importlib import import_module
 
 import pytest
 import torch
-from agreement import with_threads
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -13,6 +12,7 @@ from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import cell_index, march, use_kernels
 from nerf_lightning.kernels.march import Walk
 from nerf_lightning.sampler import Samples
+from tests.helpers.assert_close import run_with_threads
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 
@@ -206,7 +206,7 @@ def test_the_very_samples_of_the_reference_are_kept_with_any_number_of_threads(
             expected = marched(rays, bounds, grid, samples, jittered)
             use_kernels("auto")
             actual = marched(rays, bounds, grid, samples, jittered)
-            again = with_threads(lambda: marched(rays, bounds, grid, samples, jittered), other)  # noqa: B023
+            again = run_with_threads(lambda: marched(rays, bounds, grid, samples, jittered), other)  # noqa: B023
             for name in ("t", "dt", "ray", "offsets"):
                 assert torch.equal(getattr(actual, name), getattr(expected, name)), name
                 assert torch.equal(getattr(actual, name), getattr(again, name)), name

@@ -2,12 +2,12 @@ import math
 
 import pytest
 import torch
-from agreement import with_threads
-from ragged import COUNTS, MANY, ragged
 
 from nerf_lightning.kernels import composite, merge_faint, use_kernels
 from nerf_lightning.kernels.composite import Kept
 from nerf_lightning.sampler import Samples
+from tests.helpers.assert_close import run_with_threads
+from tests.helpers.ragged_samples import COUNTS, MANY, ragged_samples
 
 FAINT = 0.1
 
@@ -18,7 +18,7 @@ def packed(samples: Samples):
 
 def foggy(counts: list[int]) -> tuple[torch.Tensor, Samples]:
     """Thickness and samples, of which some stand alone."""
-    samples = ragged(counts)
+    samples = ragged_samples(counts)
     keep = torch.rand(len(samples)) < 0.8
     ends = torch.cat([torch.zeros(1, dtype=torch.int64), keep.cumsum(0)])[samples.offsets]
     some = Samples(samples.t[keep], samples.dt[keep], samples.ray[keep], ends)
@@ -71,7 +71,7 @@ def test_merging_agrees_with_the_reference(counts: list[int]):
     (wanted, those), (actual, these) = found.values()
     for a, b in zip((actual, *these), (wanted, *those), strict=True):
         torch.testing.assert_close(a, b)
-    one, which = with_threads(merged, 1)
+    one, which = run_with_threads(merged, 1)
     assert torch.equal(one, actual) and all(torch.equal(a, b) for a, b in zip(which, these, strict=True))
 
 
@@ -90,7 +90,7 @@ def test_opacity_and_depth_stay_and_colours_hardly_change(kernels: str):
 
 
 def test_a_thickness_that_is_not_a_number_stays_alone(kernels: str):
-    samples = ragged([3, 5, 2])
+    samples = ragged_samples([3, 5, 2])
     thickness = torch.full((10,), 1e-3)
     thickness[5] = math.nan
     merged, (t, _, _, offsets) = merge_faint(thickness, packed(samples), FAINT)

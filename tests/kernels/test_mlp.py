@@ -2,10 +2,10 @@ from itertools import pairwise
 
 import pytest
 import torch
-from agreement import agree, outcome, with_threads
 from torch import Tensor
 
 from nerf_lightning.kernels import mlp, mlp_heads
+from tests.helpers.assert_close import assert_agrees, run_with_threads, values_and_gradients
 
 WIDTHS = [(4, 4), (3, 5), (31, 3, 5), (16, 32, 16), (1, 1, 1), (5, 31, 3, 7), (12, 32, 32, 31, 3)]
 """Of input, hidden layers and output: one to four layers, filled up to fours and not."""
@@ -48,7 +48,7 @@ def test_a_network_agrees_with_a_loop_over_neurons(widths: tuple[int, ...], furt
 @pytest.mark.parametrize("samples", [0, 1, 128, 1000])
 def test_a_network_agrees_with_the_reference(widths: tuple[int, ...], further: int, samples: int):
     inputs = [torch.randn(samples, further), torch.randn(samples, widths[0]), *network(widths, further)]
-    agree(
+    assert_agrees(
         lambda extra, x, *flat: mlp(x, pairs(flat), extra if further else None),
         inputs,
         constants=(0,),
@@ -67,10 +67,10 @@ def test_heads_are_the_outputs_taken_apart(first: int, kernels: str):
 @pytest.mark.parametrize("samples", [0, 300])
 def test_gradients_of_heads_agree_with_the_reference(samples: int):
     inputs = [torch.randn(samples, 12), *network((12, 32, 7))]
-    agree(lambda x, *flat: mlp_heads(x, pairs(flat), 3), inputs, atol=1e-5, any_threads=False)
+    assert_agrees(lambda x, *flat: mlp_heads(x, pairs(flat), 3), inputs, atol=1e-5, any_threads=False)
     # One of them alone: the other has no gradient to hand down.
-    agree(lambda x, *flat: mlp_heads(x, pairs(flat), 3)[0], inputs, atol=1e-5, any_threads=False)
-    agree(lambda x, *flat: mlp_heads(x, pairs(flat), 3)[1], inputs, atol=1e-5, any_threads=False)
+    assert_agrees(lambda x, *flat: mlp_heads(x, pairs(flat), 3)[0], inputs, atol=1e-5, any_threads=False)
+    assert_agrees(lambda x, *flat: mlp_heads(x, pairs(flat), 3)[1], inputs, atol=1e-5, any_threads=False)
 
 
 def test_strides_do_not_matter(kernels: str):
@@ -97,7 +97,9 @@ def test_further_inputs_are_constants(kernels: str):
 
 def test_one_and_two_threads_agree_to_rounding():
     inputs = [torch.randn(1000, 12), *network((12, 32, 32, 7))]
-    one, two = (with_threads(lambda: outcome(lambda x, *flat: mlp(x, pairs(flat)), inputs), n) for n in (1, 2))
+    one, two = (
+        run_with_threads(lambda: values_and_gradients(lambda x, *flat: mlp(x, pairs(flat)), inputs), n) for n in (1, 2)
+    )
     assert torch.equal(one[0], two[0]) and torch.equal(one[1], two[1]), "samples do not share sums"
     for a, b in zip(one, two, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)

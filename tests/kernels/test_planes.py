@@ -1,10 +1,10 @@
 import pytest
 import torch
-from agreement import agree
 from torch import Tensor
 
 from nerf_lightning.kernels import plane_line_products, plane_line_sum, use_kernels
 from nerf_lightning.kernels.planes import sampled_products
+from tests.helpers.assert_close import assert_agrees
 
 NAN = float("nan")
 READS = pytest.mark.parametrize("read", [plane_line_products, plane_line_sum])
@@ -48,7 +48,7 @@ def test_products_and_their_sum_agree_with_a_loop_over_vertices(side: int, chann
 @pytest.mark.parametrize("samples", [0, 1, 512, 2000])
 def test_the_fast_version_agrees_with_the_reference(read, side: int, channels: int, samples: int):
     unit = 1.2 * torch.rand(samples, 3) - 0.1
-    agree(read, [*factors(side, channels), unit], atol=3e-6)
+    assert_agrees(read, [*factors(side, channels), unit], atol=3e-6)
 
 
 @READS

@@ -2,11 +2,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from agreement import agree
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import mark_cells, points
+from tests.helpers.assert_close import assert_agrees
 
 
 @pytest.mark.parametrize("count", [0, 1, 5000])
@@ -17,12 +17,12 @@ def test_points_lie_on_their_rays(count: int):
         [o + d * x for o, d in zip(origins[r].tolist(), directions[r].tolist(), strict=True)]
         for r, x in zip(ray, t.tolist(), strict=True)
     ]
-    agree(points, [origins, directions, ray, t], constants=(0, 1, 3), rtol=0, atol=0)
+    assert_agrees(points, [origins, directions, ray, t], constants=(0, 1, 3), rtol=0, atol=0)
     torch.testing.assert_close(
         points(origins, directions, ray, t), torch.tensor(expected).view(-1, 3), rtol=1e-5, atol=1e-5
     )
-    agree(points, [origins, directions, ray, t], constants=(3,), atol=3e-6)  # with gradients
-    agree(points, [origins, directions, ray, t])
+    assert_agrees(points, [origins, directions, ray, t], constants=(3,), atol=3e-6)  # with gradients
+    assert_agrees(points, [origins, directions, ray, t])
 
 
 def test_a_distance_or_a_ray_that_is_not_a_number_shows(kernels: str):

@@ -2,11 +2,11 @@ import math
 
 import pytest
 import torch
-from agreement import with_threads
-from ragged import COUNTS, MANY, ragged
 
 from nerf_lightning.kernels import composite, keep_visible, use_kernels
 from nerf_lightning.sampler import Samples
+from tests.helpers.assert_close import run_with_threads
+from tests.helpers.ragged_samples import COUNTS, MANY, ragged_samples
 
 
 def packed(samples: Samples):
@@ -24,7 +24,7 @@ def flat(kept):
 def test_what_is_seen_agrees_with_a_loop(
     counts: list[int], early_stop_eps: float, min_thickness: float, dropped: float, kernels: str
 ):
-    samples = ragged(counts)
+    samples = ragged_samples(counts)
     density = 20 * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.7)
     kept, ends, i = [], [0], 0
     for count in counts:
@@ -47,7 +47,7 @@ def test_what_is_seen_agrees_with_a_loop(
 @pytest.mark.parametrize("counts", [[], [0, 0], MANY])
 @pytest.mark.parametrize(("min_thickness", "dropped"), [(0.0, math.inf), (0.1, math.inf), (0.1, 0.2)])
 def test_what_is_seen_agrees_with_the_reference(counts: list[int], min_thickness: float, dropped: float):
-    samples = ragged(counts)
+    samples = ragged_samples(counts)
     density = 30 * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.5)
     results = {}
     for choice in ("auto", "reference"):
@@ -57,20 +57,20 @@ def test_what_is_seen_agrees_with_the_reference(counts: list[int], min_thickness
         )
     assert all(torch.equal(a, b) for a, b in zip(*results.values(), strict=True))
     use_kernels("auto")
-    one = with_threads(
+    one = run_with_threads(
         lambda: keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness, dropped=dropped), 1
     )
     assert all(torch.equal(a, b) for a, b in zip(flat(one), results["auto"], strict=True))
 
 
 def test_nothing_is_dropped_when_all_may_stay(kernels: str):
-    samples = ragged(MANY)
+    samples = ragged_samples(MANY)
     _, kept = keep_visible(torch.full((len(samples),), 1e-3), packed(samples), 1e-4, 0.1, dropped=1e-4)
     assert all(torch.equal(a, b) for a, b in zip(kept, packed(samples), strict=True))
 
 
 def test_dropping_what_is_not_seen_changes_pixels_by_no_more_than_it_may():
-    samples = ragged(MANY)
+    samples = ragged_samples(MANY)
     density, rgb = 20 * torch.rand(len(samples)) ** 4, torch.rand(len(samples), 3)
     whole = composite(density, rgb, *packed(samples))
     _, (t, dt, ray, offsets) = keep_visible(density * samples.dt, packed(samples), 1e-3, 0.0)
@@ -82,7 +82,7 @@ def test_dropping_what_is_not_seen_changes_pixels_by_no_more_than_it_may():
 
 
 def test_a_density_that_is_not_a_number_stays(kernels: str):
-    samples = ragged([3, 5, 2])
+    samples = ragged_samples([3, 5, 2])
     density = torch.zeros(10)
     density[5] = float("nan")
     _, (t, _, ray, _) = keep_visible(density * samples.dt, packed(samples), 1e-4, 0.01)

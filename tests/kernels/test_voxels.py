@@ -1,6 +1,5 @@
 import pytest
 import torch
-from agreement import agree
 from torch import Tensor
 
 from nerf_lightning.kernels import (
@@ -12,6 +11,7 @@ from nerf_lightning.kernels import (
     spherical_harmonics,
     voxel_value,
 )
+from tests.helpers.assert_close import assert_agrees
 
 SIDE = 6
 NAN = float("nan")
@@ -72,7 +72,7 @@ def test_interpolation_agrees_with_a_loop_over_vertices(kernels: str):
 
 @pytest.mark.parametrize("count", [0, 1, 500])
 def test_fast_rows_and_weights_agree_with_the_reference(count: int):
-    agree(locate, [sparse_index(), places(count)])
+    assert_agrees(locate, [sparse_index(), places(count)])
 
 
 @pytest.mark.parametrize("count", [0, 1, 500])
@@ -80,8 +80,8 @@ def test_fast_value_agrees_with_the_reference(count: int):
     index, unit = sparse_index(), places(count)
     (values, *_) = tables(index, 0)
     with torch.no_grad():
-        agree(voxel_value, [values, index, unit], constants=(0, 2))
-    agree(voxel_value, [values, index, unit], constants=(2,))
+        assert_agrees(voxel_value, [values, index, unit], constants=(0, 2))
+    assert_agrees(voxel_value, [values, index, unit], constants=(2,))
 
 
 @pytest.mark.parametrize("terms", [0, 3, 15])
@@ -90,7 +90,7 @@ def test_fast_reading_agrees_with_the_reference(terms: int, count: int):
     index, unit = sparse_index(), places(count)
     rows, weights = locate(index, unit)
     inputs = [*tables(index, terms), rows, weights, basis_of(len(unit), terms)]
-    agree(read_voxels, inputs, constants=(5,), atol=3e-6)
+    assert_agrees(read_voxels, inputs, constants=(5,), atol=3e-6)
 
 
 def test_what_is_not_kept_gets_no_gradient(kernels: str):
@@ -179,7 +179,7 @@ def test_fast_roughness_agrees_with_the_reference(first: int, last: int | None):
     def rough(values: Tensor) -> Tensor:
         return roughness(values, vertex, index, first, last)
 
-    agree(rough, [values], rtol=1e-5)
+    assert_agrees(rough, [values], rtol=1e-5)
 
 
 def test_pieces_of_the_roughness_pull_as_the_whole(kernels: str):

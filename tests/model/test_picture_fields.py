@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from agreement import with_threads
 from torch import Tensor
 
 from nerf_lightning.dataset import Picture, PixelDataModule, pixel_grid
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import FourierField, HashGrid2DField, PictureField, PictureMLP, SirenField
 from nerf_lightning.system import NeRF2D, constant, psnr
+from tests.helpers.assert_close import run_with_threads
 
 SIZES = pytest.mark.parametrize("size", [(64, 64), (40, 25), (25, 40), (1, 1), (1, 30), (30, 1), (2, 1), (3, 2)])
 MAKERS: dict[str, Callable[[tuple[int, int]], PictureField]] = {
@@ -56,7 +56,7 @@ def test_a_field_learns_a_picture(make):
         return [system.colours(view.uv)]
 
     view = data.held_out(0)
-    (learned,) = with_threads(train, 1)  # steps so small are slower with two, and far slower on a busy machine
+    (learned,) = run_with_threads(train, 1)  # steps so small are slower with two, and far slower on a busy machine
     assert psnr(learned, view.rgb) > psnr(view.rgb.mean(0).expand_as(view.rgb), view.rgb) + 13
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from blob import BOX, around_it, blob
 from torch import Tensor
 
 import nerf_lightning as nl
@@ -29,6 +28,7 @@ from nerf_lightning.sampler import Samples, UniformSampler
 from nerf_lightning.stability import damage
 from nerf_lightning.system import aligned
 from nerf_lightning.training.train import train
+from tests.helpers.soft_ball import BOX, cameras_around_ball
 
 VIEWS, SIZE = 5, 12
 """Photos, and pixels along a side of each."""
@@ -43,7 +43,7 @@ def everything(cameras: Cameras) -> Corrections:
 @pytest.fixture
 def cameras() -> Cameras:
     """Around the box, looking at its centre."""
-    return around_it(VIEWS, SIZE)
+    return cameras_around_ball(VIEWS, SIZE)
 
 
 def some_pixels(count: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from blob import BOX, around_it, blob
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras, Rays
@@ -29,6 +28,7 @@ from nerf_lightning.renderer import Rendered, VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system.fits import misfits
 from nerf_lightning.system.trial import least_squares, worth
+from tests.helpers.soft_ball import BOX, cameras_around_ball
 
 VIEWS, SIZE = 6, 24
 BLACK = torch.zeros(3)
@@ -42,7 +42,7 @@ def see(rays: Rays, behind: Tensor) -> Rendered:
 @pytest.fixture
 def views() -> Views:
     """Photos of the blob."""
-    cameras = around_it(VIEWS, SIZE)
+    cameras = cameras_around_ball(VIEWS, SIZE)
     with torch.no_grad():
         rays = [cameras.view_rays(view) for view in range(VIEWS)]
         photos = torch.stack([see(of, BLACK.expand(len(of), 3)).rgb.view(SIZE, SIZE, 3) for of in rays])

@@ -1,12 +1,12 @@
 import pytest
 import torch
-from ragged import ragged
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
+from tests.helpers.ragged_samples import ragged_samples
 
 SCENE = (0.2, 0.4, 0.6)
 
@@ -22,7 +22,7 @@ def fixed(density: Tensor, rgb: Tensor):
 
 def test_colour_opacity_and_depth_agree_with_a_loop(kernels: str):
     counts = [4, 0, 6]
-    samples, rays = ragged(counts), along_z(3)
+    samples, rays = ragged_samples(counts), along_z(3)
     density, rgb = 5 * torch.rand(10), torch.rand(10, 3)
     behind = torch.rand(3, 3)
     seen = VolumeRenderer()(rays, samples, fixed(density, rgb), behind)
@@ -39,7 +39,7 @@ def test_colour_opacity_and_depth_agree_with_a_loop(kernels: str):
 
 
 def test_the_field_is_asked_at_the_samples_in_their_directions():
-    samples = ragged([2, 3])
+    samples = ragged_samples([2, 3])
     rays = Rays(torch.randn(2, 3), torch.eye(3)[:2])
     asked = []
 
@@ -67,7 +67,7 @@ def test_the_depth_of_a_thin_wall_is_its_distance(distance: float, kernels: str)
 
 
 def test_before_a_background_the_depth_is_that_of_the_wall_and_not_of_what_is_behind(kernels: str):
-    samples, rays = ragged([4]), along_z(1)
+    samples, rays = ragged_samples([4]), along_z(1)
     density = torch.tensor([0.0, 0.0, 50.0, 0.0])
     density[3], samples.t[3], samples.dt[3] = 1e-3, 600.0, 1000.0
     field = fixed(density, torch.ones(4, 3))
@@ -82,7 +82,7 @@ def test_before_a_background_the_depth_is_that_of_the_wall_and_not_of_what_is_be
     [("black", (0, 0, 0)), ("white", (1, 1, 1)), ([0.1, 0.5, 1], (0.1, 0.5, 1)), ("scene", SCENE), ("random", SCENE)],
 )
 def test_what_is_not_covered_shows_the_background(background, colour, sigma, kernels: str):
-    samples = ragged([5])
+    samples = ragged_samples([5])
     red = torch.tensor([1.0, 0, 0]).repeat(5, 1)
     seen = VolumeRenderer(background, SCENE)(along_z(1), samples, fixed(torch.full((5,), sigma), red))
     opacity = -torch.expm1(-sigma * samples.dt.sum())
@@ -117,7 +117,7 @@ def test_other_backgrounds_are_refused(background):
 
 
 def test_gradients_of_everything_seen():
-    samples, rays = ragged([3, 0, 4], torch.float64), along_z(3, torch.float64)
+    samples, rays = ragged_samples([3, 0, 4], torch.float64), along_z(3, torch.float64)
     renderer = VolumeRenderer("white").double()
     density = (0.2 + 2 * torch.rand(7, dtype=torch.float64)).requires_grad_()
     rgb = torch.rand(7, 3, dtype=torch.float64, requires_grad=True)
@@ -130,7 +130,7 @@ def test_gradients_of_everything_seen():
 
 
 def test_the_penalty_on_nearness_fades_out():
-    samples, rays = ragged([4]), Rays(torch.zeros(1, 3), torch.eye(3)[:1])
+    samples, rays = ragged_samples([4]), Rays(torch.zeros(1, 3), torch.eye(3)[:1])
     density = torch.ones(4, requires_grad=True)
 
     def field(positions: Tensor, directions: Tensor):

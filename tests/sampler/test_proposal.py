@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from agreement import agree
 from torch import Generator
 
 from nerf_lightning.cameras import Bounds, Rays
@@ -11,6 +10,7 @@ from nerf_lightning.kernels import along, resample, volume_weights
 from nerf_lightning.sampler import OccupancySampler, ProposalSampler, Samples, suited_sampler
 from nerf_lightning.sampler.proposal import interlevel_loss
 from nerf_lightning.sampler.samples import Histogram
+from tests.helpers.assert_close import assert_agrees
 
 AROUND = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True, near=0.1)
 
@@ -141,13 +141,13 @@ def test_fast_and_plain_intervals_agree(unbounded: bool):
     bounds, some = replace(AROUND, unbounded=unbounded), rays(50)
     near, far = bounds.near_far(some)
     s = torch.rand(50, 13).sort(1).values
-    agree(lambda *given: along(some, bounds, *given), [near, far, s], constants=(0, 1, 2), rtol=0, atol=0)
+    assert_agrees(lambda *given: along(some, bounds, *given), [near, far, s], constants=(0, 1, 2), rtol=0, atol=0)
 
 
 def test_fast_and_plain_resampling_agree():
     s, share, shift = torch.rand(50, 13).sort(1).values, torch.rand(50, 12), torch.rand(50) - 0.5
     share[::5] = 0
-    agree(lambda *given: resample(*given, 20), [s, share, shift], constants=(0, 1, 2), rtol=1e-4, atol=1e-4)
+    assert_agrees(lambda *given: resample(*given, 20), [s, share, shift], constants=(0, 1, 2), rtol=1e-4, atol=1e-4)
     even = resample(torch.linspace(0, 1, 5)[None], torch.zeros(1, 4), torch.zeros(1), 8)
     torch.testing.assert_close(even, torch.linspace(0, 1, 9)[None])
 
