@@ -51,6 +51,7 @@ install_import_hook(checked_modules(), "tests.helpers.typechecker.check")
 import pytest
 import yaml
 from filelock import FileLock
+from hypothesis import HealthCheck, settings
 from numba.core.dispatcher import Dispatcher
 from torch.nn.functional import normalize
 
@@ -61,6 +62,12 @@ from nerf_lightning.kernels.cpu import apart
 from nerf_lightning.utils.ending import listen
 from tests.helpers.fake_device import device, without_doubles  # noqa: F401  (fixtures)
 from tests.helpers.shared_fixtures import make_once, shared_folder
+
+# The same examples on every machine, none kept: a failure is found again by running the test again.
+settings.register_profile(
+    "tests", derandomize=True, deadline=None, database=None, max_examples=30, suppress_health_check=list(HealthCheck)
+)
+settings.load_profile("tests")
 
 
 @pytest.fixture(scope="session")

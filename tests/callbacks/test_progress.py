@@ -8,22 +8,18 @@ from nerf_lightning.utils.progress import set_sweep
 @pytest.mark.parametrize(
     ("seconds", "expected"),
     [
-        (0, "0:00"),
-        (0.4, "0:00"),
         (9, "0:09"),
         (59.4, "0:59"),
         (59.6, "1:00"),
-        (123, "2:03"),
         (3599.6, "1:00:00"),
         (3723, "1:02:03"),
-        (360_000, "100:00:00"),
     ],
 )
-def test_clock(seconds, expected):
+def test_clock_formats_seconds(seconds, expected):
     assert in_words(seconds) == expected
 
 
-def test_the_time_left_comes_once_it_can_be_told_and_that_of_the_sweep_beside_it(clock, system, trainer_with):
+def test_progress_shows_time_left_of_run_and_sweep(clock, system, trainer_with):
     budget, progress = Budget(seconds=100), Progress()
     trainer = trainer_with(budget, progress)
     budget.on_train_start(trainer, system)

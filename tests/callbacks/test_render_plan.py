@@ -46,11 +46,11 @@ class Told:
         ({"final": 0.0, "orbit": 5.0}, -3.0, {"final": 0.0, "orbit": 0.0}),
     ],
 )
-def test_what_a_job_does_not_need_is_for_the_others(needs: dict, allowance: float, expected: dict):
+def test_allot_unused_share_goes_to_others(needs: dict, allowance: float, expected: dict):
     assert allot(needs, allowance) == pytest.approx(expected)
 
 
-def test_shares_leave_each_job_its_least_and_do_not_count_what_was_asked_for():
+def test_render_plan_shares_keep_minimum():
     plan = RenderPlan()
     assert plan.seconds_left({"final": Need(100)}, 10.0) is None, "nothing was rendered yet"
     plan.note(1000, 1.0)
@@ -67,7 +67,7 @@ def test_shares_leave_each_job_its_least_and_do_not_count_what_was_asked_for():
     assert plan.seconds_left({"final": Need(1000, scored=True)}, 34.0) == pytest.approx(2.0)
 
 
-def test_a_pixel_takes_as_long_as_in_the_last_views(clock):
+def test_render_plan_pixel_seconds_follow_last_views(clock):
     plan = RenderPlan()
     plan.note(1 << 14, 2.0 * (1 << 14))
     plan.note(10, 1000.0)
@@ -132,7 +132,7 @@ def simulated(clock: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Ca
         (512, 2e-4, 1.0, 180.0, 0.25),  # and here 419 s
     ],
 )
-def test_rendering_takes_as_long_as_training_at_most_and_its_end_is_told(
+def test_rendering_takes_at_most_as_long_as_training(
     side: int, pixel_seconds: float, fog: float, seconds: float, rows: float, simulated: Callable[..., Told]
 ):
     told = simulated(side, pixel_seconds, fog)

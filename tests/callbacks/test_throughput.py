@@ -1,10 +1,9 @@
 import pytest
 
 from nerf_lightning.callbacks import Budget, Throughput
-from nerf_lightning.errors import InputError
 
 
-def test_speeds_are_averages_since_the_last_entry(clock, system, trainer_with):
+def test_throughput_speeds_are_averages_since_last_entry(clock, system, trainer_with):
     budget, throughput = Budget(steps=100), Throughput(every=4)
     trainer = trainer_with(budget, throughput)
     budget.on_train_start(trainer, system)
@@ -25,7 +24,7 @@ def test_speeds_are_averages_since_the_last_entry(clock, system, trainer_with):
     assert throughput.rays == 240
 
 
-def test_rays_are_counted_over_resumes_and_without_a_logger(clock, system, trainer_with):
+def test_throughput_counts_rays_over_resumes(clock, system, trainer_with):
     budget, throughput, resumed = Budget(steps=100), Throughput(every=1), Throughput(every=1)
     throughput.rays = 1000
     resumed.load_state_dict(throughput.state_dict())
@@ -38,8 +37,3 @@ def test_rays_are_counted_over_resumes_and_without_a_logger(clock, system, train
     trainer.logger = None
     resumed.on_train_batch_end(trainer, system, None, None, 0)
     assert resumed.rays == 1060
-
-
-def test_entries_must_be_at_least_a_step_apart():
-    with pytest.raises(InputError, match="callbacks.throughput.every"):
-        Throughput(every=0)

@@ -36,7 +36,7 @@ def looked(rays: Rays, occupied: Tensor) -> tuple[Tensor, Packed, int]:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_all_that_light_reaches_is_found_and_little_else(share: float):
+def test_front_first_any_occupancy_finds_visible_samples(share: float):
     directions = normalize(torch.randn(400, 3), dim=1)
     aside = torch.cat([torch.rand(396, 3) - 0.5, torch.full((4, 3), 5.0)])  # the last miss
     rays = Rays(aside - 4 * directions, directions)
@@ -54,7 +54,7 @@ def test_all_that_light_reaches_is_found_and_little_else(share: float):
     assert torch.equal(found, again[0]) and torch.equal(packed[0], again[1][0])
 
 
-def test_rays_with_gradient_take_the_reference():
+def test_front_first_rays_with_gradient_use_reference():
     rays = Rays(torch.tensor([[-3.0, 0.1, 0.2]], requires_grad=True), torch.tensor([[1.0, 0, 0]]))
     found, packed, asked = looked(rays, torch.ones(4**3, dtype=torch.bool))
     near, far = CUBE.near_far(rays)

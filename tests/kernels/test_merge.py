@@ -3,11 +3,9 @@ import math
 import pytest
 import torch
 
-from nerf_lightning.kernels import composite, merge_faint, use_kernels
-from nerf_lightning.kernels.composite import Kept
+from nerf_lightning.kernels import composite, merge_faint
 from nerf_lightning.sampler import Samples
-from tests.helpers.assert_close import run_with_threads
-from tests.helpers.ragged_samples import COUNTS, MANY, ragged_samples
+from tests.helpers.ragged_samples import MANY, ragged_samples
 
 FAINT = 0.1
 
@@ -46,9 +44,8 @@ def by_hand(thickness: torch.Tensor, samples: Samples, faint: float) -> list[tup
     return found
 
 
-@pytest.mark.parametrize("counts", [*COUNTS, MANY])
-@pytest.mark.parametrize("faint", [0.0, FAINT, 1.1])
-def test_neighbours_that_hardly_count_are_merged(counts: list[int], faint: float, kernels: str):
+@pytest.mark.parametrize(("counts", "faint"), [([0], FAINT), ([30, 0, 2, 11, 0], 0.0), (MANY, FAINT), (MANY, 1.1)])
+def test_merge_faint_neighbours_match_loop_over_samples(counts: list[int], faint: float, kernels: str):
     thickness, samples = foggy(counts)
     merged, (t, dt, ray, offsets) = merge_faint(thickness, packed(samples), faint)
     wanted = by_hand(thickness, samples, faint)
@@ -57,25 +54,7 @@ def test_neighbours_that_hardly_count_are_merged(counts: list[int], faint: float
     assert len(t) < len(samples) or faint == 0 or len(samples) < 20
 
 
-@pytest.mark.parametrize("counts", [[], [0, 0], MANY])
-def test_merging_agrees_with_the_reference(counts: list[int]):
-    thickness, samples = foggy(counts)
-
-    def merged() -> Kept:
-        return merge_faint(thickness, packed(samples), FAINT)
-
-    found = {}
-    for choice in ("reference", "auto"):
-        use_kernels(choice)
-        found[choice] = merged()
-    (wanted, those), (actual, these) = found.values()
-    for a, b in zip((actual, *these), (wanted, *those), strict=True):
-        torch.testing.assert_close(a, b)
-    one, which = run_with_threads(merged, 1)
-    assert torch.equal(one, actual) and all(torch.equal(a, b) for a, b in zip(which, these, strict=True))
-
-
-def test_opacity_and_depth_stay_and_colours_hardly_change(kernels: str):
+def test_merge_faint_pixels_hardly_change(kernels: str):
     thickness, samples = foggy(MANY)
     merged, (t, dt, ray, offsets) = merge_faint(thickness, packed(samples), 0.01)
 
@@ -89,7 +68,7 @@ def test_opacity_and_depth_stay_and_colours_hardly_change(kernels: str):
     assert 0 < (whole[0] - part[0]).abs().max() < 0.01
 
 
-def test_a_thickness_that_is_not_a_number_stays_alone(kernels: str):
+def test_merge_faint_nan_thickness_stays_alone(kernels: str):
     samples = ragged_samples([3, 5, 2])
     thickness = torch.full((10,), 1e-3)
     thickness[5] = math.nan

@@ -23,34 +23,23 @@ def read(density: Tensor, colour: Tensor, views: Tensor) -> None:
 
 CALLS: dict[str, Callable[[], object]] = {
     "lengths": lambda: k.volume_weights(ONE, ONE[1:], RAY, OFFSETS),
-    "rays that are no whole numbers": lambda: k.volume_weights(ONE, ONE, ONE, OFFSETS),
     "colours of two channels": lambda: k.composite(ONE, torch.zeros(3, 2), ONE, ONE, RAY, OFFSETS),
-    "too few colours": lambda: k.composite(ONE, torch.zeros(2, 3), ONE, ONE, RAY, OFFSETS),
     "too little thickness": lambda: k.keep_visible(ONE[1:], (ONE, ONE, RAY, OFFSETS), 1e-4, 0.0),
-    "too little thickness to merge": lambda: k.merge_faint(ONE[1:], (ONE, ONE, RAY, OFFSETS), 0.1),
     "directions of two coordinates": lambda: k.spherical_harmonics(torch.zeros(5, 2)),
-    "places in a row": lambda: k.hash_interpolate(torch.zeros(27, 2), torch.rand(4), [(2, 2, 2)], [27]),
-    "too few near ends": lambda: k.march(RAYS, BOX, ONE[1:], ONE, ONE, CELLS, 8, 0.1),
     "cells that are no truths": lambda: k.march(RAYS, BOX, ONE, ONE, ONE, torch.ones(64), 8, 0.1),
     "directions of points": lambda: k.points(RAYS.origins, RAYS.directions[:, :2], RAY, ONE),
-    "inputs in a row": lambda: k.mlp(torch.zeros(5), LAYERS),
     "too few further inputs": lambda: k.mlp(torch.zeros(4, 5), LAYERS, torch.zeros(3, 1)),
     "planes": lambda: k.plane_line_products(torch.rand(3, 3, 4, 2), torch.rand(3, 4, 2), UNIT),
-    "lines": lambda: k.plane_line_products(torch.rand(3, 4, 4, 2), torch.rand(3, 3, 2), UNIT),
-    "channels": lambda: k.plane_line_products(torch.rand(3, 4, 4, 2), torch.rand(3, 4, 1), UNIT),
-    "two planes": lambda: k.plane_line_products(torch.rand(2, 4, 4, 2), torch.rand(3, 4, 2), UNIT),
-    "densities of vertices": lambda: read(torch.zeros(8), torch.zeros(9, 3), torch.zeros(9, 9)),
     "colours of vertices": lambda: read(torch.zeros(9), torch.zeros(9, 2), torch.zeros(9, 9)),
-    "views of vertices": lambda: read(torch.zeros(9), torch.zeros(9, 3), torch.zeros(8, 9)),
 }
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-def test_a_wrong_shape_or_type_is_refused_in_tests(call: Callable[[], object]):
+def test_kernel_wrong_shape_or_type_is_refused(call: Callable[[], object]):
     with pytest.raises(jaxtyping.TypeCheckError):
         call()
 
 
-def test_cells_along_other_axes_than_positions_are_refused():
+def test_hash_interpolate_other_axes_are_refused():
     with pytest.raises(ValueError, match="reshape"):
         k.hash_interpolate(torch.zeros(27, 2), torch.rand(4, 2), [(2, 2, 2)], [27])
