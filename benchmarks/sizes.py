@@ -1,5 +1,6 @@
 """Sizes: what the search for the smallest model chooses on scenes of rising complexity, against every rung trained in full."""
 
+import argparse
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from benchmarks.tables import Rows, named
 from nerf_lightning.config import conf_dir
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
@@ -30,8 +32,6 @@ FEW = 6
 """Training views that a scene is left with, to see whether its model shrinks too."""
 NEAR = 0.3
 """dB that the choice may be below the best."""
-
-Rows = list[dict[str, Any]]
 
 
 def heap(count: int = BODIES, seed: int = 0) -> list[Body]:
@@ -73,8 +73,9 @@ def looked_for(cfg: DictConfig, folder: Path) -> Found:
     return found
 
 
-def measure(overrides: list[str], seconds: float, output: Path) -> dict[str, Rows]:
+def measure(args: argparse.Namespace) -> Rows:
     """Two tables: for each scene the choice, and all rungs of the ladder trained in full; the last scene with few views."""
+    overrides, seconds, output = args.overrides, args.budgets[0], args.output
     rows: Rows = []
     last: tuple[DictConfig, Found] | None = None
     for name, dataset in scenes(output / "scenes").items():
@@ -90,7 +91,7 @@ def measure(overrides: list[str], seconds: float, output: Path) -> dict[str, Row
         rows.append({"scene": name, "picture_kB": png_size(data.scene.val.images) / 1000, **_row(found, full)})
         last = cfg, found
     assert last is not None  # there are scenes
-    return {"sizes": rows, "few": few(*last, overrides, seconds, output)}
+    return named({"sizes": rows, "few": few(*last, overrides, seconds, output)})
 
 
 def png_size(images: Tensor) -> float:
