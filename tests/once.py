@@ -1,3 +1,5 @@
 """Moved to tests/helpers/shared_fixtures.py."""
 
-from tests.helpers.shared_fixtures import T as T, shared_folder as shared_folder, make_once as once  # noqa: E501, F401, I001, PLC0414
+# ruff: noqa
+from tests.helpers.shared_fixtures import *
+from tests.helpers.shared_fixtures import make_once as once
