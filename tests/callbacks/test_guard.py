@@ -84,7 +84,7 @@ class Broken(NeRF2D):
         self.field.colours.copy_((0.5 + (1 - error**0.5) * (truth - 0.5)).view(64, 3))
 
 
-def run(system: NeRF2D, guard: Guard, tmp_path: Path, steps: int = 400, picture: Picture | None = None) -> float:
+def run(system: NeRF2D, guard: Guard, tmp_path: Path, steps: int = 250, picture: Picture | None = None) -> float:
     """Trains and returns the last mean squared error over the picture."""
     data = PixelDataModule(picture or stripes(), 64)
     trainer = L.Trainer(
@@ -104,7 +104,7 @@ def without_lightnings_hints() -> None:
 @pytest.mark.parametrize("how", ["not at all", "spike"])
 def test_guard_good_training_is_left_alone(how: str, tmp_path: Path):
     guard = Guard(every=10)
-    assert run(Broken(how, 130), guard, tmp_path) < 1e-3
+    assert run(Broken(how, 80), guard, tmp_path) < 1e-3
     assert guard.recoveries == [] and guard.rate == 1.0
 
 
@@ -116,9 +116,9 @@ def test_guard_broken_step_restores_last_good_weights(
     how: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     guard = Guard(every=10, keep_every=50)
-    assert run(Broken(how, 130), guard, tmp_path) < 1e-3
+    assert run(Broken(how, 80), guard, tmp_path) < 1e-3
     (one,) = guard.recoveries
-    assert words in one.cause and "last good weights" in one.action and 130 < one.step < 230
+    assert words in one.cause and "last good weights" in one.action and 80 < one.step < 180
     assert guard.rate == pytest.approx(LOWER)
     assert f"guard: step {one.step}" in capsys.readouterr().out, "never silently"
 

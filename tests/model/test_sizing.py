@@ -12,7 +12,6 @@ from nerf_lightning.dataset import RayDataModule, save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import HashGridField, TensoRFField, VoxelField
 from nerf_lightning.model import tensorf as planes
-from nerf_lightning.model.tensorf import FINEST
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.stability.toys import MARBLE, around, toy
@@ -82,6 +81,7 @@ def test_tensorf_large_photos_enlarge_planes_and_network(unbounded: bool, across
 def test_run_on_large_photos_resumes_with_finer_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(bounds, "USUAL_WIDTH", 4)  # so that small photos count as large
     monkeypatch.setattr(planes, "SETTLED", 2)
+    monkeypatch.setattr(planes, "FINEST", 24)
     scene = tmp_path / "scene.npz"
     save_npz(toy(MARBLE, size=24, views=5, held_out=1), scene)
     given = ["dataset=photos", f"dataset.path={scene}", "recipe=tensorf_medium", "model.coarsest=8", "model.size=fixed"]
@@ -114,4 +114,4 @@ def test_run_on_large_photos_resumes_with_finer_field(tmp_path: Path, monkeypatc
     finer = found.field.finer
     assert told == [1.0] * 4 + [finer] * 3, "the data aims for more samples once the field is finer"
     assert finer > 1.1 and found.sampler.samples == 3 * found.sampler.resolution > 192 * 1.1
-    assert found.field.resolutions[-1] == round(FINEST * finer)
+    assert found.field.resolutions[-1] == round(24 * finer)
