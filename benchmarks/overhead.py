@@ -21,7 +21,7 @@ BLOCKS, FIRST = 50, 10
 
 
 class Alternation(L.Callback):
-    """After each block of the Trainer's steps, takes as many without it: same field, same optimiser, same data.
+    """After each block of the Trainer's steps, takes as many without it: same field, same optimiser, same photos.
 
     Of every block the last step is left out, because in the Trainer's it ends in this callback's own work.
     """
@@ -55,8 +55,11 @@ def measure_overhead(overrides: list[str]) -> dict[str, float]:
     steps = BLOCKS * BLOCK + 1
     settings = [*overrides, f"budget.steps={steps}", "callbacks.heldout.at=[]", "callbacks.snapshots.steps=[]"]
     cfg, data, system = build(settings)
+    own = RayDataModule(
+        data.scene, rays=data.rays, samples=data.samples, seed=cfg.seed
+    )  # the Trainer has drawn its batch
     with tempfile.TemporaryDirectory() as folder:
-        trainer, alternation = build_trainer(cfg, Path(folder), device_of(cfg)), Alternation(data)
+        trainer, alternation = build_trainer(cfg, Path(folder), device_of(cfg)), Alternation(own)
         trainer.callbacks.insert(0, alternation)  # type: ignore[attr-defined]
         trainer.fit(system, data)
     full, bare = alternation.trainer_blocks[FIRST:], alternation.bare_blocks[FIRST:]

@@ -79,14 +79,6 @@ def test_shrunk_picture_keeps_proportions_within_bytes(sunset):
     assert qualities == sorted(qualities) and qualities[-1] > qualities[0] + 3
 
 
-def test_shrunk_picture_is_averaged_and_enlarged_smoothly():
-    ramp = np.repeat(np.arange(0, 256, 4, dtype=np.uint8)[None, :, None], 64, axis=0).repeat(3, axis=2)
-    assert shrunk(ramp, ramp.nbytes // 4)["psnr"] > 50, "nothing of a ramp is lost but at the borders"
-    stripes = np.zeros((64, 64, 3), np.uint8)
-    stripes[:, ::2] = 200
-    assert shrunk(stripes, stripes.nbytes // 4)["psnr"] == pytest.approx(20 * math.log10(255 / 100), abs=0.1)
-
-
 def results_with(size: int, quality: float | None) -> Results:
     results = Results("results.json", "grey", 0)
     results.summary = {"artifact_bytes": size, "psnr": quality}

@@ -1,7 +1,6 @@
 import pytest
 
 from nerf_lightning.callbacks import Budget, HeldOut
-from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.evenly import evenly
 
@@ -56,24 +55,6 @@ def test_heldout_step_passing_several_marks_measures_once(clock, system, trainer
     resumed.load_state_dict(held_out.state_dict())
     resumed.on_train_batch_end(trainer, system, None, None, 0)
     assert len(resumed.curve) == 2, "what was measured before the pause is not measured again"
-
-
-def test_heldout_little_time_takes_fewer_pixels(clock, system, trainer_with, monkeypatch):
-    monkeypatch.setattr("nerf_lightning.callbacks.heldout.MIN_PIXELS", 0)
-    budget, held_out = Budget(seconds=1000), HeldOut([0.5], views=2)
-    trainer = trainer_with(budget, held_out)
-    budget.on_train_start(trainer, system)
-    clock.wait(500)
-    trainer.global_step = system.progress = 1
-    system.progress = 0.5
-    held_out.on_train_batch_end(trainer, system, None, None, 0)
-    # A view takes 50 s, the test 500, so that both are measured whole within 1000 s ...
-    assert trainer.datamodule.subsets[1:] == [WHOLE] * 2
-    held_out.curve, trainer.datamodule.subsets = [], []
-    budget.plan.spent = 450.0
-    held_out.on_train_batch_end(trainer, system, None, None, 0)
-    # ... and if 50 are left beside the test, on every second row and column.
-    assert trainer.datamodule.subsets == [PixelSubset(stride=2)] * 2
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,3 @@
-import dataclasses
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -7,10 +6,9 @@ import pytest
 import torch
 from PIL import Image
 
-from nerf_lightning.callbacks import Budget, PictureCharts, Results, Snapshots, TrainingGif
+from nerf_lightning.callbacks import PictureCharts, Results, Snapshots, TrainingGif
 from nerf_lightning.callbacks.picture.charts import curve_chart, error_chart
-from nerf_lightning.drawing.panels import WIDEST, narrowed, to_bytes
-from nerf_lightning.errors import InputError
+from nerf_lightning.drawing.panels import narrowed
 
 CURVE = [[0.5, 10, 20.0], [1.5, 100, 25.0], [4.0, 300, 31.0]]
 
@@ -68,21 +66,6 @@ def test_picture_charts_after_test_are_written(found, files, clock, system, trai
 # final.png, and what TensorBoard gets
 
 
-def test_snapshots_latest_render_stands_alone(clock, system, trainer_with, tmp_path: Path):
-    snapshots, taken = Snapshots(steps=[1, 2], final="latest.png"), []
-    trainer, evaluate = trainer_with(Budget(steps=9), snapshots), system.evaluate
-
-    def noted(view: int):
-        taken.append(dataclasses.replace(evaluate(view), truth=torch.zeros(12, 16, 3)))
-        return taken[-1]
-
-    system.evaluate = noted
-    for trainer.global_step in (1, 2):
-        snapshots.on_train_batch_end(trainer, system, None, None, 0)
-        assert np.array_equal(imageio.imread(tmp_path / "latest.png"), to_bytes(taken[-1].rgb))
-    assert len(taken) == 3 and len(list((tmp_path / "snapshots").iterdir())) == 2
-
-
 @pytest.mark.parametrize(
     ("height", "width", "most", "size"),
     [(40, 60, 60, (40, 60)), (40, 60, 100, (40, 60)), (40, 60, 30, (20, 30)), (2, 60, 6, (1, 6)), (5, 3, 1, (2, 1))],
@@ -133,20 +116,3 @@ def test_training_gif_without_snapshots_is_not_written(levels, trainer_with, sys
         write_snapshots(tmp_path / "snapshots", levels)
     TrainingGif().on_test_end(trainer_with(*([] if levels is None else [Snapshots()])), system)
     assert not list(tmp_path.rglob("*.gif"))
-
-
-@pytest.mark.parametrize(("options", "key"), [({"fps": 0}, "fps"), ({"fps": -1.0}, "fps"), ({"width": 0}, "width")])
-def test_training_gif_bad_option_is_refused(options: dict, key: str):
-    with pytest.raises(InputError, match=f"callbacks.training_gif.{key}"):
-        TrainingGif(**options)
-
-
-def test_error_chart_large_picture_is_averaged():
-    rgb = torch.zeros(8, 2 * WIDEST, 3)
-    rgb[:, WIDEST:] = 10 / 255
-    axes = error_chart(rgb, torch.zeros_like(rgb), "").axes[0]
-    (shown,) = axes.images
-    assert shown.get_array().shape == (4, WIDEST)
-    assert shown.get_array()[:, : WIDEST // 2].max() == 0
-    np.testing.assert_allclose(shown.get_array()[:, WIDEST // 2 :], 10, rtol=1e-5)
-    assert axes.get_xlim() == (-0.5, 2 * WIDEST - 0.5) and axes.get_ylim() == (7.5, -0.5), "in the picture's pixels"

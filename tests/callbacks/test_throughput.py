@@ -22,18 +22,3 @@ def test_throughput_speeds_are_averages_since_last_entry(clock, system, trainer_
     assert first["train/learning_rate"] == 0.1
     assert (first["speed/training_seconds"], second["speed/training_seconds"]) == (4, 16)
     assert throughput.rays == 240
-
-
-def test_throughput_counts_rays_over_resumes(clock, system, trainer_with):
-    budget, throughput, resumed = Budget(steps=100), Throughput(every=1), Throughput(every=1)
-    throughput.rays = 1000
-    resumed.load_state_dict(throughput.state_dict())
-    trainer = trainer_with(budget, resumed)
-    budget.on_train_start(trainer, system)
-    resumed.on_train_start(trainer, system)
-    clock.wait(2)
-    resumed.on_train_batch_end(trainer, system, None, None, 0)
-    assert trainer.logger.log_metrics.call_args.args[0]["speed/rays_per_second"] == pytest.approx(15)
-    trainer.logger = None
-    resumed.on_train_batch_end(trainer, system, None, None, 0)
-    assert resumed.rays == 1060

@@ -8,8 +8,6 @@ from nerf_lightning.kernels import composite, use_kernels, volume_weights
 from nerf_lightning.sampler import Samples
 from tests.helpers.ragged_samples import COUNTS, ragged_samples
 
-NAN = float("nan")
-
 
 @pytest.fixture(params=["formula", "auto", "reference"])
 def weights_of(request: pytest.FixtureRequest):
@@ -100,24 +98,3 @@ def test_gradients_behind_opaque_sample_are_finite(kernels: str):
     seen = composite(density, torch.rand(4, 3), samples.t, samples.dt, samples.ray, samples.offsets)
     (gradient,) = torch.autograd.grad(sum(x.square().sum() for x in seen), density)
     assert gradient.isfinite().all() and gradient[0].abs() < 1e-6, "no more of it can be seen"
-
-
-def seen(samples: Samples):
-    """`composite` as a function of what may have gradients."""
-    return lambda density, rgb: composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
-
-
-@pytest.mark.parametrize(("where", "kind"), [(0, "density"), (4, "density"), (2, "rgb")])
-def test_composite_nan_input_shows_in_its_ray(where: int, kind: str, kernels: str):
-    samples = ragged_samples([3, 5, 2])
-    density, rgb = 0.1 + torch.rand(10), torch.rand(10, 3)
-    (density if kind == "density" else rgb)[3 + where] = NAN
-    colour, opacity, depth = seen(samples)(density.requires_grad_(), rgb.requires_grad_())
-    assert colour[1].isnan().all() and colour[0].isfinite().all()
-    if kind == "density":
-        assert opacity[1].isnan() and depth[1].isnan()
-    else:
-        assert opacity.isfinite().all() and colour[2].isfinite().all()
-    loss = colour.sum()
-    loss.backward()
-    assert loss.isnan() and density.grad[3 : 3 + where + 1].isnan().any()

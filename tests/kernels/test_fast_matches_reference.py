@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning import kernels as k
 from nerf_lightning.cameras import Bounds, Rays
-from tests.helpers.assert_close import assert_agrees
+from tests.helpers.assert_close import assert_agrees, values_and_gradients
 from tests.helpers.ragged_samples import MANY, ragged_samples
 
 DRAW = Callable[[st.SearchStrategy], object]
@@ -46,6 +46,8 @@ class Case:
     rtol: float = 1e-4
     atol: float = 1e-6
     any_threads: bool = True
+    spoilt: int | None = None
+    """An input whose values that are not numbers must show."""
 
 
 def packed(counts: list[int]) -> tuple[Tensor, ...]:
@@ -61,7 +63,8 @@ def composite(draw: DRAW) -> Case:
     """Fields give densities as a column, colours as the transpose of [3, N]."""
     t, dt, ray, offsets = packed(draw(COUNTS))
     density = draw(st.sampled_from([0.1, 3.0, 100.0])) * torch.rand(len(t), 2) * (torch.rand(len(t), 2) < 0.7)
-    return Case(lambda d, rgb: k.composite(d[:, 1], rgb.T, t, dt, ray, offsets), [density, torch.rand(3, len(t))])
+    call = lambda d, rgb: k.composite(d[:, 1], rgb.T, t, dt, ray, offsets)  # noqa: E731
+    return Case(call, [density, torch.rand(3, len(t))], spoilt=draw(st.sampled_from([0, 1])))
 
 
 def keep_visible(draw: DRAW) -> Case:
@@ -91,7 +94,7 @@ def spherical_harmonics(draw: DRAW) -> Case:
     transposed = draw(st.booleans())
     d = directions(draw(SAMPLES))
     call = (lambda x: k.spherical_harmonics(x.T)) if transposed else k.spherical_harmonics
-    return Case(call, [d.T.contiguous() if transposed else d], draw(st.sampled_from([(), (0,)])), rtol=1e-5)
+    return Case(call, [d.T.contiguous() if transposed else d], draw(st.sampled_from([(), (0,)])), rtol=1e-5, spoilt=0)
 
 
 def hash_interpolate(draw: DRAW) -> Case:
@@ -102,7 +105,9 @@ def hash_interpolate(draw: DRAW) -> Case:
     )
     # Only entries of two features have a fast gradient of the positions.
     constants = (1,) if tables.shape[1] > 2 else draw(st.sampled_from([(), (1,)]))
-    return Case(lambda t, u: k.hash_interpolate(t, u - 0.1, cells, sizes), [tables, unit], constants, atol=3e-6)
+    return Case(
+        lambda t, u: k.hash_interpolate(t, u - 0.1, cells, sizes), [tables, unit], constants, atol=3e-6, spoilt=1
+    )
 
 
 def mlp(draw: DRAW) -> Case:
@@ -119,7 +124,7 @@ def mlp(draw: DRAW) -> Case:
         return list(k.mlp_heads(x.T, layers, first, extra.T if further else None)[head])
 
     inputs = [torch.randn(further, samples), torch.randn(widths[0], samples), *flat]
-    return Case(call, inputs, (0,), atol=1e-5, any_threads=False)
+    return Case(call, inputs, (0,), atol=1e-5, any_threads=False, spoilt=1)
 
 
 def planes(draw: DRAW) -> Case:
@@ -127,13 +132,19 @@ def planes(draw: DRAW) -> Case:
     read = draw(st.sampled_from([k.plane_line_products, k.plane_line_sum]))
     factors = [torch.randn(3, side, side, channels), torch.randn(3, side, channels)]
     unit = 1.2 * torch.rand(3, draw(SAMPLES)) - 0.1
-    return Case(lambda p, lines, u: read(p, lines, u.T), [*factors, unit], draw(st.sampled_from([(), (2,)])), atol=3e-6)
+    return Case(
+        lambda p, lines, u: read(p, lines, u.T),
+        [*factors, unit],
+        draw(st.sampled_from([(), (2,)])),
+        atol=3e-6,
+        spoilt=2,
+    )
 
 
 def points(draw: DRAW) -> Case:
     ray, t = torch.randint(0, 40, (draw(SAMPLES),)), draw(st.sampled_from([5.0, 500.0]))
     given = [torch.randn(40, 3), directions(40), ray, t * torch.rand(len(ray))]
-    return Case(k.points, given, draw(st.sampled_from([(), (3,), (0, 1, 3)])), atol=3e-6)
+    return Case(k.points, given, draw(st.sampled_from([(), (3,), (0, 1, 3)])), atol=3e-6, spoilt=3)
 
 
 def voxels(draw: DRAW) -> Case:
@@ -203,3 +214,22 @@ def test_fast_kernel_any_input_matches_reference(kernel: Callable[[DRAW], Case],
     torch.manual_seed(seed)
     case = kernel(data.draw)
     assert_agrees(case.call, case.inputs, case.constants, case.rtol, case.atol, case.any_threads)
+
+
+@pytest.mark.parametrize("kernel", [composite, spherical_harmonics, hash_interpolate, mlp, planes, points])
+@given(data=st.data(), seed=st.integers(0, 1000))
+def test_fast_kernel_nan_input_shows_as_in_reference(kernel: Callable[[DRAW], Case], data: st.DataObject, seed: int):
+    torch.manual_seed(seed)
+    case = kernel(data.draw)
+    spoilt = case.inputs[case.spoilt]
+    spoilt[torch.rand(spoilt.shape) < 0.1] = math.nan
+    found = []
+    for choice in ("reference", "auto"):
+        k.use_kernels(choice)
+        found.append(values_and_gradients(case.call, case.inputs, case.constants))
+    gradients = sum(x.is_floating_point() and i not in case.constants for i, x in enumerate(case.inputs))
+    for number, (expected, got) in enumerate(zip(*found, strict=True)):
+        if number < len(found[0]) - gradients:
+            assert torch.equal(got.isnan(), expected.isnan()), number
+        else:  # it spreads with the order of sums
+            assert bool(got.isnan().any()) == bool(expected.isnan().any()), number

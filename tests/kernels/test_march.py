@@ -76,29 +76,6 @@ def test_march_matches_loop_over_rays_and_steps(training: bool, resolution: int,
     assert total > 100
 
 
-@pytest.mark.parametrize(("unbounded", "training"), [(False, False), (False, True), (True, False)])
-def test_march_full_grid_takes_steps_of_one_length(unbounded, training, box: Bounds, rays: Rays, kernels: str):
-    bounds = replace(box, unbounded=unbounded)
-    samples = marched(rays, bounds, everywhere(4), 64, training)
-    near, far = bounds.near_far(rays)
-    step = 2 * float(box.half_size.norm()) / 64
-    for r in range(len(rays)):
-        part = slice(int(samples.offsets[r]), int(samples.offsets[r + 1]))
-        if near[r] >= far[r]:
-            assert part.start == part.stop
-            continue
-        start, end = samples.t[part] - samples.dt[part] / 2, samples.t[part] + samples.dt[part] / 2
-        torch.testing.assert_close(start[1:], end[:-1], rtol=1e-5, atol=1e-5)
-        if not training:
-            torch.testing.assert_close(start[0], near[r], rtol=1e-4, atol=1e-4)
-        if unbounded:
-            change = samples.dt[part][1:-1].diff()
-            shorter, longer = (change < -1e-4).nonzero()[:, 0], (change > 1e-4).nonzero()[:, 0]
-            assert len(longer) and (not len(shorter) or shorter.max() < longer.min()), "shorter, then longer"
-        else:
-            torch.testing.assert_close(samples.dt[part][1:-1], torch.full_like(start[1:-1], step), rtol=1e-3, atol=1e-5)
-
-
 def test_march_thin_rod_is_never_missed(box: Bounds, kernels: str):
     resolution = 16
     grid = torch.zeros(resolution, resolution, resolution, dtype=torch.bool)

@@ -63,17 +63,3 @@ def test_mlp_one_and_two_threads_agree():
     assert torch.equal(one[0], two[0]) and torch.equal(one[1], two[1]), "samples do not share sums"
     for a, b in zip(one, two, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("widths", [(3, 5), (5, 31, 3, 7), (12, 32, 32, 31, 3)])
-def test_mlp_nan_input_shows(widths: tuple[int, ...], kernels: str):
-    flat, x = [p.requires_grad_() for p in network(widths)], torch.randn(200, widths[0])
-    usual = mlp(x, pairs(flat)).detach()
-    x[[3, 150], -1] = float("nan")
-    out = mlp(x, pairs(flat))
-    assert out[[3, 150]].isnan().all()
-    others = torch.ones(200, dtype=torch.bool)
-    others[[3, 150]] = False
-    assert torch.equal(out[others], usual[others])
-    out.sum().backward()
-    assert flat[0].grad[:, -1].isnan().any()

@@ -25,13 +25,6 @@ def test_points_any_distance_lie_on_rays(count: int):
     assert_agrees(points, [origins, directions, ray, t])
 
 
-def test_points_nan_input_shows(kernels: str):
-    origins, directions = torch.randn(3, 3), torch.randn(3, 3)
-    origins[1, 2] = float("nan")
-    places = points(origins, directions, torch.tensor([0, 1, 2, 2]), torch.tensor([1.0, 2.0, float("nan"), 3.0]))
-    assert places.isnan().tolist() == [[False] * 3, [False, False, True], [True] * 3, [False] * 3]
-
-
 @pytest.mark.parametrize("unbounded", [False, True])
 def test_mark_cells_marks_cells_of_samples(unbounded: bool, box: Bounds, rays: Rays, kernels: str):
     bounds, resolution = replace(box, unbounded=unbounded), 6

@@ -3,7 +3,6 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.kernels import (
-    interpolate_rows,
     locate,
     mark_rows,
     read_voxels,
@@ -133,12 +132,3 @@ def test_roughness_pieces_pull_as_whole(kernels: str):
     torch.testing.assert_close(pull(1, 30) + pull(30, rows), pull(1, rows))
     smoother = values.detach() - 0.01 * pull(1, rows)
     assert roughness(smoother, vertex, index, 1, rows) < roughness(values, vertex, index, 1, rows)
-
-
-def test_interpolate_rows_takes_several_values_a_vertex():
-    """`interpolate_rows` takes any number of values a vertex."""
-    index, unit = sparse_index(), places(30)
-    values = torch.randn(rows_of(index), 2, 4)
-    rows, weights = locate(index, unit)
-    expected = torch.stack([by_hand(values, index, p) for p in unit.tolist()])
-    torch.testing.assert_close(interpolate_rows(values, rows, weights).double(), expected, atol=1e-5, rtol=1e-5)

@@ -30,12 +30,6 @@ def tensorf(bounds: Bounds) -> Field:
     return field
 
 
-def split(bounds: Bounds) -> Field:
-    field = HashGridField(bounds, levels=3, log2_entries=8, coarsest=3, finest=12, width=8, split_colour=True)
-    torch.nn.init.normal_(field.grid.tables)
-    return field
-
-
 FIELDS = pytest.mark.parametrize("make", [mlp, hashgrid, tensorf])
 Make = Callable[[Bounds], Field]
 
@@ -59,19 +53,6 @@ def test_field_any_positions_gives_density_and_colour(make: Make, unbounded: boo
     assert torch.equal(density, field.density(positions))
     if count > 1:
         assert density.std() > 0 and rgb.std(0).min() > 0
-
-
-@pytest.mark.parametrize("make", [mlp, hashgrid, split])
-def test_field_view_part_is_all_that_depends_on_direction(make: Make):
-    field, positions = make(Bounds(BOX, False)), places(20)
-    seen = [field.with_view_part(positions, ways(20)) for _ in range(2)]
-    (density, rgb, part), (density2, rgb2, part2) = seen
-    assert torch.equal(density, density2) and not torch.allclose(rgb, rgb2, atol=1e-4)
-    if make is not split:
-        assert part is None
-        return
-    own = [torch.special.logit(colour.double()) - added for colour, added in ((rgb, part), (rgb2, part2))]
-    torch.testing.assert_close(*own, atol=1e-4, rtol=0)
 
 
 @FIELDS

@@ -108,13 +108,6 @@ def test_hash_grid_2d_cells_stay_nearly_square(size: tuple[int, int]):
         assert abs(across / (size[0] - 1) - down / (size[1] - 1)) * (min(size) - 1) <= 1
 
 
-@pytest.mark.parametrize(("size", "levels"), [((16, 12), 1), ((40, 40), 2), ((4000, 300), 7)])
-def test_hash_grid_2d_levels_differ(size: tuple[int, int], levels: int):
-    field = HashGrid2DField(size)
-    assert len(set(field.resolutions)) == len(field.resolutions) == levels
-    assert field(torch.rand(5, 2)).shape == (5, 3)
-
-
 @pytest.mark.parametrize(("size", "octaves"), [((1, 1), 1), ((64, 64), 6), ((256, 192), 8), ((60, 100), 7)])
 def test_picture_mlp_octaves_end_at_half_of_nyquist(size: tuple[int, int], octaves: int):
     field = PictureMLP(size, None, width=8, depth=2)
@@ -123,13 +116,6 @@ def test_picture_mlp_octaves_end_at_half_of_nyquist(size: tuple[int, int], octav
         "to the nearest octave"
     )
     assert field.net[0].in_features == 2 * (1 + 2 * octaves)
-
-
-def test_picture_mlp_last_octave_has_four_pixels_a_cycle():
-    seen = inputs_of(PictureMLP((64, 64), None, width=8), pixel_grid(64, 64))
-    sine_x = seen[:64, -4]  # per octave: the sines of x and y, then the cosines
-    cycle = math.sqrt(0.5) * torch.tensor([1.0, 1.0, -1.0, -1.0])
-    torch.testing.assert_close(sine_x, cycle.repeat(16), atol=1e-3, rtol=0)
 
 
 def inputs_of(field: PictureField, uv: Tensor) -> Tensor:

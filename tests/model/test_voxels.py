@@ -75,20 +75,6 @@ def test_voxels_grow_drops_unread_vertices():
     assert torch.equal(voxels.index[voxels.vertex[1:].long()], torch.arange(1, len(voxels.vertex), dtype=torch.int32))
 
 
-def test_voxels_grow_forgets_early_reads():
-    voxels = field()
-    see(voxels, low=0.8)
-    for _ in range(5):
-        voxels.grow(0.0)
-    late = see(voxels, high=0.2)
-    for _ in range(2):
-        voxels.grow(0.0)
-    before = voxels.density(late)
-    voxels.grow(1.0)
-    torch.testing.assert_close(voxels.density(late), before, atol=1e-4, rtol=1e-3)
-    assert (voxels.density(BOX.to_world(0.9 + 0.1 * torch.rand(50, 3))) < 1e-3).all()
-
-
 def test_voxels_grow_keeps_neighbours():
     voxels = field()
     voxels(BOX.to_world(torch.full((1, 3), 0.51)), directions(1))  # eight vertices, 4 and 5 along each axis

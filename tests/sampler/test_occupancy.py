@@ -8,7 +8,6 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at
 from nerf_lightning.kernels import cell_index, use_kernels
 from nerf_lightning.sampler import OccupancySampler, occupancy
-from nerf_lightning.sampler.occupancy import spread_evenly
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 
@@ -163,17 +162,6 @@ def test_occupancy_cells_few_cameras_see_stay_empty():
     assert not near.allowed.view(16, 16, 16)[2, 8, 8], "nearer than rays begin"
 
 
-def test_occupancy_few_cameras_allow_what_all_see():
-    K = torch.tensor([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])[None]
-    c2w = look_at(torch.tensor([[-4.0, 0, 0]]), torch.zeros(1, 3), torch.tensor([0.0, 0, 1]))
-    sampler = OccupancySampler(CUBE, resolution=8, seen_by=3)
-    sampler.look_through(Cameras.of_size(K, c2w, 16, 16))
-    assert sampler.allowed.all()
-    away = look_at(torch.tensor([[-4.0, 0, 0]]), torch.tensor([[-9.0, 0, 0]]), torch.tensor([0.0, 0, 1]))
-    sampler.look_through(Cameras.of_size(K, away, 16, 16))
-    assert sampler.allowed.all(), "a view of nothing must not leave nothing to train"
-
-
 def test_occupancy_refine_steps_follow_field_unless_stated():
     usual, stated = OccupancySampler(CUBE), OccupancySampler(CUBE, resolution=16)
     assert (usual.samples, usual.resolution) == (192, 64)
@@ -222,15 +210,3 @@ def test_occupancy_state_of_any_stage_loads():
         OccupancySampler(CUBE, resolution=16).import_state(late.export_state())
     with pytest.raises(RuntimeError, match="size mismatch"):
         OccupancySampler(CUBE, resolution=16).load_state_dict(late.state_dict())
-
-
-def test_spread_evenly_places_cover_cells():
-    numbers = torch.arange(0, 40000, 4, dtype=torch.int32)
-    one, other = (spread_evenly(numbers, torch.Generator().manual_seed(seed)) for seed in (0, 1))
-    for places in (one, other, spread_evenly(numbers + 2_000_000_000, torch.Generator().manual_seed(0))):
-        assert float(places.min()) >= 0 and float(places.max()) < 1
-        cells = (places * 10).long()
-        counts = torch.bincount((cells[0] * 10 + cells[1]) * 10 + cells[2], minlength=1000)
-        assert int(counts.min()) >= 5 and int(counts.max()) <= 16  # 10 each
-    moved = (other - one) % 1
-    assert (moved - moved[:, :1]).abs().max() < 1e-6 and moved[:, 0].min() > 1e-3

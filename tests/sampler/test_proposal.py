@@ -64,17 +64,6 @@ def test_proposal_sampler_after_training_finds_surfaces():
     assert before < 0.25 and after > 0.5
 
 
-def test_proposal_sampler_trust_is_annealed():
-    sampler = ProposalSampler(AROUND, anneal=100)
-    trusts = []
-    for step in (0, 10, 50, 99, 5000):
-        sampler.update(step, nothing, Generator())
-        trusts.append(sampler.trust)
-    assert trusts == sorted(trusts) and trusts[0] < 0.1 and trusts[-2] == trusts[-1] == 1
-    sampler.restart(5000)
-    assert sampler.trust < 0.1 and not sampler.grid.tables.any()
-
-
 def test_proposal_sampler_samples_tile_ray():
     sampler, some = ProposalSampler(AROUND, samples=10), rays(30)
     samples = sampler(some, nothing, Generator().manual_seed(1))

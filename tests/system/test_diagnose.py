@@ -6,7 +6,7 @@ import torch
 
 from nerf_lightning.dataset import Picture, PictureBatch, PixelDataModule
 from nerf_lightning.dataset.picture import builtin_picture
-from nerf_lightning.model import FourierField, HashGrid2DField, PictureField, PictureMLP, SirenField
+from nerf_lightning.model import FourierField, PictureField, PictureMLP, SirenField
 from nerf_lightning.system import NeRF2D, constant, nerf2d
 from nerf_lightning.system.nerf2d import dead_relus
 
@@ -44,12 +44,6 @@ def test_diagnose_dead_relus_are_named(make, layer: int, view):
 )
 def test_diagnose_healthy_field_is_silent(make, view):
     assert diagnosis(make(SIZE), view) == ""
-
-
-def test_diagnose_one_colour_without_relus_is_named(view):
-    told = diagnosis(shifted(SirenField(SIZE, width=16), -1, 50.0), view)
-    assert told == "every place gets the same colour"
-    assert diagnosis(HashGrid2DField(SIZE), view) == told, "its tables start out as nearly nothing"
 
 
 @pytest.mark.parametrize("by", [100.0, -100.0])
