@@ -180,9 +180,12 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path
     from nerf_lightning.config.compose import composed
     from nerf_lightning.training.train import train
 
-    folder = tmp_path_factory.mktemp("run")
-    train(composed(["+experiment=smoke_3d", "dataset.size=16", "budget.steps=10", "callbacks.orbit.frames=0"], folder))
-    return folder
+    def make(folder: Path) -> Path:
+        options = ["+experiment=smoke_3d", "dataset.size=16", "budget.steps=10", "callbacks.orbit.frames=0"]
+        train(composed(options, folder))
+        return folder
+
+    return make_once(tmp_path_factory, "small_run", make)
 
 
 @pytest.fixture(scope="session")

@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from benchmarks import __main__ as command
-from benchmarks import agreement, cameras, cases, drawn, methods, overhead, pictures, speed
+from benchmarks import agreement, cameras, cases, drawn, methods, overhead, photos, pictures, speed
 from benchmarks.tables import differences
 from nerf_lightning import kernels
 from nerf_lightning.cameras import in_other_frame
+from nerf_lightning.dataset import save_npz
+from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.picture import load_picture
 from nerf_lightning.utils.device import CPU
 from tests.helpers.soft_ball import cameras_around_ball
@@ -139,7 +141,9 @@ TINY = {
         "WARMUP": 2, "BLOCK": 2, "ROUNDS": 2, "PERIODS": 1, "SAMPLES": (64, 128), "VIEWS": (3,), "SIDES": (8,),
         "METHODS": ("hashgrid",),
     },
-    pictures: {"KINDS": ("clouds",), "SIZE": 16, "LARGE": 16},
+    cameras: {"STEPS": 2, "CONDITIONS": {"exact": cameras.CONDITIONS["exact"]}},
+    photos: {"SIZE": 16, "VIEWS": 6, "HELD_OUT": 2, "STEPS": 2, "ROUNDS": 1, "DRAWS": 2},
+    pictures: {"KINDS": ("clouds",), "FIELDS": ("siren",), "SIZE": 16, "LARGE": 16},
 }  # fmt: skip
 
 
@@ -179,3 +183,25 @@ def test_main_tiny_parts_write_table_and_json(tiny: None, tmp_path: Path, monkey
     assert report["overhead"][0]["bare_ms"] > 0
     assert report["methods"][0]["method"] == "smoke_3d"
     assert "bare_ms" in (tmp_path / "table.txt").read_text()
+
+
+@pytest.mark.long
+def test_measure_tiny_scenes_and_pictures_give_rows(tiny: None, tmp_path: Path):
+    save_npz(bricks(size=16, train_views=6, val_views=2), tmp_path / "scene.npz")
+    words = [
+        "--scenes",
+        str(tmp_path / "scene.npz"),
+        "--recipes",
+        "hashgrid_medium",
+        "--seeds",
+        "0",
+        "--output",
+        str(tmp_path),
+    ]
+    args = command.parse([*words, "dataset.max_side=16", "budget.steps=2", "budget.seconds=null"])
+    found = pictures.measure(args)
+    assert {row["table"] for row in found} == {"pictures", "2D fields", "kinds of pictures"}
+    assert [row["photos"] for row in photos.measure(args)][:2] == ["one size", "several sizes"]
+    args.overrides = []
+    rows = cameras.measure(args)
+    assert [row["refine"] for row in rows] == ["none", "auto"] and all(row["degrees"] < 1e-3 for row in rows[:1])
