@@ -30,8 +30,8 @@ def format_table(metrics: list[ViewMetrics]) -> Table:
     drawn = Table("view", "PSNR, dB", "SSIM", "LPIPS", "seconds", box=None)
     for one in metrics:
         mark = " <- worst" if one is lowest and len(metrics) > 1 else ""
-        drawn.add_format_row(*_format_row(str(one.view), vars(one), mark))
-    drawn.add_format_row(*_format_row("mean", average(metrics)))
+        drawn.add_row(*_format_row(str(one.view), vars(one), mark))
+    drawn.add_row(*_format_row("mean", average(metrics)))
     return drawn
 
 

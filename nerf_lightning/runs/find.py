@@ -12,7 +12,7 @@ def find_run(path: Path | None) -> Path:
     """Finds the run that a path means.
 
     Args:
-        path: a run's folder or compact file, or a folder with runs below it, of which the newest counts; None: the newest of all.
+        path: a run's folder or compact file, or a folder with runs below it, for the newest; None: the newest of all.
 
     Raises:
         InputError: where there is none.

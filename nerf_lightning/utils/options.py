@@ -107,6 +107,8 @@ def _fits(value: Any, hint: Any) -> bool:
         return value in arguments
     if origin in (list, Sequence):
         return isinstance(value, list | tuple) and all(_fits(item, arguments[0]) for item in value)
+    if hint is dict:
+        return isinstance(value, Mapping)
     if origin is dict:
         return isinstance(value, Mapping) and all(_fits(item, arguments[1]) for item in value.values())
     if hint is float:
@@ -116,7 +118,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if hint in (str, bool, type(None)):
         return isinstance(value, hint)
     # YAML cannot hold other classes, but a mapping may describe one (with a target of its own).
-    return not inspect.isclass(hint) or isinstance(value, (hint, Mapping, list))
+    return hint is Any or not inspect.isclass(hint) or isinstance(value, (hint, Mapping, list))
 
 
 def _range_of(value: Any) -> str:
@@ -126,7 +128,7 @@ def _range_of(value: Any) -> str:
     return f"numbers are finite, whole ones at most {WHOLE:.3g}, others {SINGLE:.3g}"
 
 
-def _within(value: float, bound: Any) -> bool:
+def _within(value: Any, bound: Any) -> bool:
     """Whether a number keeps a bound; other annotations are none."""
     if isinstance(bound, AtLeast):
         return value >= bound.value
@@ -148,5 +150,12 @@ def _describe(hint: Any) -> str:
         return f"a list, each {_describe(arguments[0])}"
     if origin is dict:
         return f"names, each with {_describe(arguments[1])}"
-    words = {int: "a whole number", float: "a number", str: "text", bool: "true or false", type(None): "null"}
+    words = {
+        int: "a whole number",
+        float: "a number",
+        str: "text",
+        bool: "true or false",
+        dict: "options by name",
+        type(None): "null",
+    }
     return words.get(hint, "a value")
