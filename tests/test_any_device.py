@@ -143,7 +143,8 @@ def test_evaluate_on_device_finds_quality_of_training(device: torch.device, run:
 
 
 def test_render_on_device_writes_videos_and_images(device: torch.device, run: Path, tmp_path: Path):
-    render = pytest.importorskip("nerf_lightning.cli.render").render
+    from nerf_lightning.cli.render import render
+
     render(run, frames=2, channels="rgb,depth,opacity", output=tmp_path / "film.webp", device=NAME)
     render(run, path="test", output=tmp_path / "beside", device=NAME)
     render(run, frames=1, background="transparent", output=tmp_path / "frames", device=NAME)
@@ -151,7 +152,8 @@ def test_render_on_device_writes_videos_and_images(device: torch.device, run: Pa
 
 
 def test_export_on_device_writes_each_kind(device: torch.device, run: Path, tmp_path: Path):
-    export = pytest.importorskip("nerf_lightning.cli.export")
+    from nerf_lightning.cli import export
+
     box = (-0.9, -0.9, -0.9, 0.9, 0.9, 0.9)
     written = [
         export.export_compact(run, output=tmp_path / "compact.npz", loss_db=3.0, device=NAME),

@@ -1,6 +1,5 @@
 """Photos of several sizes through a fisheye, some masked: trained on, judged, filmed, exported and looked at."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +13,11 @@ import torch
 import nerf_lightning as nl
 from nerf_lightning.callbacks import results
 from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
-from nerf_lightning.config.compose import composed
+from nerf_lightning.cli.evaluate import evaluate
+from nerf_lightning.cli.export import export_compact
+from nerf_lightning.cli.render import render
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
-from nerf_lightning.evaluate.__main__ import task as evaluate
-from nerf_lightning.export.__main__ import task as export
-from nerf_lightning.render.__main__ import task as render
 from nerf_lightning.renderer import Rendered
 from nerf_lightning.stability.toys import PILE, around, photograph
 from nerf_lightning.system import NeRF3D
@@ -67,20 +65,15 @@ def test_a_run_on_any_photos(folder: Path, tmp_path: Path, capsys: pytest.Captur
     run = nl.train(scene, steps=STEPS, seed=1, device="cpu", folder=tmp_path / "run", options=options)
     assert np.isfinite(run.psnr) and run.psnr > 10
 
-    evaluate(composed([f"run={tmp_path / 'run'}", "device=cpu"], tmp_path, "evaluate"))
-    judged = json.loads((tmp_path / "run/evaluation/views.json").read_text())
+    judged = evaluate(run.path, device="cpu")
     assert np.mean([view["psnr"] for view in judged["views"]]) == pytest.approx(run.psnr, abs=0.02)
     assert imageio.imread(tmp_path / "run/evaluation/worst.png").ndim == 3
 
     film = tmp_path / "film.webp"
-    render(
-        composed(
-            [f"run={tmp_path / 'run'}", "path=train", "frames=4", f"output={film}", "device=cpu"], tmp_path, "render"
-        )
-    )
+    render(run.path, path="train", frames=4, output=film, device="cpu")
     assert imageio.improps(film, plugin="pillow", index=...).n_images == 4, "frames of two sizes make one film"
 
-    export(composed([f"run={tmp_path / 'run'}", "loss=20", "device=cpu"], tmp_path, "export"))
+    export_compact(run.path, loss_db=20.0, device="cpu")
     assert (tmp_path / "run/compact.npz").exists()
     assert len(list(frusta(scene.train, "train", 16))) == len(scene.train)
 

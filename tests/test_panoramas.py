@@ -12,6 +12,7 @@ from export.balls import CENTRE, RADIUS, ball_run
 
 import nerf_lightning as nl
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at, orbit_around
+from nerf_lightning.check.findings import describe_scene
 from nerf_lightning.dataset import RayDataModule, Scene, Views, load_transforms
 from nerf_lightning.dataset.optics import equirectangular
 from nerf_lightning.dataset.shots import Reading, Shot, read_shots
@@ -21,7 +22,6 @@ from nerf_lightning.export.page import field_page
 from nerf_lightning.export.photos import write_photos
 from nerf_lightning.export.smallest import smallest
 from nerf_lightning.export.volume import sample_volume
-from nerf_lightning.inspect.verb import facts_of
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.open import open_run
 from nerf_lightning.stability.rooms import Room, pile, walls
@@ -88,8 +88,8 @@ def test_panoramas_of_room_are_learned_and_exported(scene: Scene, tmp_path: Path
     assert photos["lenses"] == [[20, 15, *cameras.as_pinholes().K[0, [0, 1, 0, 1], [0, 1, 2, 2]].tolist()]]
 
 
-def test_facts_of_panoramas_name_projection(scene: Scene):
-    assert facts_of(scene)["lens"] == "equirectangular; rays follow the lens"
+def test_describe_scene_panoramas_name_projection(scene: Scene):
+    assert describe_scene(scene)["lens"] == "equirectangular; rays follow the lens"
 
 
 def test_mesh_from_panoramas_sees_all_directions():

@@ -10,11 +10,10 @@ from torch import Tensor
 
 import nerf_lightning as nl
 from nerf_lightning.cameras import Cameras, Rays, in_other_frame
+from nerf_lightning.cli.export import export_transforms
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.options import ExportOptions
-from nerf_lightning.export.verb import export
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
 from nerf_lightning.refine import Corrections, summary, told
@@ -207,9 +206,7 @@ def test_run_with_corrections_reports_and_exports_them(tmp_path: Path, capsys, m
     moved, given = ([poses.train.cameras.centres for poses in again][i] for i in (0, 1))
     torch.testing.assert_close((moved - given).norm(dim=1), torch.tensor(found["moved"]), atol=2e-5, rtol=0)
     assert found["moved"][0] > 0 and torch.equal(again[0].val.cameras.c2w, again[1].val.cameras.c2w)
-    given_to_export = dict.fromkeys(("precision", "resolution", "threshold", "box", "photos", "output"))
-    options = ExportOptions(str(tmp_path), "transforms", loss=0.1, content="mesh", device="cpu", **given_to_export)
-    export(options)
+    export_transforms(tmp_path)
     assert "5 photos and transforms.json, cameras as corrected" in capsys.readouterr().out
     written = nl.load_scene(tmp_path / "posed")
     for found, kept in ((written.train, again[0].train), (written.val, again[0].val)):
@@ -218,7 +215,7 @@ def test_run_with_corrections_reports_and_exports_them(tmp_path: Path, capsys, m
         )
         assert torch.equal(found.pixels, kept.pixels)
     with pytest.raises(InputError, match="posed: found something, expected a folder that is not there yet"):
-        export(options)
+        export_transforms(tmp_path)
     with pytest.raises(InputError, match="corrected.*4 poses, one of each training photo"):
         data_again(load_config(tmp_path), {**load_scene(tmp_path), "corrected": [1.0]})
 
