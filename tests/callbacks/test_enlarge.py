@@ -84,18 +84,6 @@ def test_enlarge_without_larger_original_gives_no_scores(max_side, enlarge, tmp_
     assert f"3 times as large ({scores['width']}x{scores['height']}): no larger original" in told and "dB" not in told
 
 
-def test_enlarge_panel_shows_bicubic_field_and_truth(enlarge, tmp_path: Path):
-    truth = np.full((200, 100, 3), 90, np.uint8)
-    image = torch.full((100, 50, 3), 30, dtype=torch.uint8)
-    for at, count in ((lambda width, height: torch.from_numpy(truth), 3), (lambda width, height: None, 2)):
-        enlarge(PixelDataModule(Picture("p", "test", image, at)), 2)
-        panel = imageio.imread(tmp_path / "enlarged_panel.png")
-        assert panel.shape[1] == count * 100
-        shown = [panel[:200, 100 * i : 100 * (i + 1)] for i in range(count)]
-        assert (shown[0] == 30).all() and np.array_equal(shown[1], ramp(100, 200))
-        assert count == 2 or np.array_equal(shown[2], truth)
-
-
 @pytest.mark.parametrize("scale", [0.0, -2.0, math.nan])
 def test_enlarge_scale_not_above_zero_is_refused(scale: float):
     with pytest.raises(InputError, match="render.scale"):

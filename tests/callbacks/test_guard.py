@@ -10,11 +10,10 @@ import pytest
 import torch
 
 from nerf_lightning.callbacks import Budget, Guard
-from nerf_lightning.callbacks.guard import LOWER, MUCH_LOWER, started_anew
-from nerf_lightning.cameras import Bounds
+from nerf_lightning.callbacks.guard import LOWER, MUCH_LOWER
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Picture, PixelDataModule, save_npz
-from nerf_lightning.model import HashGridField, PictureField, SirenField
+from nerf_lightning.model import PictureField, SirenField
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.stability.methods import METHODS
 from nerf_lightning.stability.toys import MARBLE, toy
@@ -189,15 +188,6 @@ def test_guard_resumed_run_restores_resumed_weights(tmp_path: Path):
     run(Broken("nan loss", 5), guard, tmp_path, 60)
     (one,) = guard.recoveries
     assert one.step == 10 and "last good weights" in one.action
-
-
-def test_restart_hash_grid_starts_from_thin_fog():
-    field = HashGridField(Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])), levels=2, log2_entries=8, width=16)
-    first = field.density_net[-1].bias.detach()
-    assert float(first[0]) == field.START and (first[1:] != field.START).all()
-    first.fill_(3.0)
-    started_anew(field)
-    assert float(first[0]) == field.START and (first[1:].abs() < 1).all()
 
 
 @pytest.mark.parametrize(("optimizer", "lowered"), [(torch.optim.Adam, True), (torch.optim.SGD, False)])

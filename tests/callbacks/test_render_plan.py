@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from nerf_lightning.callbacks.render_plan import Need, RenderPlan, allot
+from nerf_lightning.callbacks.render_plan import RenderPlan, allot
 from nerf_lightning.cameras import Rays
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Views
@@ -48,23 +48,6 @@ class Told:
 )
 def test_allot_unused_share_goes_to_others(needs: dict, allowance: float, expected: dict):
     assert allot(needs, allowance) == pytest.approx(expected)
-
-
-def test_render_plan_shares_keep_minimum():
-    plan = RenderPlan()
-    assert plan.seconds_left({"final": Need(100)}, 10.0) is None, "nothing was rendered yet"
-    plan.note(1000, 1.0)
-    needs = {
-        "final": Need(30_000),
-        "orbit": Need(10_000, least=1000),
-        "curve": Need(5000, least=1000),
-        "snapshots": Need(7000, asked=True),
-    }
-    # Of 34 s two are taken beforehand: the rest is divided 30 : 1 : 1.
-    assert [plan.share(job, needs, 34.0) for job in needs] == pytest.approx([1.0, 0.2, 0.4, 1.0])
-    assert plan.seconds_left(needs, 34.0) == pytest.approx(30 + 2 + 2 + 7)
-    plan.score_seconds = 1e-3
-    assert plan.seconds_left({"final": Need(1000, scored=True)}, 34.0) == pytest.approx(2.0)
 
 
 def test_render_plan_pixel_seconds_follow_last_views(clock):

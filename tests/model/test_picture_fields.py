@@ -82,32 +82,6 @@ def test_hash_grid_2d_finest_level_has_vertex_at_pixel_centre(size: tuple[int, i
         assert moved.max() < 1e-3, "and no other pixel's"
 
 
-@pytest.mark.parametrize(
-    ("size", "features", "share"),
-    [((256, 256), 2, 0.5), ((97, 1400), 1, 1.0), ((40, 30), 2, 0.25), ((1, 1000), 1, 0.5)],
-)
-def test_hash_grid_2d_tables_hold_share_of_picture(size: tuple[int, int], features: int, share: float):
-    field = HashGrid2DField(size, features=features, share=share)
-    values = 2 * share * 3 * size[0] * size[1]
-    most = math.log2(max(field.sizes))
-    everything = features * sum(corners(r) for r in field.resolutions)
-    assert field.tables.numel() <= values / 2 and (
-        field.tables.numel() > values / 4 or field.tables.numel() == everything
-    )
-    for resolution, entries in zip(field.resolutions, field.sizes, strict=True):
-        assert entries == corners(resolution) or (entries == 2**most and entries < corners(resolution))
-    assert all(isinstance(entries, int) for entries in field.sizes)
-
-
-@pytest.mark.parametrize("size", [(256, 256), (360, 640)])
-def test_hash_grid_2d_cells_stay_nearly_square(size: tuple[int, int]):
-    field = HashGrid2DField(size)
-    longer = [max(resolution) for resolution in field.resolutions]
-    assert longer[0] == 16 and longer[-1] == max(size) - 1 and longer == sorted(set(longer))
-    for across, down in field.resolutions:
-        assert abs(across / (size[0] - 1) - down / (size[1] - 1)) * (min(size) - 1) <= 1
-
-
 @pytest.mark.parametrize(("size", "octaves"), [((1, 1), 1), ((64, 64), 6), ((256, 192), 8), ((60, 100), 7)])
 def test_picture_mlp_octaves_end_at_half_of_nyquist(size: tuple[int, int], octaves: int):
     field = PictureMLP(size, None, width=8, depth=2)

@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import normalize
 
 from nerf_lightning.model import Field, HashGridField, VoxelField
-from nerf_lightning.model.layers.pruning import vertices_in, widened
+from nerf_lightning.model.layers.pruning import vertices_in
 from tests.model.test_warm_start import BOX, hashgrid, mlp, tensorf, voxels
 
 FIELDS = pytest.mark.parametrize("make", [hashgrid, tensorf, voxels, mlp])
@@ -25,12 +25,6 @@ def test_vertices_in_reached_cells_are_their_corners(cells: int):
         for corner in torch.cartesian_prod(*[torch.arange(2)] * 3):
             expected[tuple((low + corner).T)] = True
     assert torch.equal(vertices_in(reached, cells), expected)
-
-
-def test_widened_includes_all_neighbours():
-    mask = torch.zeros(5, 5, 5, dtype=torch.bool)
-    mask[2, 2, 0] = True
-    assert int(widened(mask).sum()) == 18
 
 
 def some_cells() -> torch.Tensor:

@@ -17,7 +17,6 @@ from nerf_lightning.refine.corrections import (
     GAMMA,
     GROWTH,
     LAST,
-    RIPENED,
     START,
     TWICE,
     WORTHWHILE,
@@ -150,13 +149,3 @@ def test_misfits_far_worse_photos_stand_out():
     assert misfits([30.0, 31.0, 29.0, 30.5, 12.0, 30.2, 14.0]) == [4, 6]
     assert misfits([30.0, 20.0, 25.0, 15.0, 28.0]) == []
     assert misfits([float("nan"), 30.0, 30.1, 29.9, 3.0]) == [4]
-
-
-def test_ripeness_field_grows_later_during_pose_correction(views: Views):
-    corrections = Corrections(views.cameras, BOX, auto=True)
-    assert corrections.ripeness(0.2, grown_after=0.3) == 0.2
-    corrections.begin(0.2, "poses")
-    assert corrections.ripeness(0.1, grown_after=0.3) == 0.1
-    assert corrections.ripeness(0.3, grown_after=0.3) == pytest.approx(0.2 + 0.1 * 0.1 / RIPENED)
-    assert corrections.ripeness(0.2 + RIPENED, grown_after=0.3) == pytest.approx(0.3)
-    assert corrections.ripeness(0.25, grown_after=0.0) == 0.25  # it has its size from the start

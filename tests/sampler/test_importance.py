@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Generator, Tensor
+from torch import Generator
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import inverse_cdf
-from nerf_lightning.sampler import ImportanceSampler, UniformSampler
+from nerf_lightning.sampler import ImportanceSampler
 
 
 @pytest.mark.parametrize("kind", ["random", "one", "none", "sparse"])
@@ -52,17 +52,6 @@ def test_importance_sampler_samples_crowd_where_density_is(generator: int | None
     assert ((x.abs() < 0.25).float().mean() > 0.65) and ((x.abs() < 0.25).sum() > 4 * 64)
 
 
-def test_importance_sampler_ignores_space_behind_wall():
-    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-
-    def walls(x: Tensor) -> Tensor:
-        return 500.0 * ((x[:, 0] + 0.5).abs() < 0.1) + 500.0 * ((x[:, 0] - 0.5).abs() < 0.1)
-
-    x = ImportanceSampler(box, 40, 80)(along_x(1), walls).t - 3
-    assert ((x + 0.5).abs() < 0.15).sum() > 75
-    assert ((x - 0.5).abs() < 0.15).sum() < 12
-
-
 DENSITIES = {
     "nothing": lambda x: torch.zeros(len(x)),
     "ball": ball(0.4, 5.0),
@@ -97,16 +86,3 @@ def test_importance_sampler_coarse_and_fine_tile_ray(density, unbounded, trainin
         torch.testing.assert_close(start[part][1:], end[part][:-1], rtol=1e-5, atol=1e-5)
         torch.testing.assert_close(start[part][0], near[r], rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(end[part][-1], far[r], rtol=1e-4, atol=1e-4)
-
-
-def test_importance_sampler_first_pass_is_uniform_without_gradient(box: Bounds, rays: Rays):
-    asked = []
-    level = torch.tensor(2.0, requires_grad=True)
-
-    def density(x: Tensor) -> Tensor:
-        asked.append(x)
-        return level.expand(len(x))
-
-    samples = ImportanceSampler(box, 12, 20)(rays, density)
-    assert len(asked) == 1 and not samples.t.requires_grad
-    torch.testing.assert_close(asked[0], UniformSampler(box, 12)(rays, density).positions(rays))

@@ -96,15 +96,6 @@ def test_occupancy_updates_find_content():
     assert not sampler.occupied[centre.norm(dim=-1) > 0.5 + corner].any()
 
 
-def test_occupancy_speck_in_cell_is_found():
-    """A speck a quarter of a cell in each direction: random places meet it sooner or later."""
-    speck = torch.tensor([0.13, 0.13, 0.13])
-    sampler = OccupancySampler(CUBE, samples=16, resolution=2, decay=1.0, warmup=10**6)
-    for step in range(0, 16 * 400, 16):
-        sampler.update(step, lambda x: 1000.0 * ((x - speck).abs() < 0.125).all(-1).float(), seeded(step))
-    assert sampler.occupied.tolist() == [False] * 7 + [True]
-
-
 @pytest.mark.parametrize(("share", "kept"), [(0.5, False), (2.0, True)])
 def test_occupancy_threshold_is_optical_thickness_of_step(share: float, kept: bool):
     sampler = OccupancySampler(CUBE, samples=100, resolution=4, threshold=0.02)
