@@ -22,10 +22,6 @@ MAKERS: dict[str, Callable[[tuple[int, int]], PictureField]] = {
 FIELDS = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 
 
-def corners(resolution: tuple[int, int]) -> int:
-    return (resolution[0] + 1) * (resolution[1] + 1)
-
-
 @FIELDS
 @SIZES
 def test_picture_field_any_size_learns_with_all_parameters(make, size: tuple[int, int]):
