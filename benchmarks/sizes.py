@@ -22,7 +22,7 @@ from nerf_lightning.rightsize.ladder import read_ladder
 from nerf_lightning.rightsize.report import chart
 from nerf_lightning.rightsize.search import Found, Full, search, train_in_full
 from nerf_lightning.stability.toys import Ball, Block, Body, toy
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 SIZE, VIEWS, HELD_OUT = 200, 100, 10
 """As of bricks and Lego, so that scenes differ in what they show alone."""
@@ -104,7 +104,7 @@ def few(whole: DictConfig, found: Found, overrides: list[str], seconds: float, o
     data = build_data(whole)
     assert isinstance(data, RayDataModule)  # scenes alone are measured
     folder = output / "sizes" / f"{data.scene.name}_{FEW}"
-    kept = torch.tensor(evenly(len(data.scene.train), FEW))
+    kept = torch.tensor(subsample(len(data.scene.train), FEW))
     views = data.scene.train
     path = output / "scenes" / f"{data.scene.name}_{FEW}.npz"
     save_npz(replace(data.scene, train=views[torch.as_tensor(kept)]), path)

@@ -25,8 +25,8 @@ from nerf_lightning.dataset.resize import resize_views
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import prepare
 from nerf_lightning.utils.device import CPU, synchronize
+from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.machine import cores
-from nerf_lightning.utils.quiet import quiet
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 WARMUP, PERIODS = 320, 6
@@ -44,7 +44,7 @@ def build(overrides: list[str], device: torch.device = CPU) -> tuple[DictConfig,
     """Configuration, data and system of a 3D run, the process prepared as for training on a device, the system there."""
     with tempfile.TemporaryDirectory() as folder:
         cfg = composed(overrides, Path(folder))
-        quiet()
+        silence_lightning()
         prepare(cfg)
         data = build_data(cfg)
         data.enlarge(limits_of(cfg, device).batch)

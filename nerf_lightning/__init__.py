@@ -27,16 +27,9 @@ Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S sa
 to world; pixel centres lie at +0.5. Lengths are in the scene's own unit, colours are sRGB in [0, 1].
 """
 
-import sys
 from typing import TYPE_CHECKING, Any
 
-from nerf_lightning.utils.torchvision_guard import guard_torchvision
-
-if sys.argv[:1] == ["-m"] and any(word.partition(".")[0] == __name__ for word in sys.orig_argv):
-    # A command line looks for its module: from here on, through all imports, Ctrl-C ends it in a line.
-    from nerf_lightning.utils.ending import end_at_once
-
-    end_at_once()
+from nerf_lightning.utils.libraries import guard_torchvision
 
 guard_torchvision()  # before anything imports Lightning
 

@@ -1,16 +1,18 @@
 """The Python interface: scenes, trainings and runs, with the command line's defaults."""
 
+import functools
 import logging
 import math
 import os
 import random
+import signal
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -19,13 +21,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.config.cli import given_of
+from nerf_lightning.cli.evaluate import evaluate
+from nerf_lightning.cli.export import (
+    export_compact,
+    export_html,
+    export_mesh,
+    export_points,
+    export_transforms,
+    export_voxels,
+)
+from nerf_lightning.cli.view import view
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.literal import override_of
 from nerf_lightning.dataset import Reading, Scene, open_scene
 from nerf_lightning.dataset.size import AUTO, auto_resize, parse_resize
-from nerf_lightning.export.options import ExportOptions
-from nerf_lightning.export.verb import export
 from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.runs.open import open_scene_run
@@ -33,10 +42,23 @@ from nerf_lightning.runs.owner import Taken, own_folder
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train as train_configured
 from nerf_lightning.utils.device import the_device
-from nerf_lightning.utils.ending import listening
 from nerf_lightning.utils.files import user_path
-from nerf_lightning.utils.options import check_options
-from nerf_lightning.utils.quiet import NOISY
+from nerf_lightning.utils.libraries import NOISY
+from nerf_lightning.utils.signals import Interrupted, handle_signals
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _as_method(function: Callable[P, T]) -> Callable[P, T]:
+    """A command as a method of what has the run's path, with the same options; it leaves the process as it was."""
+
+    @functools.wraps(function)
+    def method(self: "Run | Exports", *args: Any, **kwargs: Any) -> T:
+        with undisturbed():
+            return function(self.path, *args, **kwargs)  # type: ignore[arg-type]
+
+    return method  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
@@ -74,24 +96,28 @@ class Run:
         rgb, opacity, depth = (x.cpu() for x in (found.rgb, found.opacity, found.depth))
         return View(rgb.clamp(0, 1).view(*shape, 3), opacity.view(shape), depth.view(shape))
 
-    def export(self, path: str | Path, format: str = "compact", options: Sequence[str] = ()) -> Path:
-        """Writes the run as one file.
+    evaluate = _as_method(evaluate)
+    render_video = _as_method(render)
+    view = _as_method(view)
 
-        Args:
-            path: of the file.
-            format, options: as `python -m nerf_lightning.export` takes them, such as "glb" and ["resolution=128"].
+    @property
+    def export(self) -> "Exports":
+        """Writes the run as a file: `run.export.mesh(output="lego.glb")`, as `nerf_lightning export mesh` does."""
+        return Exports(self.path)
 
-        Raises:
-            InputError: as the verb does.
-        """
-        output = user_path(path)
-        paths = [override_of("run", self.path), override_of("output", output)]
-        given = [*paths, f"format={format}", f"device={self.system.device.type}"]
-        with undisturbed():
-            keys = given_of(composed([*given, *options], self.path, "export"))
-            check_options("", ExportOptions, keys)
-            export(ExportOptions(**keys))
-        return output
+
+@dataclass(frozen=True)
+class Exports:
+    """The sub-commands of `nerf_lightning export`, for one run."""
+
+    path: Path
+
+    compact = _as_method(export_compact)
+    html = _as_method(export_html)
+    mesh = _as_method(export_mesh)
+    points = _as_method(export_points)
+    transforms = _as_method(export_transforms)
+    voxels = _as_method(export_voxels)
 
 
 def load_scene(path: str | Path, resize: int | str | None = AUTO) -> Scene:
@@ -135,7 +161,7 @@ def train(
     folder: str | Path | None = None,
     options: Sequence[str] = (),
 ) -> Run:
-    """Trains as `python -m nerf_lightning dataset=photos dataset.path=SCENE` does, with the same defaults and results.
+    """Trains as `nerf_lightning train dataset=photos dataset.path=SCENE` does, with the same defaults and results.
 
     Args:
         scene: from `load_scene`, or its path, whose photos are then read at the size that suits the budget.
@@ -168,13 +194,16 @@ def train(
     ]
     if recipe is not None:
         given.append(f"recipe={recipe}")
-    with undisturbed(), listening():
-        cfg = composed([*given, *options], place)
-        try:
+    try:
+        with undisturbed(), handle_signals():
+            cfg = composed([*given, *options], place)
             with own_folder(place, cfg.overwrite, renamed=folder is None) as place:
                 train_configured(cfg, folder=place, scene=scene)
-        except Taken as error:
-            raise FileExistsError(f"{error}; load_run opens it, another folder= keeps both") from error
+    except Taken as error:
+        raise FileExistsError(f"{error}; load_run opens it, another folder= keeps both") from error
+    except Interrupted as interrupted:
+        signal.raise_signal(interrupted.signum)  # to the caller's own handlers
+        raise
     return load_run(place, device)
 
 

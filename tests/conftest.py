@@ -59,7 +59,6 @@ from benchmarks.synthetic.photos import Flaws, Truth, write_capture
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.kernels.cpu import apart
-from nerf_lightning.utils.ending import listen
 from tests.helpers.fake_device import device, without_doubles  # noqa: F401  (fixtures)
 from tests.helpers.shared_fixtures import make_once, shared_folder
 
@@ -122,13 +121,8 @@ def same_random_numbers() -> None:
 
 
 @pytest.fixture(autouse=True)
-def signals_as_they_were() -> Iterator[None]:
-    """Command lines take them for the rest of their process, also those that fixtures of a whole module run; one that came is
-    forgotten, as it would end the next training."""
-    for number, handler in HANDLERS.items():
-        signal.signal(number, handler)
-    yield
-    listen()
+def default_signal_handlers() -> None:
+    """Each test starts with Python's own handlers."""
     for number, handler in HANDLERS.items():
         signal.signal(number, handler)
 

@@ -20,7 +20,7 @@ from nerf_lightning.runs.open import open_scene_run
 from nerf_lightning.stability.toys import PILE, toy
 from nerf_lightning.system import System
 from nerf_lightning.training.train import train
-from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.view.painter import Painter, Wish
 from tests.helpers.device_runs import ON_IT, SCENES, options
 from tests.helpers.fake_device import NAME, Module
@@ -30,7 +30,7 @@ from tests.helpers.train_models import MODELS
 
 @pytest.fixture(autouse=True)
 def without_lightnings_hints() -> None:
-    quiet()
+    silence_lightning()
 
 
 def trained(name: str, folder: Path, *more: str) -> dict:

@@ -19,7 +19,7 @@ from commands import BARE
 from nerf_lightning.cli.app import main
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.export.photos import write_photos
-from nerf_lightning.utils.ending import Interrupted
+from nerf_lightning.utils.signals import Interrupted
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = sorted(DOCS.glob("*.md"))

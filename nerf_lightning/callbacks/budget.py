@@ -18,15 +18,12 @@ from nerf_lightning.dataset.subset import thin
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU, synchronize
-from nerf_lightning.utils.ending import interruptible
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.machine import Load, work_clocks
-from nerf_lightning.utils.untrusted import count, number
+from nerf_lightning.utils.signals import defer_signals
+from nerf_lightning.utils.text import subsample
 
 LOOK_AT, LOOK_PIXELS = 3, 1 << 16
 """Held-out views rendered to look for a plateau, and about the most pixels of each."""
-AT_ROW = "stopping after this row"
-"""What a signal is answered with while a view is rendered."""
 RECENT, UNDISTURBED = 20, 0.1
 """With `alone`: steps that are looked back on, and the share of them that other work never disturbs: each time it has a core in
 between, it leaves this process's data out of the caches too."""
@@ -156,7 +153,7 @@ class Budget(L.Callback):
     def rendering(self, trainer: L.Trainer, subject: str) -> Iterator[None]:
         """Stops the clock for a block that renders, which a signal ends: it must change nothing that a checkpoint keeps."""
         alone = trainer.world_size == 1  # several processes leave together, at the end of a step
-        with self.paused(), self.plan.rendering(subject), interruptible(AT_ROW) if alone else nullcontext():
+        with self.paused(), self.plan.rendering(subject), defer_signals(False) if alone else nullcontext():
             yield
 
     def _start(self) -> None:
@@ -201,7 +198,7 @@ class Budget(L.Callback):
         if not plateau.due(spent):
             return
         data = data_of(trainer)
-        chosen = evenly(data.held_out_views, LOOK_AT)
+        chosen = subsample(data.held_out_views, LOOK_AT)
         some = thin(max(map(data.pixels_held_out, chosen)), LOOK_PIXELS)
         with self.rendering(trainer, "views to look for a plateau"):
             quality = fmean(view.psnr for view in system.evaluate_held_out(data, chosen, some))
@@ -234,12 +231,7 @@ class Budget(L.Callback):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._before = number(state_dict["seconds"])
-        start, reached, slope = map(number, state_dict["line"])
-        self._line, self.stopped = (start, reached, slope), None
-        if state_dict["stopped"] is not None:
-            stopped = dict(state_dict["stopped"])
-            seconds, rest = number(stopped["seconds"]), number(stopped["rest_db"])
-            self.stopped = {"seconds": seconds, "step": count(stopped["step"]), "rest_db": rest}
+        start, reached, slope = state_dict["line"]
+        self._before, self._line, self.stopped = state_dict["seconds"], (start, reached, slope), state_dict["stopped"]
         if self.plateau is not None and state_dict["plateau"] is not None:
-            self.plateau.load(dict(state_dict["plateau"]))
+            self.plateau.load(state_dict["plateau"])

@@ -16,9 +16,9 @@ from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.system import System
-from nerf_lightning.utils.ending import Interrupted, asked, held, interrupt, listen_again
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic, link_file
+from nerf_lightning.utils.signals import Interrupted, defer_signals, install_handlers, received_signal
+from nerf_lightning.utils.text import subsample
 
 COPIES = 3
 """Of all parameters in a checkpoint: themselves and Adam's two means. Other optimisers keep less."""
@@ -26,11 +26,11 @@ NAMES = ("last.ckpt", "best.ckpt")
 
 
 class InPlace(TorchCheckpointIO):
-    """Writes where it is told. Lightning writes into memory, then into the system's temporary folder, which may be full or stay
-    full after an interruption."""
+    """Writes directly to the path. Lightning writes into memory, then into the system's temporary folder, which may be full."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
-        torch.save(checkpoint, path)
+        with open(path, "wb") as file:  # whose errors say that a disk is full, unlike those of PyTorch's own writer
+            torch.save(checkpoint, file)
 
 
 def check_disk(folder: Path, system: System) -> None:
@@ -96,16 +96,16 @@ class Checkpoints(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._saved = time.monotonic()
-        listen_again()  # Lightning has taken SIGTERM, and would end with 0
-        self._steps.enter_context(held("stopping after this step"))
+        install_handlers()
+        self._steps.enter_context(defer_signals())
         self._stepping = True
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        due, number = agreed(trainer, (time.monotonic() - self._saved >= self.every_seconds, asked()))
-        if number is not None:
-            interrupt(number)
+        due, signum = agreed(trainer, (time.monotonic() - self._saved >= self.every_seconds, received_signal()))
+        if signum is not None:
+            raise Interrupted(signum)
         if due:
             self.save(trainer, "last.ckpt")
             self._saved = time.monotonic()
@@ -146,7 +146,7 @@ class Checkpoints(L.Callback):
         folder = Path(trainer.default_root_dir) / self.folder
         last = folder / "last.ckpt"
         held_out = attached(trainer, HeldOut)
-        views = evenly(len(self._tested), held_out.views if held_out is not None else None)
+        views = subsample(len(self._tested), held_out.views if held_out is not None else None)
         final = fmean(self._tested[view] for view in views)
         if last.exists() and (self.best is None or final > self.best):
             self.best = final
@@ -156,5 +156,4 @@ class Checkpoints(L.Callback):
         return {"best": self.best}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        best = state_dict["best"]
-        self.best = None if best is None else float(best)
+        self.best = state_dict["best"]

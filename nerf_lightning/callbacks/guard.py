@@ -18,7 +18,6 @@ from nerf_lightning.model import SoftenableReLU
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.utils.options import AtLeast, Count
 from nerf_lightning.utils.seeding import Stream, step_generator
-from nerf_lightning.utils.untrusted import count, number
 
 LOWER, MUCH_LOWER = 0.3, 0.2
 """Factors on the learning rate when it is the cause: after something was learned, and when nothing was."""
@@ -164,12 +163,9 @@ class Guard(L.Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.watch.load(state_dict)
-        recoveries = (Recovery(**one) for one in state_dict["recoveries"])
-        self.recoveries = [Recovery(count(r.step), number(r.seconds), str(r.cause), str(r.action)) for r in recoveries]
-        self.rate, self.began_at = number(state_dict["rate"]), number(state_dict["began_at"])
-        self.softened = bool(state_dict["softened"])
-        self._given_up = bool(state_dict["given_up"])
-        self._finite = bool(state_dict.get("finite", True))  # older checkpoints lack it
+        self.recoveries = [Recovery(**one) for one in state_dict["recoveries"]]
+        self.rate, self.began_at, self.softened = (state_dict[key] for key in ("rate", "began_at", "softened"))
+        self._given_up, self._finite = state_dict["given_up"], state_dict["finite"]
 
     # Actions
 

@@ -13,9 +13,8 @@ from nerf_lightning.callbacks.rendering import share_of
 from nerf_lightning.dataset.subset import STRIP_ROWS, WHOLE, PixelSubset, thin
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
-from nerf_lightning.utils.ending import leave_if_asked
-from nerf_lightning.utils.evenly import evenly
-from nerf_lightning.utils.untrusted import count, number
+from nerf_lightning.utils.signals import raise_if_signalled
+from nerf_lightning.utils.text import subsample
 
 LARGE = 1 << 21
 """Pixels of a view beyond which SSIM, which takes some ten times as long as rendering, is left to the test."""
@@ -59,7 +58,7 @@ class HeldOut(Renders):
     def needs(self, trainer: L.Trainer) -> dict[str, Need]:
         data, training = data_of(trainer), Budget.of(trainer).progress(trainer.global_step) < 1
         points = len(self.at) - len(self.curve) if training else 0
-        chosen = evenly(data.held_out_views, self.views)
+        chosen = subsample(data.held_out_views, self.views)
         measured = points * sum(map(data.pixels_held_out, chosen))
         tested = [data.pixels_held_out(view) for view in range(self._tested, data.held_out_views)]
         strips = sum(STRIP_ROWS * math.sqrt(pixels) for pixels in tested)
@@ -95,7 +94,7 @@ class HeldOut(Renders):
         if due <= len(self.curve) or progress >= 1.0:
             return
         data, budget = data_of(trainer), Budget.of(trainer)
-        chosen = evenly(data.held_out_views, self.views)
+        chosen = subsample(data.held_out_views, self.views)
         pixels = fmean(map(data.pixels_held_out, chosen))
         subset = thin(pixels, max(MIN_PIXELS, agreed(trainer, share_of(trainer, pl_module, "curve")) * pixels))
         views: list[dict[str, float]] = []  # not their pictures, which would be held together
@@ -107,7 +106,7 @@ class HeldOut(Renders):
                 if trainer.logger is not None and subset == WHOLE and result.pixels <= LARGE:
                     views[-1]["ssim"] = result.ssim
             if trainer.world_size == 1:  # several processes leave together, at the end of a step
-                leave_if_asked()
+                raise_if_signalled()
         while len(self.curve) < due:  # one step may pass several marks: one measurement counts for all
             self.record(trainer, views)
 
@@ -140,4 +139,4 @@ class HeldOut(Renders):
         return {"curve": self.curve}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.curve = [[number(spent), count(step), float(quality)] for spent, step, quality in state_dict["curve"]]
+        self.curve = [list(point) for point in state_dict["curve"]]

@@ -17,9 +17,9 @@ from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.panels import panel, to_bytes, write_animation
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.options import FramesPerSecond
+from nerf_lightning.utils.text import subsample
 
 MAX_FRAMES, MIN_FRAMES = 60, 12
 MAX_SIDE = 800
@@ -55,7 +55,7 @@ class Orbit(Renders):
     def needs(self, trainer: L.Trainer) -> dict[str, Need]:
         cameras = self.cameras(trainer)
         count = self.count(cameras)
-        pixels = int(cameras.sizes[evenly(len(cameras), count)][self._drawn :].prod(1).sum())
+        pixels = int(cameras.sizes[subsample(len(cameras), count)][self._drawn :].prod(1).sum())
         least = min(1.0, MIN_FRAMES / max(count, 1)) * MIN_SCALE**2 * pixels
         return {"orbit": Need(pixels, least, asked=self.frames is not None)}
 
@@ -91,7 +91,7 @@ class Orbit(Renders):
         self, trainer: L.Trainer, system: NeRF3D, cameras: Cameras, count: int
     ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
         plan, caption = Budget.of(trainer).plan, f"{data_of(trainer).scene.name}, step {trainer.global_step}"
-        for number, view in enumerate(evenly(len(cameras), count), 1):
+        for number, view in enumerate(subsample(len(cameras), count), 1):
             before = plan.spent
             with plan.rendering(f"orbit, frame {number} of {count}"):
                 rgb = system.render(cameras.view_rays(view)).rgb

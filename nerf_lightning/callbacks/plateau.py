@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from nerf_lightning.utils.untrusted import count, number
-
 SPACING = 1.15
 """Each measurement comes when this factor more has been spent than at the one before."""
 FIRST = 0.01
@@ -67,7 +65,7 @@ class Plateau:
 
     def load(self, state: dict[str, Any]) -> None:
         """Restores what `state` returned."""
-        self.points = [(number(spent), number(quality)) for spent, quality in state["points"]]
-        self.flat = count(state["flat"])
+        self.points = [(spent, quality) for spent, quality in state["points"]]
+        self.flat = state["flat"]
         if any(spent <= 0 for spent, _ in self.points):
             raise ValueError("a plateau's measurement before training")

@@ -35,10 +35,10 @@ from nerf_lightning.system import (
     misfits,
     psnr_of_photos,
 )
-from nerf_lightning.utils.ending import Interrupted
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import known, write_json
 from nerf_lightning.utils.machine import describe_machine
+from nerf_lightning.utils.signals import Interrupted
+from nerf_lightning.utils.text import subsample
 
 try:
     import resource
@@ -113,7 +113,7 @@ class Results(Renders):
     def evaluate_test(self, trainer: L.Trainer, system: System, views: Views) -> None:
         """Renders the test split."""
         share, plan = share_of(trainer, system, "test"), Budget.of(trainer).plan
-        chosen = evenly(len(views), max(1, int(share * len(views))))
+        chosen = subsample(len(views), max(1, int(share * len(views))))
         found = []
         for number, view in enumerate(chosen, 1):
             with plan.rendering(f"test view {number} of {len(chosen)}"):
@@ -170,7 +170,7 @@ class Results(Renders):
         if isinstance(exception, Interrupted | KeyboardInterrupt):
             if len(self.views) < data_of(trainer).held_out_views:
                 self.views = []  # the mean of some views is another figure
-            self.write(trainer, pl_module, "interrupted", f"at step {trainer.global_step}; resume= goes on")
+            self.write(trainer, pl_module, "interrupted", f"at step {trainer.global_step}; resume= continues")
         elif trainer.ckpt_path is None or Budget.of(trainer).began:  # else there was no state to go on from
             with suppress(NoRoom):  # on a full disk what happened first is to be told
                 self.write(trainer, pl_module, "failed", " ".join(f"{type(exception).__name__}: {exception}".split()))

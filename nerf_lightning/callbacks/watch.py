@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from nerf_lightning.utils.untrusted import count, number
-
 MEMORY = 0.96
 """Decay of the running mean of the loss: it looks back about 25 steps."""
 AS_PLAIN = 0.85
@@ -65,9 +63,9 @@ class Watch:
 
     def load(self, state: dict[str, Any]) -> None:
         """Restores what `state` returned."""
-        self.began, self.risen, self.dead = (count(state[key]) for key in ("began", "risen", "dead"))
-        self.level = None if state["level"] is None else number(state["level"])
-        self.earlier, self.lowest = [number(level) for level in state["earlier"]], float(state["lowest"])
+        self.began, self.risen, self.dead = (state[key] for key in ("began", "risen", "dead"))
+        self.level = state["level"]
+        self.earlier, self.lowest = list(state["earlier"]), state["lowest"]
 
     def due(self, step: int) -> bool:
         """Whether to look at this step."""

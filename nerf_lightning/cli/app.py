@@ -18,9 +18,9 @@ from nerf_lightning.cli.render import render
 from nerf_lightning.cli.train import describe_groups, is_override, train
 from nerf_lightning.cli.view import view
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leave, listen
 from nerf_lightning.utils.files import full_disk, no_room
-from nerf_lightning.utils.waiting import wait_briefly
+from nerf_lightning.utils.libraries import shorten_openmp_waits
+from nerf_lightning.utils.signals import exit_on_signal
 
 TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
 """Environment variable: set to 1, errors come with the full traceback."""
@@ -54,23 +54,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words and is_override(words[0]):
         words.insert(0, "train")
-    wait_briefly()
-    listen()
+    shorten_openmp_waits()
     try:
-        app(words)
+        with exit_on_signal():
+            app(words)
     except CycloptsError as error:
         fail(error)
     except Exception as error:
         if (known := find_cause(error)) is None:
             raise
         fail(known)
-    except BaseException as error:  # whatever a signal has become on its way
-        number = asked()
-        if number is None:
-            raise
-        leave(number, error.go_on if isinstance(error, Interrupted) else AGAIN)
-    finally:
-        be_deaf()
 
 
 def find_cause(error: Exception) -> InputError | None:

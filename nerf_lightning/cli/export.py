@@ -213,7 +213,7 @@ def _write_shape(
     """Writes a mesh, points or voxels."""
     from nerf_lightning.export.mesh import SUFFIXES, export_shape
     from nerf_lightning.utils.device import the_device
-    from nerf_lightning.utils.extras import require
+    from nerf_lightning.utils.libraries import require
 
     where, source = the_device(device), find_run(run)
     suffixes = SUFFIXES[kind]

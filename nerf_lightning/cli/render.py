@@ -1,7 +1,7 @@
 """nerf_lightning render."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from nerf_lightning.cli.command import Device, Output, Photos, RunPath, command
 from nerf_lightning.errors import InputError
@@ -72,7 +72,7 @@ def render(
     target = beside(source) / f"render_{Path(path).stem}.webp" if output is None else output_path(output)
     check_output(target, background == "transparent")
     found = open_scene_run(source, where)
-    scene = None
+    scene: Any = None
     if path in SPLITS:
         scene = data_again(found.cfg, found.scene, None if photos is None else str(photos)).scene
     route = build_path(path, frames, found.orbit, scene, found.to_source, path_frame)

@@ -81,8 +81,9 @@ def run_hydra(overrides: Sequence[str]) -> None:
     def job(cfg: "DictConfig") -> float | None:
         try:
             runtime: Any = HydraConfig.get().runtime
+            plain: Any = OmegaConf.to_container(runtime)
             with read_write(runtime):  # Hydra does not escape the path that it puts there
-                runtime.output_dir = escape(OmegaConf.to_container(runtime)["output_dir"])
+                runtime.output_dir = escape(plain["output_dir"])
             return train_job(cfg)
         except (InputError, OmegaConfBaseException) as error:
             remove_empty(Path(HydraConfig.get().runtime.output_dir))
@@ -118,7 +119,7 @@ def train_job(cfg: "DictConfig") -> float | None:
     from hydra.types import RunMode
 
     from nerf_lightning.config.options import check_run_options
-    from nerf_lightning.utils.ending import Interrupted
+    from nerf_lightning.utils.signals import Interrupted
 
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         from nerf_lightning.training.sweep import job
@@ -133,7 +134,7 @@ def train_job(cfg: "DictConfig") -> float | None:
         folder = Path(HydraConfig.get().runtime.output_dir)
         if (folder / "checkpoints" / "last.ckpt").exists():
             argument = shlex.quote(f"resume={os.path.relpath(folder)}")
-            interrupted.go_on = f"continue with: nerf_lightning train {argument}"
+            interrupted.hint = f"continue with: nerf_lightning train {argument}"
         raise
 
 
@@ -159,7 +160,7 @@ def _find_experiments(arguments: Sequence[str]) -> list[str]:
         InputError: where such a file is no YAML.
     """
     from nerf_lightning.config.literal import override_of
-    from nerf_lightning.utils.untrusted import read_yaml
+    from nerf_lightning.utils.parsing import read_yaml
 
     rewritten = []
     for argument in arguments:

@@ -9,14 +9,20 @@ from nerf_lightning.cli.command import Device, command
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.find import OUTPUTS, find_run
 from nerf_lightning.utils.options import AtLeast, AtMost, Count, Port
+from nerf_lightning.utils.signals import Interrupted
 
 if TYPE_CHECKING:
     from nerf_lightning.view.page import Page
 
 
+RunOrScene = Annotated[
+    Path | None, Parameter(help="A run, a folder of runs for its newest, or a scene; default: the latest run.")
+]
+
+
 @command
 def view(
-    path: Annotated[Path | None, Parameter(help="A run, a folder of runs for its newest, or a scene; default: the latest run.")] = None,
+    path: RunOrScene = None,
     /,
     *,
     resize: Count | Literal["auto"] | None = "auto",
@@ -52,7 +58,7 @@ def view(
     try:
         print(f"{announce(page.name, host, port, page.port)}; Ctrl-C ends it", flush=True)
         page.run()
-    except KeyboardInterrupt:
+    except Interrupted:
         pass
     finally:
         page.stop()

@@ -31,7 +31,6 @@ from nerf_lightning.sampler import Sampler
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.utils.device import CPU, the_device
 from nerf_lightning.utils.files import output_path
-from nerf_lightning.utils.memory import Frugal
 from nerf_lightning.utils.options import check_options
 
 KNOWN = ("cpu", "cuda", "mps")
@@ -140,8 +139,7 @@ def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> A
         name = getattr(found, "__name__", "nothing")
         advice = "model=hashgrid or model=mlp" if kind is Field else "model=hashgrid2d or model=picture_mlp"
         raise InputError("config", "model", name, f"a field of {dimensions} for this dataset", f"choose {advice}")
-    with Frugal("config", "model"):
-        return make(cfg, "model", kind, **extra)
+    return make(cfg, "model", kind, **extra)
 
 
 def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) -> System:
@@ -157,8 +155,7 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
         return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
     bounds = frame.bounds
     field = build_field(cfg, Field, "three coordinates", bounds=bounds)
-    with Frugal("config", "sampler"):
-        sampler = make(cfg, "sampler", Sampler, bounds=bounds)
+    sampler = make(cfg, "sampler", Sampler, bounds=bounds)
     seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
     renderer = make(cfg, "renderer", VolumeRenderer, scene_background=frame.background, **seen)
     corrections = None

@@ -84,12 +84,9 @@ def check_run_options(cfg: DictConfig, choices: Mapping[str, str | None]) -> Non
         for group in OPTIONAL_GROUPS:
             if choices.get(group) == NONE and group != "recipe":
                 cfg[group] = None
-    text = str(OmegaConf.to_container(cfg))
+    text, plain = str(OmegaConf.to_container(cfg)), OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(plain, dict)  # of a DictConfig
     used = {str(key) for key in cfg if re.search(rf"\$\{{[^}}]*\b{re.escape(str(key))}\b", text)}
     known = {field.name for field in fields(RunOptions)}
-    given = {
-        key: value
-        for key, value in OmegaConf.to_container(cfg, resolve=True).items()
-        if key in known or key not in used
-    }
+    given = {str(key): value for key, value in plain.items() if key in known or key not in used}
     check_options("", RunOptions, given)

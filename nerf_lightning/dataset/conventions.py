@@ -13,8 +13,7 @@ from nerf_lightning.dataset.evidence import MAX_TRAIN_PHOTOS, MAX_VAL_PHOTOS, fi
 from nerf_lightning.dataset.hypotheses import ZOOMS, Hypothesis, Matches, convention_hypotheses, explained
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Runs, Views
-from nerf_lightning.utils.evenly import evenly
-from nerf_lightning.utils.listing import first_few
+from nerf_lightning.utils.text import join_truncated, subsample
 
 MIN_PAIRS, MIN_MATCHES = 4, 60
 """That say anything."""
@@ -75,7 +74,7 @@ def judge_cameras(scene: Scene) -> Verdict:
     """
     if has_panoramas(scene.train.cameras):
         return Verdict()
-    train, val = evenly(len(scene.train), MAX_TRAIN_PHOTOS), evenly(len(scene.val), MAX_VAL_PHOTOS)
+    train, val = subsample(len(scene.train), MAX_TRAIN_PHOTOS), subsample(len(scene.val), MAX_VAL_PHOTOS)
     views = join_views(scene.train[torch.tensor(train)], scene.val[torch.tensor(val, dtype=torch.long)])
     c2w = in_other_frame(torch.cat([scene.train.cameras.c2w, scene.val.cameras.c2w]), scene.to_source).numpy()
     kept = np.array([*train, *(len(scene.train) + i for i in val)])
@@ -106,7 +105,7 @@ def judge_cameras(scene: Scene) -> Verdict:
     elif (finding := wrong_focal(matches, c2w[kept], zoomed, free)) is not None:
         return Verdict((finding,))
     if given >= REFUTED and (lost := misplaced(matches, c2w[kept], HELD_OUT * given)):
-        named = first_few([scene.train.name(train[view]) for view in lost], MAX_NAMES)
+        named = join_truncated([scene.train.name(train[view]) for view in lost], MAX_NAMES)
         found = f"{len(lost)} training photos whose poses do not fit the others: {named}"
         return Verdict((Finding(found, "", False, inexact=True),), fits=True)
     tested = [pair for pair in pairs if max(pair.first, pair.second) >= len(train)]

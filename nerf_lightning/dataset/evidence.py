@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 MAX_TRAIN_PHOTOS, MAX_VAL_PHOTOS = 48, 8
 """Photos that are matched, evenly chosen."""
@@ -142,7 +142,7 @@ def find_pairs(views: Views) -> list[Pair]:
         candidates |= {(min(view, int(other)), max(view, int(other))) for other in (*by_pose[view], *alike)}
     pairs = []
     every = sorted(candidate for candidate in candidates if candidate[0] != candidate[1])
-    for first, second in (every[i] for i in evenly(len(every), MAX_PAIRS)):
+    for first, second in (every[i] for i in subsample(len(every), MAX_PAIRS)):
         places = match(features[first], features[second])
         if len(places) >= MIN_MATCHES:
             pair = Pair(first, second, places)

@@ -13,7 +13,7 @@ from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset.evidence import detect_in_view, match
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ def neighbours(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
     """Pairs of photos, spread over a capture: one each of which has the median baseline among those that look alike."""
     axes, centres = normalize(c2w[:, :3, 2], dim=1), c2w[:, :3, 3]
     pairs = set()
-    for view in evenly(len(c2w), MAX_PAIRS):
+    for view in subsample(len(c2w), MAX_PAIRS):
         alike = axes @ axes[view]
         alike[view] = -1
         others = (alike >= min(MIN_OVERLAP, float(alike.max()))).nonzero()[:, 0]

@@ -8,14 +8,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.dataset.focus import Focus, checked_state
+from nerf_lightning.dataset.focus import Focus
 from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.seeding import Stream, step_generator
-from nerf_lightning.utils.untrusted import count
 
 RAYS, SAMPLES = 1024, 16384
 """Rays of the first step, and the samples per step that the number of rays then adapts to."""
@@ -237,7 +236,7 @@ class RayDataModule(StepDataModule[Views]):
         return {"rays": self.rays, "batch": self.batch, "focus": focus}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._focus, self._focus_state = None, checked_state(state_dict.get("focus", {}))
-        before = count(state_dict.get("batch", 1))  # perhaps of another device
-        rays = count(state_dict["rays"]) * self.batch // before
+        self._focus, self._focus_state = None, dict(state_dict["focus"])
+        before = state_dict["batch"]  # perhaps of another device
+        rays = state_dict["rays"] * self.batch // before
         self.rays = max(1, min(self.first_rays * self.MOST_RAYS, rays))

@@ -22,9 +22,9 @@ from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.size import AutoResize, choose_resize, find_reduced
 from nerf_lightning.dataset.views import Runs, Views
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.memory import free_memory
 from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.text import subsample
 
 log = logging.getLogger(__name__)
 
@@ -174,7 +174,7 @@ def what_masks_mean(shots: Sequence[Shot], reading: Reading) -> str | None:
         return None
     kept: list[Bool[np.ndarray, "_ _"]] = []
     cut = []
-    for shot in (having[i] for i in evenly(len(having), LOOKED)):
+    for shot in (having[i] for i in subsample(len(having), LOOKED)):
         assert shot.mask is not None
         size, other = image_header(shot.photo, shot.upright)[:2], image_header(shot.mask)[:2]
         image = read_pixels(shot.photo, shot.upright, fit_size(*size, LOOKED_SIDE_PX))

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 STRIP_ROWS = 32
 """Rows of a strip: enough for the windows of SSIM."""
@@ -37,7 +37,7 @@ class PixelSubset:
         strips = max(1, round(self.rows * height / STRIP_ROWS))
         if self.rows >= 1 or strips * STRIP_ROWS >= height:
             return torch.arange(height), torch.arange(width)
-        starts = torch.tensor(evenly(height // STRIP_ROWS, strips)) * STRIP_ROWS
+        starts = torch.tensor(subsample(height // STRIP_ROWS, strips)) * STRIP_ROWS
         return (starts[:, None] + torch.arange(STRIP_ROWS)).flatten(), torch.arange(width)
 
 

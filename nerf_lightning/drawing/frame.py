@@ -13,7 +13,7 @@ from nerf_lightning.drawing.panels import near_bright, to_bytes
 from nerf_lightning.renderer import Rendered
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.system.metrics import mse_to_psnr
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 CHANNELS = ("rgb", "depth", "opacity")
 LOOKS, LOOK_SIDE = 6, 64
@@ -38,7 +38,7 @@ def depth_range(system: NeRF3D, cameras: Cameras) -> tuple[float, float]:
     """The 2nd and the 98th percentile of the depths that a few of the views show, in the scene's unit."""
     small = cameras.scaled(min(1.0, LOOK_SIDE / cameras.longest))
     seen = []
-    for view in evenly(len(small), LOOKS):
+    for view in subsample(len(small), LOOKS):
         rendered = system.render(small.view_rays(view).to(system.device))
         seen.append(rendered.depth[rendered.opacity > 0.5])
     covered = torch.cat(seen).cpu().numpy()

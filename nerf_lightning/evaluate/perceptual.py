@@ -27,7 +27,7 @@ def perceptual_distance() -> tuple[Distance | None, str]:
     """
     try:
         importlib.import_module("torchvision")
-    except ImportError as error:  # not there, or see utils/torchvision_guard.py
+    except ImportError as error:  # not there, or see utils/libraries.py
         missing = "torchvision is not installed: pip install 'nerf_lightning[lpips]'"
         return None, missing if str(error).startswith("No module") else str(error)
     weights = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS

@@ -17,8 +17,8 @@ from nerf_lightning.model.layers.view_dependence import seen_from
 from nerf_lightning.model.voxels import EMPTY
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.text import subsample
 
 CELLS, STEPS = 128, 192
 """Along a side of the grid, and along a ray, that stand for another sampler."""
@@ -118,7 +118,7 @@ def voxels_like(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[Vo
             break
         across = max(COARSEST, min(across - 1, int(across * math.sqrt(MOST / count))))
     chosen = keep[vertices]
-    centres = cameras.centres[torch.tensor(evenly(len(cameras), DIRECTIONS))].to(system.device)
+    centres = cameras.centres[torch.tensor(subsample(len(cameras), DIRECTIONS))].to(system.device)
     found = [fitted(system, part, centres, voxels.terms) for part in places[chosen].split(CHUNK)]
     colours, views = (torch.cat(column) for column in zip(*found, strict=True))
     raw = (density[chosen] * voxels.unit_length).log().clamp(EMPTY, 15.0) / voxels.density_rate

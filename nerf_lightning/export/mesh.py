@@ -23,7 +23,7 @@ from nerf_lightning.export.volume import PLACES, Volume, volume_of
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.open import SceneRun, open_scene_run
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 if TYPE_CHECKING:
     import trimesh
@@ -84,7 +84,7 @@ def training_views(run: SceneRun, photos: str | None = None) -> Cameras:
             raise
         print(f"without the photos' cameras, from the orbit: {error}")
         spiral, count = spiral_like(run.orbit, MOST_VIEWS // 2), MOST_VIEWS // 2
-        orbit = run.orbit[torch.tensor(evenly(len(run.orbit), count))]
+        orbit = run.orbit[torch.tensor(subsample(len(run.orbit), count))]
         K, c2w, sizes = (torch.cat([getattr(x, name) for x in (orbit, spiral)]) for name in ("K", "c2w", "sizes"))
         return Cameras(K, c2w, sizes)
     assert isinstance(data, RayDataModule)  # of a scene's run

@@ -21,9 +21,9 @@ from nerf_lightning.runs.folder import RunFolder, plain_config
 from nerf_lightning.runs.index import FIELD_PAGE, find_runs, read_run, varied
 from nerf_lightning.runs.open import open_run
 from nerf_lightning.system import NeRF2D, NeRF3D
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.html import address_from
+from nerf_lightning.utils.text import subsample
 
 MAX_PHOTOS = 100
 """To look through on a page."""
@@ -65,7 +65,7 @@ def build_page(source: Path, device: torch.device, options: PageOptions) -> tupl
     ]
     if changes:
         measured.append(("drawn with", f"{changes}: {before - compact.psnr:.2f} dB lost"))
-    photos, chosen = data.scene.train, evenly(len(data.scene.train), MAX_PHOTOS)
+    photos, chosen = data.scene.train, subsample(len(data.scene.train), MAX_PHOTOS)
     page = field_page(
         content,
         drawn.system,

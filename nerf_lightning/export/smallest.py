@@ -19,8 +19,8 @@ from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.open import open_run
 from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import System
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.text import subsample
 
 MOST_VIEWS = 60
 """Training views whose rays show which cells matter."""
@@ -56,7 +56,7 @@ def held_out_psnr(system: System, data: RayDataModule | PixelDataModule, views: 
 def some_cameras(data: RayDataModule, most: int = MOST_VIEWS) -> Cameras:
     """Those of training views spread over all."""
     cameras = data.scene.train.cameras
-    return cameras[torch.tensor(evenly(len(cameras), most))]
+    return cameras[torch.tensor(subsample(len(cameras), most))]
 
 
 def smallest(
@@ -97,7 +97,9 @@ def smallest(
                 return tried[-1]
     best = min(tried, key=lambda compact: compact.loss)
     found = f"{best.loss:.2f} dB lost with --precision {best.precision}"
-    advice = f"allow it with --loss-db {best.loss + 0.005:.2f}" + (", or --precision half" if precision == "byte" else "")
+    advice = f"allow it with --loss-db {best.loss + 0.005:.2f}" + (
+        ", or --precision half" if precision == "byte" else ""
+    )
     raise InputError("export", "loss_db", found, f"at most {most_loss:g} dB", advice)
 
 

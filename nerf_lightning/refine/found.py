@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from nerf_lightning.refine.corrections import FAR, Corrections
-from nerf_lightning.utils.listing import first_few
+from nerf_lightning.utils.text import join_truncated
 
 FAR_OFF = 2.5
 """Degrees by which most cameras may have turned: from 2 degrees they come back, from 5 most do not."""
@@ -22,7 +22,7 @@ def told(corrections: Corrections, name: Callable[[int], str] = "photo {}".forma
         turned_by, moved_by = max(found["turned_degrees"]), max(found["moved"])
         said.append(f"cameras turned by up to {turned_by:.2f} degrees and moved by up to {moved_by:.3g}")
         if apart := moved_apart(corrections):
-            said.append(f"far more than the others: {first_few([name(i) for i in apart], NAMED)}")
+            said.append(f"far more than the others: {join_truncated([name(i) for i in apart], NAMED)}")
         if (middle := median(found["turned_degrees"])) > FAR_OFF:
             said.append(f"half of them by more than {middle:.1f} degrees, too far for all to have found their places")
         if found["focal_factor"] is not None:

@@ -11,8 +11,8 @@ from nerf_lightning.cameras import Cameras, resample_path, spiral_like
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.path_file import read_path
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.text import subsample
 
 SPLITS = {"test": "val", "train": "train"}
 """Paths through photos, and their attribute of a scene."""
@@ -66,7 +66,7 @@ def build_path(
     if path in SPLITS:
         assert scene is not None  # the caller opens it for these words
         photos: Views = getattr(scene, SPLITS[path])
-        chosen = evenly(len(photos), frames)
+        chosen = subsample(len(photos), frames)
         index = torch.tensor(chosen)
         return CameraPath(photos.cameras[index], chosen, photos[index])
     if path == "orbit":

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Cameras, in_other_frame
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.untrusted import read_json
+from nerf_lightning.utils.parsing import read_json
 
 OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5

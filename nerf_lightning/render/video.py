@@ -14,11 +14,11 @@ from numpy import ndarray
 from nerf_lightning.dataset.formats.decode import image_header
 from nerf_lightning.drawing.panels import write_animation
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.extras import require
 from nerf_lightning.utils.files import atomic, write_json
+from nerf_lightning.utils.libraries import require
 from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.parsing import read_json
 from nerf_lightning.utils.progress import tracked
-from nerf_lightning.utils.untrusted import read_json
 
 Image = UInt8[ndarray, "H W C"]
 PLAN = "frames.json"
@@ -35,7 +35,9 @@ CRF = 18
 def check_output(output: Path, transparent: bool) -> None:
     """Raises InputError where no video can be written to a place, before any work is done."""
     if output.suffix not in ("", *SUFFIXES):
-        raise InputError("render", "output", output.name, f"a name ending in {', '.join(SUFFIXES)}, or a folder of PNGs")
+        raise InputError(
+            "render", "output", output.name, f"a name ending in {', '.join(SUFFIXES)}, or a folder of PNGs"
+        )
     if output.exists() and output.is_dir() == bool(output.suffix):
         found, expected = ("a folder", "a file to write") if output.suffix else ("a file", "a folder for PNGs")
         raise InputError(output, "", found, expected, "give --output another name")

@@ -34,8 +34,8 @@ from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.room import check_room
 from nerf_lightning.training.train import prepare, warm_up
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.seeding import Stream, step_generator
+from nerf_lightning.utils.text import subsample
 
 Data = RayDataModule | PixelDataModule
 SEARCH = 0.75
@@ -116,7 +116,7 @@ def quality(system: System, data: Data) -> float:
     Raises:
         InputError: where what it shows is not finite.
     """
-    found = held_out_psnr(system, data, evenly(data.held_out_views, VIEWS))
+    found = held_out_psnr(system, data, subsample(data.held_out_views, VIEWS))
     if not math.isfinite(found):
         raise InputError("rightsize", "", "pictures that are not finite", "a field that learns", "lower optimizer.lr")
     return found

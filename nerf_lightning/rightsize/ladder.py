@@ -7,7 +7,7 @@ from typing import Any
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import user_path
-from nerf_lightning.utils.untrusted import read_yaml
+from nerf_lightning.utils.parsing import read_yaml
 
 Options = dict[str, Any]
 

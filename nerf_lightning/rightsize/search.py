@@ -32,7 +32,7 @@ from nerf_lightning.runs.index import read_run
 from nerf_lightning.training.before import left_of
 from nerf_lightning.training.train import prepare, train
 from nerf_lightning.utils.files import atomic
-from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.libraries import silence_lightning
 
 MOST_FULL = 2
 """Trainings in full: the candidate, and the one it is compared with."""
@@ -84,7 +84,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Fou
     """
     began = time.perf_counter()
     device = device_of(cfg)
-    quiet()
+    silence_lightning()
     prepare(cfg)
     data = build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)

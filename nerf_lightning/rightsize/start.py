@@ -13,7 +13,7 @@ from nerf_lightning.rightsize.ladder import Ladder
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.owner import LOCK
 from nerf_lightning.utils.files import write_json
-from nerf_lightning.utils.untrusted import read_json
+from nerf_lightning.utils.parsing import read_json
 
 PLAN, REPORT = "search.json", "rightsize.json"
 """What is searched for; and what was found, written last."""

@@ -13,20 +13,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from nerf_lightning.dataset.formats.checks import require_keys
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.checkpoint import check_finite
-from nerf_lightning.runs.folder import RunFolder, system_of
+from nerf_lightning.runs.folder import RunFolder, config_from, system_of
 from nerf_lightning.runs.scene_file import frame_from
-from nerf_lightning.runs.trusted import check_config
 from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.utils.arrays import Headers, read_npz
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.memory import check_memory
-from nerf_lightning.utils.untrusted import NONSENSE, existing_file, parsed_json, read_content
+from nerf_lightning.utils.parsing import VALUE_ERRORS, existing_file, parse_json, read_content, read_npz
 
 FORMAT, VERSION = "nerf_lightning compact", 1
 WORTH_BYTES = 2048
@@ -112,11 +109,10 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
         InputError: if it is not a compact file, is damaged, of another version, or names something not trusted.
     """
     header, arrays = _unpacked(content, path)
-    expected = "the weights of the model it names"
-    frame, orbit, to_source = frame_from(header["scene"], f"{path}: header.scene")
-    cfg = OmegaConf.create(check_config(header["config"], path))
-    system = system_of(cfg, frame, device, path)
     try:
+        frame, orbit, to_source = frame_from(header["scene"], f"{path}: header.scene")
+        cfg = config_from(header["config"], path)
+        system = system_of(cfg, frame, device, path)
         floats = sum(math.prod(one["shape"]) for one in header["arrays"].values())
         check_memory(path, "", "weights", 4 * floats)
         tensors = {key: _decoded(key, arrays, one["code"], one["shape"]) for key, one in header["arrays"].items()}
@@ -125,7 +121,8 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
             system.sampler.import_state(_of("sampler", tensors))
     except InputError:
         raise
-    except NONSENSE as error:
+    except VALUE_ERRORS as error:
+        expected = "the weights of the model it names"
         raise InputError(path, "", f"{type(error).__name__}: {error}", expected) from error
     check_finite(system, path)
     return RunFolder(cfg, system.eval().to(device), orbit, to_source, header["scene"])
@@ -138,21 +135,12 @@ def _unpacked(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]
         InputError: as `decode`.
     """
     expected = "a compact file of this package"
-
-    def check(headers: Headers) -> None:
-        require_keys(path, headers, ["header"])
-
-    arrays = read_npz(content, None, check, path, expected)
-    header = parsed_json(arrays.pop("header").tobytes(), f"{path}: header", expected)
-    if not isinstance(header, dict):
-        raise InputError(path, "header", f"a {type(header).__name__}", expected)
-    require_keys(f"{path}: header", header, ["format", "version"])
-    if (header["format"], header["version"]) != (FORMAT, VERSION):
-        found = f"{header['format']}, version {header['version']}"
+    arrays = read_npz(content, None, lambda headers: require_keys(path, headers, ["header"]), path, expected)
+    header = parse_json(arrays.pop("header").tobytes(), f"{path}: header", expected)
+    format_, version = (header.get(key) for key in ("format", "version")) if isinstance(header, dict) else (None, None)
+    if (format_, version) != (FORMAT, VERSION):
+        found = f"{format_}, version {version}"
         raise InputError(path, "header", found, f"{FORMAT}, version {VERSION}", "export the run again")
-    for key in ("config", "scene", "arrays"):
-        if not isinstance(header.get(key), dict):
-            raise InputError(path, f"header.{key}", repr(header.get(key)), expected)
     return header, arrays
 
 

@@ -1,26 +1,61 @@
-"""Which run a path means: itself, or the newest below a folder."""
+"""Finds a run by its folder, its compact file, a folder of runs, or as the newest of all."""
 
+import logging
+import os
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.runs.owner import LOCK
+from nerf_lightning.utils.files import user_path
 
 OUTPUTS = Path("outputs")
 """Where training puts runs."""
+LATEST = "latest"
+"""The link beside the runs of one name to the one that began last."""
+log = logging.getLogger(__name__)
 
 
-def find_run(path: Path | None) -> Path:
-    """Finds the run that a path means.
+def find_run(path: str | os.PathLike[str] | None = None) -> Path:
+    """The folder or compact file of a run.
 
     Args:
-        path: a run's folder or compact file, or a folder with runs below it, for the newest; None: the newest of all.
+        path: of either, or of a folder of runs, which stands for its newest run; None for the newest below `outputs/`.
 
     Raises:
         InputError: where there is none.
     """
-    root = OUTPUTS if path is None else path.expanduser()
-    if root.is_file() or (root / "config.yaml").is_file():
+    root = OUTPUTS if path is None else user_path(path)
+    if root.name == LATEST and not root.exists():  # where links are not possible
+        root = root.parent
+    if root.is_file() or is_run(root):
         return root
-    runs = [file.parent for file in root.rglob("config.yaml")] if root.is_dir() else []
+    runs = [file.parent for file in root.rglob("config.yaml") if is_run(file.parent)]
     if not runs:
-        raise InputError(root, "", "no run", "a folder that training has made", "train one, or give its path")
-    return max(runs, key=lambda run: (run / "config.yaml").stat().st_mtime)
+        found = "a folder without a run" if root.is_dir() else "nothing there"
+        raise InputError(root, "", found, "a run: a folder with config.yaml and checkpoints/, or a compact file (.npz)")
+    return max(runs, key=_modified)
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds a run that can be opened."""
+    return (folder / "config.yaml").is_file() and (folder / "checkpoints" / "last.ckpt").is_file()
+
+
+def _modified(folder: Path) -> float:
+    files = (folder / "config.yaml", folder / "results.json")
+    return max(file.stat().st_mtime for file in files if file.exists())
+
+
+def link_latest(folder: Path) -> None:
+    """Points `outputs/NAME/latest` to the run folder `outputs/NAME/TIME`; does nothing for other folders."""
+    folder = folder.absolute()
+    if folder.parent.parent.name != OUTPUTS.name or not (folder / LOCK).exists():
+        return
+    link = folder.with_name(LATEST)
+    temporary = link.with_name(f".{LATEST}-{os.getpid()}")
+    try:
+        temporary.symlink_to(folder.name, target_is_directory=True)
+        os.replace(temporary, link)
+    except OSError as error:  # Windows without the right to; or a folder of this name
+        temporary.unlink(missing_ok=True)
+        log.warning("%s: no link to the newest run (%s)", link, error.strerror)

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+import nerf_lightning
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.config.build import Frame, build_system, resolved
 from nerf_lightning.errors import InputError, found_in
@@ -27,16 +28,20 @@ from nerf_lightning.runs.trusted import check_config
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.files import atomic, user_path
-from nerf_lightning.utils.options import Seed, check_options
-from nerf_lightning.utils.untrusted import NONSENSE, existing_file, read_yaml
+from nerf_lightning.utils.parsing import VALUE_ERRORS, existing_file, read_yaml
 
 GROUPS = ("dataset", "optimizer", "schedule", "model", "trainer")
 """Groups of a configuration, in the order written: if a file was cut short, at least the last is missing."""
 
 
+VERSION = ".".join(nerf_lightning.__version__.split(".")[:2])
+"""Of this package, as runs are marked with: those of another one are refused."""
+
+
 def plain_config(cfg: DictConfig) -> dict[str, Any]:
     """The resolved configuration; a relative dataset path becomes absolute, so that it is valid from any folder."""
-    plain = {key: value for key, value in resolved(cfg).items() if key != "overwrite"}  # of the command, not of the run
+    of_command = ("overwrite", "version")
+    plain = {"version": VERSION} | {key: value for key, value in resolved(cfg).items() if key not in of_command}
     path = plain["dataset"].get("path")
     if path is not None:
         plain["dataset"]["path"] = os.path.abspath(user_path(path))
@@ -57,16 +62,21 @@ def load_config(folder: Path) -> DictConfig:
     """
     path = folder / "config.yaml"
     existing_file(path, "the folder of a run", "look below outputs/")
-    checked = check_config(read_yaml(path, "a run's configuration in YAML"), path)
+    return config_from(read_yaml(path, "a run's configuration in YAML"), path)
+
+
+def config_from(plain: Any, path: Path | str) -> DictConfig:
+    """As `load_config`, of what a file at `path` holds."""
+    checked = check_config(plain, path)
+    if (version := checked.get("version")) != VERSION:
+        found = "no version" if version is None else f"version {version}"
+        todo = "train the run again, or use the version of nerf_lightning that made it"
+        raise InputError(path, "version", found, f"version {VERSION}, which this one reads", todo)
     for group in GROUPS:
         if not isinstance(checked.get(group), dict):
             found = repr(checked[group])[:60] if group in checked else "nothing"
             raise InputError(path, group, found, "a run's whole configuration", "was the file cut short?")
     return OmegaConf.create(checked)
-
-
-def _top(seed: Seed, kernels: str) -> None:
-    """What opening a run needs of the top level of its configuration, for checking."""
 
 
 def system_of(cfg: DictConfig, frame: Frame, device: torch.device, where: object) -> System:
@@ -80,7 +90,6 @@ def system_of(cfg: DictConfig, frame: Frame, device: torch.device, where: object
         InputError: where an option is missing or wrong.
     """
     with found_in(where):
-        check_options("", _top, {key: cfg[key] for key in ("seed", "kernels") if key in cfg})
         return build_system(cfg, frame, device)
 
 
@@ -113,7 +122,7 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device =
         # Corrections are of training photos, which rendering has none of.
         weights = {key: value for key, value in state["state_dict"].items() if not key.startswith("corrections.")}
         system.load_state_dict(weights)
-    except NONSENSE as error:
+    except VALUE_ERRORS as error:
         raise InputError(path, "state_dict", str(error), "the weights of this run's model") from error
     check_finite(system, path)
     return RunFolder(cfg, system.eval().to(device), orbit, to_source, scene)

@@ -8,20 +8,13 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.untrusted import read_json, read_yaml
+from nerf_lightning.utils.parsing import read_json, read_yaml
 
 FINISHED = ("finished", "collapsed")
 """Status of completed runs."""
 
 FIELD_PAGE = "field.html"
 """The name of a run's web page in its folder, as the export verb writes it and charts look for it."""
-
-KINDS: dict[str, type] = {
-    **dict.fromkeys(("scene", "machine", "load", "versions"), dict),
-    **dict.fromkeys(("curve", "warnings", "recoveries"), list),
-    **dict.fromkeys(("status", "diagnosis"), str),
-}
-"""What stands in a results.json at some keys, or nothing: anything else there is told and left out."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +73,8 @@ def read_run(folder: Path) -> Run:
         return Run(folder, plain, {}, "unreadable", f"results.json: found {error.found}")
     if not isinstance(results, dict):
         return Run(folder, plain, {}, "unreadable", f"results.json: a {type(results).__name__}, not a mapping")
-    odd = [key for key, kind in KINDS.items() if not isinstance(results.get(key), kind | None)]
-    told = [f"results.json: {key} is a {type(results[key]).__name__}, not a {KINDS[key].__name__}" for key in odd]
-    results |= dict.fromkeys(odd)
-    diagnosis = "; ".join(filter(None, [results.get("diagnosis"), *told]))
-    return Run(folder, plain, results, results.get("status") or "unreadable", diagnosis)
+    diagnosis = str(results.get("diagnosis") or "")
+    return Run(folder, plain, results, str(results.get("status") or "unreadable"), diagnosis)
 
 
 def find_runs(root: Path) -> list[Run]:

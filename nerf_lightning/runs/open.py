@@ -15,7 +15,7 @@ from nerf_lightning.kernels import use_kernels
 from nerf_lightning.runs.compact import load_compact
 from nerf_lightning.runs.folder import RunFolder, load_run
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.libraries import silence_lightning
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def open_run(path: Path, device: torch.device) -> RunFolder:
     Raises:
         InputError: if there is none, or it is broken, of another version, or names something not trusted.
     """
-    quiet()
+    silence_lightning()
     found = load_compact(path, device) if path.suffix == ".npz" else load_run(path, device=device)
     use_kernels(found.cfg.kernels)
     return found

@@ -1,29 +1,20 @@
 """Who a run's folder belongs to: one process at a time, and to one run until somebody asks to replace it."""
 
-import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import count
 from pathlib import Path
 
+from filelock import FileLock, Timeout
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
-from omegaconf import DictConfig
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import remove_empty
-from nerf_lightning.utils.lock import Held, locked
+from nerf_lightning.utils.files import remove, remove_empty
 
-LOCK = ".lock"
-"""In a folder that is being written: held by the process that does."""
+LOCK = ".nerf_lightning"
+"""Marks a folder as made by this package; the process that writes into the folder locks it."""
 RUN = ("config.yaml", "results.json", "checkpoints")
 """Any of these says that a folder holds a run."""
-MADE = (
-    *RUN, "scene.json", "error.txt", "hparams.yaml", "events.out.tfevents.*", "snapshots", "final.png", "orbit.gif",
-    "training.gif", "error.png", "spectrum.png", "curve.png", "csv", "wandb", "baselines.json", "enlarged.*", "enlarged_*",
-    "compact.npz", "field.html", "mesh.ply", "mesh.obj", "mesh.glb", "mesh.stl", "points.ply", "voxels.npz", "posed",
-    "render_*", "evaluation",
-)  # fmt: skip
-"""What runs leave, and what the verbs make from them, where no other names are given."""
 
 
 class Taken(InputError):
@@ -36,32 +27,44 @@ def leads() -> bool:
 
 
 @contextmanager
-def owned(folder: Path) -> Iterator[None]:
-    """Holds a folder, which is made if it is missing, and removed again if nothing was written.
+def owned(folder: Path, resumed: bool = False) -> Iterator[None]:
+    """Locks a folder, which is made if it is missing, and removed again if nothing was written.
+
+    Args:
+        folder: a new or empty one, or one that was owned before.
+        resumed: whether any other will do too, as a run in it was moved there without its lock.
 
     Raises:
-        Taken: while another process holds it.
-        InputError: where it cannot be written.
+        Taken: while another process writes into it.
+        InputError: where it cannot be written, or holds files of others.
     """
     if not leads():
         yield
         return
-    with ExitStack() as stack:
-        if not folder.exists():
-            stack.callback(remove_empty, folder)
-        try:
-            stack.enter_context(locked(folder / LOCK))
-        except Held as error:
-            found, todo = f"a run that is still going on ({error})", "wait for its end, or give another folder"
-            raise Taken(folder, "", found, "a folder that no other process writes into", todo) from error
-        except OSError as error:
-            raise InputError(folder, "", error.strerror or str(error), "a folder that can be written") from error
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not resumed and not (folder / LOCK).exists() and any(folder.iterdir()):
+            raise InputError(folder, "", "other files in it", "a new or empty folder, or one of an earlier run")
+        lock = FileLock(folder / LOCK, timeout=0)
+        lock.acquire()
+    except Timeout as error:
+        todo = "wait for its end, or give another folder"
+        raise Taken(folder, "", "a run that is in progress", "a folder that no other process uses", todo) from error
+    except OSError as error:
+        found = error.strerror or str(error)
+        raise InputError(folder, "", found, "a folder that can be written") from error
+    try:
         yield
+    finally:
+        lock.release()
+        if [file.name for file in folder.iterdir()] == [LOCK]:
+            remove(folder / LOCK)
+            remove_empty(folder)
 
 
 @contextmanager
 def own_folder(folder: Path, overwrite: bool, renamed: bool = False) -> Iterator[Path]:
-    """Holds a folder for a run that starts anew; yields it.
+    """Locks a folder for a run that starts anew; yields it.
 
     Args:
         folder: as asked for.
@@ -69,8 +72,8 @@ def own_folder(folder: Path, overwrite: bool, renamed: bool = False) -> Iterator
         renamed: whether `folder-2`, `folder-3`, ... will do as well, where another run has it.
 
     Raises:
-        Taken: where another run has it, going on or not.
-        InputError: where it cannot be written.
+        Taken: where another run has it, in progress or not.
+        InputError: as `owned`.
     """
     for number in count(1):
         place = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
@@ -88,20 +91,9 @@ def own_folder(folder: Path, overwrite: bool, renamed: bool = False) -> Iterator
 
 
 def already(folder: Path) -> Taken:
-    """What to say of a folder that holds a run."""
-    todo = f"resume={folder} goes on with it, overwrite=true replaces it"
+    """The error for a folder that holds a run."""
+    todo = f"resume={folder} continues it, overwrite=true replaces it"
     return Taken(folder, "", "a run in it already", "a folder of its own for each run", todo)
-
-
-def may_overwrite(cfg: DictConfig) -> bool:
-    """Whether the user asks to replace what is there.
-
-    Raises:
-        InputError: for anything but true and false.
-    """
-    if not isinstance(cfg.overwrite, bool):
-        raise InputError("config", "overwrite", repr(cfg.overwrite), "true or false")
-    return cfg.overwrite
 
 
 def holds_run(folder: Path) -> bool:
@@ -109,16 +101,10 @@ def holds_run(folder: Path) -> bool:
 
 
 def clear(folder: Path) -> None:
-    """Removes an earlier run's files from a folder, so that none is mistaken for a later one's; all others stay."""
+    """Removes an earlier run, so that none of its files is mistaken for a later one's: all files of a folder that this package
+    made, else only those that say that there is a run."""
     if not holds_run(folder):
         return
-    for path in [path for name in MADE for path in folder.glob(name)]:
+    own = (folder / LOCK).exists()
+    for path in [path for path in folder.iterdir() if path.name != LOCK and (own or path.name in RUN)]:
         remove(path)
-
-
-def remove(path: Path) -> None:
-    """Removes a file, or a folder with all that is in it, if it is there."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

@@ -16,13 +16,9 @@ from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Sce
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import write_json
-from nerf_lightning.utils.untrusted import read_json
+from nerf_lightning.utils.parsing import read_json
 
-FORMAT = 1
-"""Version of run folders. Goes up when older versions of this package can no longer read newer runs."""
-PICTURE = ("name", "resolution")
-SCENE = ("name", "aabb", "unbounded", "near", "far", "background", "orbit", "to_source")
-"""Keys of every scene.json, of a picture and of a scene."""
+WHOLE = "the scene of a run, whole"
 
 
 def save_scene(
@@ -42,7 +38,7 @@ def save_scene(
 def scene_content(data: RayDataModule | PixelDataModule) -> dict[str, Any]:
     """The same as plain values."""
     scene, frame = data.scene, frame_of(data)
-    content: dict[str, Any] = {"format": FORMAT, **scene.describe()}
+    content: dict[str, Any] = dict(scene.describe())
     if scene.source != BUILT_IN:
         content["source"] = os.path.abspath(scene.source)
     if isinstance(scene, Scene) and isinstance(frame, SceneFrame):
@@ -70,15 +66,12 @@ def load_scene(folder: Path) -> dict[str, Any]:
     """The content of a run's scene.json, whose values `frame_from` checks.
 
     Raises:
-        InputError: where it is missing, broken, or of another version.
+        InputError: where it is missing or broken.
     """
     path = folder / "scene.json"
-    scene = read_json(path, "the scene of a run, whole", "")
+    scene = read_json(path, WHOLE, "")
     if not isinstance(scene, dict):
-        raise InputError(path, "", f"a {type(scene).__name__}", "the scene of a run, whole")
-    if scene.get("format", FORMAT) != FORMAT:
-        found, expected = f"format {scene['format']}", f"format {FORMAT}, which this version reads"
-        raise InputError(path, "format", found, expected, "use the version of nerf_lightning that made the run")
+        raise InputError(path, "", f"a {type(scene).__name__}", WHOLE)
     return scene
 
 
@@ -92,24 +85,21 @@ def frame_from(scene: Mapping[str, Any], where: object) -> tuple[Frame, Cameras 
     Raises:
         InputError: where a value is missing or cannot be.
     """
-    checks.require_keys(where, scene, SCENE if "aabb" in scene else PICTURE)
-    for key in ("name", "source"):
-        if not isinstance(scene.get(key, ""), str):
-            raise InputError(where, key, repr(scene[key]), "text")
-    if "aabb" not in scene:
-        return PictureFrame(*_size(where, "resolution", scene["resolution"])), None, None
-    near, far, pixel = (_number_or_none(where, key, scene.get(key)) for key in ("near", "far", "pixel"))
-    checks.near_far(where, near, far)
-    if not isinstance(scene["unbounded"], bool):
-        raise InputError(where, "unbounded", repr(scene["unbounded"]), "true or false")
-    if pixel is not None:
-        checks.positive(where, "pixel", pixel, "world units")
-    aabb = torch.from_numpy(checks.box(where, "aabb", numbers(where, "aabb", scene["aabb"]))).float()
-    colour = checks.numeric(where, "background", numbers(where, "background", scene["background"]), "3")
-    red, green, blue = colour.tolist()
-    to_source = checks.similarity(where, "to_source", numbers(where, "to_source", scene["to_source"]))
-    frame = SceneFrame(Bounds(aabb, scene["unbounded"], near, far, pixel), (red, green, blue))
-    return frame, _orbit(where, scene["orbit"]), torch.from_numpy(to_source)
+    try:
+        if "aabb" not in scene:
+            return PictureFrame(*checks.view_size(where, "resolution", *scene["resolution"])), None, None
+        near, far, pixel = (
+            None if scene[key] is None else checks.number(where, key, scene[key]) for key in ("near", "far", "pixel")
+        )
+        checks.near_far(where, near, far)
+        aabb = torch.from_numpy(checks.box(where, "aabb", numbers(where, "aabb", scene["aabb"]))).float()
+        colour = checks.numeric(where, "background", numbers(where, "background", scene["background"]), "3")
+        red, green, blue = colour.tolist()
+        to_source = checks.similarity(where, "to_source", numbers(where, "to_source", scene["to_source"]))
+        frame = SceneFrame(Bounds(aabb, bool(scene["unbounded"]), near, far, pixel), (red, green, blue))
+        return frame, _read_orbit(where, scene["orbit"]), torch.from_numpy(to_source)
+    except (LookupError, TypeError) as error:
+        raise InputError(where, "", f"{type(error).__name__}: {error}", WHOLE) from error
 
 
 def numbers(where: object, key: str, value: Any) -> Float[np.ndarray, "..."]:
@@ -124,24 +114,11 @@ def numbers(where: object, key: str, value: Any) -> Float[np.ndarray, "..."]:
         raise InputError(where, key, repr(value)[:60], "numbers, in rows of one length") from error
 
 
-def _orbit(where: object, view: Any) -> Cameras:
-    if not isinstance(view, dict):
-        raise InputError(where, "orbit", repr(view), "K, c2w, width and height")
-    checks.require_keys(f"{where}: orbit", view, ("K", "c2w", "width", "height"))
-    width, height = _size(where, "orbit", [view["width"], view["height"]])
+def _read_orbit(where: object, view: Mapping[str, Any]) -> Cameras:
+    width, height = checks.view_size(where, "orbit", view["width"], view["height"])
     c2w = checks.rigid_poses(where, "orbit.c2w[{}]", numbers(where, "orbit.c2w", view["c2w"]))
     K = numbers(where, "orbit.K", view["K"])
     if K.shape != (len(c2w), 3, 3) or not len(c2w):
         raise InputError(where, "orbit.K", f"shape {K.shape}", f"shape ({len(c2w)}, 3, 3), of at least one view")
     K = np.stack([checks.intrinsics(where, f"orbit.K[{number}]", one, width, height) for number, one in enumerate(K)])
     return Cameras.of_size(torch.from_numpy(K).float(), torch.from_numpy(c2w).float(), width, height)
-
-
-def _size(where: object, key: str, value: Any) -> tuple[int, int]:
-    if not isinstance(value, list) or len(value) != 2:
-        raise InputError(where, key, repr(value), "a width and a height")
-    return checks.view_size(where, key, *value)
-
-
-def _number_or_none(where: object, key: str, value: Any) -> float | None:
-    return None if value is None else checks.number(where, key, value)

@@ -26,10 +26,6 @@ class ImportanceSampler(UniformSampler):
         super().__init__(bounds, samples, stratified)
         self.fine = fine
 
-    @property
-    def first_samples(self) -> int:
-        return self.samples + self.fine
-
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         edges = self.edges(rays, generator)
         hit = edges[:, -1:] > edges[:, :1]

@@ -34,11 +34,6 @@ FINE = 1 << 24
 PLASTIC = 1.2207440846057596
 """The root above 1 of x^4 = x + 1."""
 
-CROSSED = 1 / 8
-"""Share of the diagonal that rays cross: those through a cube cross 0.38 on average, and two in three may miss it."""
-CELL = 56
-"""Bytes of a cell while all are looked at: its number and place, whole numbers of 64 bits, and two positions."""
-
 
 def in_view(camera: Cameras, points: Float[Tensor, "N 3"], near: float) -> Bool[Tensor, "N"]:
     """Which world points one camera sees, farther from it than `near`."""
@@ -137,14 +132,6 @@ class OccupancySampler(Sampler):
     def rays_at_once(self) -> int:
         """On a CPU more than elsewhere: it goes some steps at a time along rays, front first."""
         return max(1, self.chunk // 2) if self.thickness.device.type == "cpu" else super().rays_at_once
-
-    @property
-    def first_samples(self) -> int:
-        return math.ceil(self.samples * CROSSED)
-
-    @property
-    def grid_bytes(self) -> int:
-        return CELL * self.resolution**3
 
     def set_resolution(self, cells: int) -> None:
         """Takes so many cells along each side, and steps to match; buffers stay."""

@@ -72,10 +72,6 @@ class ProposalSampler(Sampler):
         self.step = 0
 
     @property
-    def first_samples(self) -> int:
-        return max(self.first, self.second, self.samples)
-
-    @property
     def groups(self) -> list[dict[str, Any]]:
         return [{"params": list(self.parameters()), "final": self.final}]
 

@@ -133,16 +133,6 @@ class Sampler(InBounds):
         return max(1, self.chunk // RAY_SAMPLES)
 
     @property
-    def first_samples(self) -> int:
-        """Samples that a ray takes on average at least, before anything is known of the content."""
-        return 1
-
-    @property
-    def grid_bytes(self) -> int:
-        """Memory that what it knows of the scene takes at least."""
-        return 0
-
-    @property
     def groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups of what is learned at a rate of its own, see `System.learned`."""
         return []

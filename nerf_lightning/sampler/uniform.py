@@ -31,10 +31,6 @@ class UniformSampler(Sampler):
         self.samples = samples
         self.stratified = stratified
 
-    @property
-    def first_samples(self) -> int:
-        return self.samples
-
     def edges(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "R S_plus_1"]:
         near, far = self.bounds.near_far(rays)
         s = torch.linspace(0, 1, self.samples + 1, device=near.device).expand(len(rays), -1)

@@ -11,7 +11,7 @@ from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.stability.conditions import CONDITIONS, LARGER, Condition
 from nerf_lightning.stability.methods import METHODS, Method
 from nerf_lightning.utils.files import full_disk, write_json
-from nerf_lightning.utils.untrusted import read_json
+from nerf_lightning.utils.parsing import read_json
 
 OUTCOME = "cell.json"
 

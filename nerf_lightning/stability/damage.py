@@ -10,8 +10,8 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.seeding import Stream, step_generator
+from nerf_lightning.utils.text import subsample
 
 Poses = Callable[[Float[Tensor, "V 4 4"]], Float[Tensor, "V 4 4"]]
 Photos = Callable[[Float[Tensor, "V H W C"]], Float[Tensor, "V H W C"]]
@@ -92,7 +92,7 @@ def with_dark_corners(scene: Scene, seed: int, share: float) -> Scene:
 
 def with_wrong_poses(scene: Scene, seed: int, count: int) -> Scene:
     """So many training photos, evenly spaced, with the pose of the next of them."""
-    wrong = evenly(len(scene.train), count)
+    wrong = subsample(len(scene.train), count)
 
     def swap(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
         c2w[wrong] = c2w[[*wrong[1:], wrong[0]]]

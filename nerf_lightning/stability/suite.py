@@ -17,9 +17,9 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.stability.cell import Cell, Outcome, run
 from nerf_lightning.stability.conditions import CONDITIONS
 from nerf_lightning.stability.methods import METHODS
-from nerf_lightning.utils.ending import AGAIN, held
 from nerf_lightning.utils.machine import cores
 from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.signals import CONTINUE, defer_signals
 
 QUICK = (
     *("clean", "white, small object", "rate x10", "wrong background flag", "OpenGL poses", "shuffled poses"),
@@ -56,17 +56,17 @@ def run_all(cells: Sequence[Cell], root: Path, workers: int | None) -> Generator
     context = multiprocessing.get_context("spawn")  # numba and torch's threads do not survive a fork
     with ProcessPoolExecutor(count, context, _prepare) as pool:
         try:
-            with _unheard(), held():
+            with _unheard(), defer_signals():
                 pending = {pool.submit(run, cell, root): cell for cell in cells}
             for done in as_completed(pending):
                 yield pending[done], done.result()
         except BaseException as error:
-            with held():
+            with defer_signals():
                 pool.shutdown(wait=False, cancel_futures=True)
                 _end(multiprocessing.active_children())
             if isinstance(error, BrokenProcessPool):
                 lost, enough = "a process that the system ended", f"memory for {count:,} of them"
-                raise InputError("config", "workers", lost, enough, f"give fewer; {AGAIN}") from error
+                raise InputError("config", "workers", lost, enough, f"give fewer; {CONTINUE}") from error
             raise
 
 

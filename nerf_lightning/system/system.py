@@ -17,8 +17,8 @@ from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system.metrics import psnr, ssim
-from nerf_lightning.utils.allocator import give_back_freed_memory
 from nerf_lightning.utils.device import synchronize
+from nerf_lightning.utils.memory import give_back_freed_memory
 
 MakeOptimizer = Callable[[list[dict[str, Any]]], torch.optim.Optimizer]
 Schedule = Callable[[float, int], float]

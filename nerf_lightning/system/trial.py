@@ -14,7 +14,7 @@ from nerf_lightning.dataset.rays import rays_through
 from nerf_lightning.refine import Corrections
 from nerf_lightning.refine.poses import spanned, without
 from nerf_lightning.renderer import Rendered, over
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 PHOTOS, PIXELS = 64, 128
 """How many photos are looked at, and pixels of each that decide; as many others judge."""
@@ -147,7 +147,7 @@ def worth(
         generator: of the pixels.
         light: whether to ask about light too; poses alone take less time.
     """
-    chosen = evenly(len(views), PHOTOS)
+    chosen = subsample(len(views), PHOTOS)
     deciding, judging = (some_pixels(views, chosen, PIXELS, behind, generator) for _ in range(2))
     left, jacobian = derivatives(see, corrections, deciding, len(chosen))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lightning.pytorch.loggers import MLFlowLogger, WandbLogger
 
-from nerf_lightning.utils.extras import require
+from nerf_lightning.utils.libraries import require
 
 
 def wandb(

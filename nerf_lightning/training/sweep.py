@@ -18,9 +18,9 @@ from omegaconf.errors import OmegaConfBaseException
 from nerf_lightning.config import resolvers  # noqa: F401  (a job's process needs them)
 from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.runs.index import FINISHED, Run, failed_results, find_runs, read_run, varied
-from nerf_lightning.utils.ending import AGAIN, listen_again
-from nerf_lightning.utils.files import atomic, full_disk, write_json
+from nerf_lightning.utils.files import atomic, full_disk, remove, write_json
 from nerf_lightning.utils.progress import clock
+from nerf_lightning.utils.signals import CONTINUE, handle_signals
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -45,8 +45,7 @@ def job(cfg: "DictConfig") -> float | None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     root = Path(HydraConfig.get().sweep.dir)
     try:
-        listen_again()  # this may be a process of a launcher
-        with owned(folder):
+        with handle_signals(), owned(folder):  # this may be a process of a launcher
             try:
                 return trained(cfg, folder)
             except Exception as error:  # noqa: BLE001  (recorded with its traceback; the other jobs must go on)
@@ -68,7 +67,7 @@ def trained(cfg: "DictConfig", folder: Path) -> float | None:
     """The held-out PSNR of a job in a folder that this process owns, from now, from before, or from its last checkpoint on."""
     from nerf_lightning.config.options import check_run_options
     from nerf_lightning.runs.folder import plain_config
-    from nerf_lightning.runs.owner import already, holds_run, leads, remove
+    from nerf_lightning.runs.owner import already, holds_run, leads
     from nerf_lightning.training.before import left_of
     from nerf_lightning.training.train import train
 
@@ -188,7 +187,7 @@ class SweepReport(Callback):
             print(f"table: {root / TABLE}; figure: {write_contact_figure(root, runs)}")
             print(f"speed against accuracy: nerf_lightning compare {root}")
         finally:
-            ended = ((failed, "failed"), (going, "have not ended"), (stopped, f"were interrupted ({AGAIN})"))
+            ended = ((failed, "failed"), (going, "have not ended"), (stopped, f"were interrupted ({CONTINUE})"))
             for some, what in ended:
                 if some:
                     told = ", ".join(str(run.folder.relative_to(root)) for run in some)

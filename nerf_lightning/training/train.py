@@ -16,7 +16,6 @@ from rich.console import Console
 
 from nerf_lightning.callbacks import Budget, Checkpoints, Live, Results
 from nerf_lightning.callbacks.attached import ChecksData, attached
-from nerf_lightning.callbacks.budget import AT_ROW
 from nerf_lightning.callbacks.checkpoints import check_disk
 from nerf_lightning.config.build import (
     build_data,
@@ -36,49 +35,43 @@ from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.refine import summary, told
-from nerf_lightning.runs.checkpoint import RESUMED, check_optimizer, read_checkpoint
+from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
 from nerf_lightning.runs.data import data_again
+from nerf_lightning.runs.find import link_latest
 from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.owner import clear
 from nerf_lightning.runs.scene_file import load_scene, save_scene
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND, check_compiler
 from nerf_lightning.training.loggers import finishing_wandb
-from nerf_lightning.training.room import check_room
-from nerf_lightning.utils.allocator import keep_freed_memory
-from nerf_lightning.utils.ending import interruptible
-from nerf_lightning.utils.listing import first_few
+from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.machine import CROWDED, crowding
-from nerf_lightning.utils.memory import check_memory, out_of_memory
+from nerf_lightning.utils.memory import check_memory, keep_freed_memory, out_of_memory
 from nerf_lightning.utils.options import AtMost, Count, Seed, check_options
 from nerf_lightning.utils.progress import animates
-from nerf_lightning.utils.quiet import quiet
 from nerf_lightning.utils.seeding import Stream, step_generator
+from nerf_lightning.utils.text import join_truncated
 
 SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
 """Figures logged beside the options, as in TensorBoard's HParams tab."""
-NAMED = 10
+MAX_NAMED = 10
 """Photos that do not fit which are printed; all stand in results.json."""
 log = logging.getLogger(__name__)
 Threads = Annotated[Count, AtMost(1024)]
 """Threads of one process; beyond, starting them fails on common systems, and ends the process."""
-STACK = 8 * 2**20
-"""Bytes that are set aside for each."""
 GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
 class Described(L.Callback):
     """Writes what opens a run again once its training begins: a resumed run stays as it was where its state does not fit."""
 
-    def __init__(self, cfg: DictConfig, data: RayDataModule | PixelDataModule, folder: Path, checkpoint: Path | None):
-        self.cfg, self.data, self.folder, self.checkpoint = cfg, data, folder, checkpoint
+    def __init__(self, cfg: DictConfig, data: RayDataModule | PixelDataModule, folder: Path):
+        self.cfg, self.data, self.folder = cfg, data, folder
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        if self.checkpoint is not None:
-            for optimizer in trainer.optimizers:
-                check_optimizer(self.checkpoint, optimizer)
         save_config(self.cfg, self.folder)
         save_scene(self.data, self.folder)
+        link_latest(self.folder)
 
 
 @finishing_wandb()
@@ -101,68 +94,34 @@ def train(
     if resumed:
         cfg, checkpoint = resume(cfg, folder)
     device = device_of(cfg)
-    quiet()
-    check_options("", labels, {"name": cfg.name, "method": cfg.method, "recipe": cfg.get("recipe")})
+    silence_lightning()
     prepare(cfg, may_compile=True)
     if cfg.compile:
         check_compiler(device, BACKEND)
-    if resumed:
-        data = data_again(cfg, load_scene(folder), cfg.dataset.get("path"), corrected=False)
-    elif scene is None:
-        data = build_data(cfg)
-    else:
-        data = RayDataModule(scene, *(cfg.dataset[key] for key in ("rays", "samples", "seed", "focus")))
+    data = load_data(cfg, scene, folder if resumed else None)
     data.enlarge(limits_of(cfg, device).batch)
     doubts = check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt.text)
-    system = build_system(cfg, frame_of(data), device)
-    check_room(system, data, device)
-    if isinstance(system, NeRF3D) and system.corrections is not None and any(doubt.far_off for doubt in doubts):
-        system.corrections.begin_poses()
-    system.backend = BACKEND if cfg.compile else None
-    if system.field.sizing:
-        log.info("model: %s", system.field.sizing)
-    check_background(cfg, data, system)
+    system = prepare_system(cfg, data, device, any(doubt.far_off for doubt in doubts))
     results = Results("results.json", cfg.method, cfg.seed, [doubt.text for doubt in doubts])
     trainer = build_trainer(cfg, folder, device, results)
     check_processes(trainer)
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
         if isinstance(callback, ChecksData):
             callback.check(data)
-    checkpoints = attached(trainer, Checkpoints)
     if trainer.is_global_zero:
-        if checkpoints is not None:
+        if (checkpoints := attached(trainer, Checkpoints)) is not None:
             check_disk(folder / checkpoints.folder, system)
         if checkpoint is None:
             clear(folder)
-        trainer.callbacks.insert(0, Described(cfg, data, folder, checkpoint))  # type: ignore[attr-defined]
+        trainer.callbacks.insert(0, Described(cfg, data, folder))  # type: ignore[attr-defined]
     with trainer.precision_plugin.train_step_context():
         warm_up(system, data, trainer.strategy.root_device)
-    try:
-        trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
-    except Exception as error:
-        if checkpoint is None and trainer.global_step == 0 and trainer.is_global_zero and out_of_memory(error):
-            clear(folder)  # nothing was trained
-        if checkpoint is None or Budget.of(trainer).began or isinstance(error, InputError):
-            raise
-        # Nothing but the state has been at work yet.
-        found = f"{type(error).__name__}: {error}"
-        raise InputError(checkpoint, "", found, "a state of this run to go on from", "start the run anew") from error
-    with interruptible(AT_ROW):
-        trainer.test(system, data, verbose=False)
+    fit(trainer, system, data, checkpoint, folder)
+    trainer.test(system, data, verbose=False)
     if trainer.is_global_zero:
-        if isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.finite:
-            assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
-            if "poses" in system.corrections.since:
-                cameras = system.corrections.cameras(data.scene.train.cameras)
-                save_scene(data, folder, cameras, summary(system.corrections)["focal_factor"])
-            found = results.summary["psnr_aligned"]
-            aligned = "" if found is None else f"; {found:.2f} dB held out with held-out photos corrected too"
-            print(told(system.corrections, data.scene.train.name) + aligned)
-        if results.misfits:
-            named = first_few([f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results.misfits], NAMED)
-            print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}")
+        report_photos(system, data, results, folder)
         if trainer.logger is not None:
             log_hyperparameters(trainer.logger, cfg, results.summary)
         report(results.summary, folder, trainer.logger)
@@ -173,11 +132,74 @@ def train(
     return math.nan if quality is None else quality  # views of a field that has broken down may have none
 
 
+def load_data(cfg: DictConfig, scene: Scene | None, resumed: Path | None) -> RayDataModule | PixelDataModule:
+    """The data to train on: a loaded scene, that of a resumed run in its frame, or the configuration's."""
+    if resumed is not None:
+        return data_again(cfg, load_scene(resumed), cfg.dataset.get("path"), corrected=False)
+    if scene is None:
+        return build_data(cfg)
+    return RayDataModule(scene, *(cfg.dataset[key] for key in ("rays", "samples", "seed", "focus")))
+
+
+def prepare_system(
+    cfg: DictConfig, data: RayDataModule | PixelDataModule, device: torch.device, poses_are_off: bool
+) -> System:
+    """The system to train, if it fits into memory and the data."""
+    system = build_system(cfg, frame_of(data), device)
+    what = "numbers, with their gradients and moments,"
+    check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
+    if isinstance(system, NeRF3D) and system.corrections is not None and poses_are_off:
+        system.corrections.begin_poses()
+    system.backend = BACKEND if cfg.compile else None
+    if system.field.sizing:
+        log.info("model: %s", system.field.sizing)
+    check_background(cfg, data, system)
+    return system
+
+
+def fit(
+    trainer: L.Trainer,
+    system: System,
+    data: RayDataModule | PixelDataModule,
+    checkpoint: Path | None,
+    folder: Path,
+) -> None:
+    """Trains, from a checkpoint if there is one.
+
+    Raises:
+        InputError: where the checkpoint does not fit the run.
+    """
+    try:
+        trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
+    except Exception as error:
+        if checkpoint is None and trainer.global_step == 0 and trainer.is_global_zero and out_of_memory(error):
+            clear(folder)  # nothing was trained
+        if checkpoint is None or Budget.of(trainer).began or isinstance(error, InputError):
+            raise
+        found = f"{type(error).__name__}: {error}"  # only the checkpoint has been at work yet
+        raise InputError(checkpoint, "", found, "a state of this run to continue from", "start the run anew") from error
+
+
+def report_photos(system: System, data: RayDataModule | PixelDataModule, results: Results, folder: Path) -> None:
+    """Saves corrected cameras, and prints what training has found out about the photos."""
+    if isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.finite:
+        assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
+        if "poses" in system.corrections.since:
+            cameras = system.corrections.cameras(data.scene.train.cameras)
+            save_scene(data, folder, cameras, summary(system.corrections)["focal_factor"])
+        found = results.summary["psnr_aligned"]
+        aligned = "" if found is None else f"; {found:.2f} dB held out with held-out photos corrected too"
+        print(told(system.corrections, data.scene.train.name) + aligned)
+    if results.misfits:
+        named = join_truncated([f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results.misfits], MAX_NAMED)
+        print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}")
+
+
 def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     """The configuration of the run in `folder` with this command line's overrides on top, and its last checkpoint."""
     saved = load_config(folder)
     checkpoint = folder / "checkpoints" / "last.ckpt"
-    read_checkpoint(checkpoint, RESUMED)  # fails in one line before anything starts, if it is broken
+    read_checkpoint(checkpoint, RESUME_KEYS)  # fails in one line before anything starts, if it is broken
     given = [override.partition("=")[0].lstrip("+") for override in HydraConfig.get().overrides.task]
     if "dataset.path" in given and cfg.dataset.path is not None:
         saved = with_photos(saved, cfg.dataset.path)
@@ -191,10 +213,6 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     if "device" in given:  # the trainer's was resolved when the run began
         OmegaConf.update(saved, "trainer.accelerator", cfg.trainer.accelerator)
     return saved, checkpoint
-
-
-def labels(name: str, method: str, recipe: str | None) -> None:
-    """What a run is called by, for checking."""
 
 
 def prepare(cfg: DictConfig, may_compile: bool = False) -> None:
@@ -216,7 +234,6 @@ def prepare(cfg: DictConfig, may_compile: bool = False) -> None:
 def prepare_process(seed: Seed, threads: Threads | None, kernels: str, compile: bool = False) -> None:
     """Sets what applies to the whole process."""
     if threads is not None:
-        check_memory("config", "threads", f"stacks of {threads} threads", threads * STACK)
         torch.set_num_threads(threads)
     use_kernels("reference" if compile else kernels)
     keep_freed_memory()

@@ -30,21 +30,20 @@ def the_device(name: str) -> torch.device:
         return torch.device(found[0])
     if name in found:
         return torch.device(name)
-    raise InputError("config", "device", _missing(name), f"auto, or what is there: {', '.join(found)}", _advice(name))
-
-
-def _missing(name: str) -> str:
-    if name == "cuda":
-        return f"cuda, but {'there is no such card' if torch.backends.cuda.is_built() else 'this PyTorch has no CUDA'}"
-    if name == "mps":
-        return f"mps, but this {'machine' if torch.backends.mps.is_built() else 'PyTorch'} has no MPS"
-    return repr(name)
-
-
-def _advice(name: str) -> str:
-    if name == "cuda" and not torch.backends.cuda.is_built():
-        return "install PyTorch's CUDA build, or give device=auto"
-    return "give device=auto"
+    built = {"cuda": torch.backends.cuda.is_built(), "mps": torch.backends.mps.is_built()}
+    why = (
+        ""
+        if name not in built
+        else ", but there is no such chip"
+        if built[name]
+        else ", but this PyTorch has no such part"
+    )
+    todo = (
+        "install PyTorch's CUDA build, or give device=auto"
+        if name == "cuda" and not built["cuda"]
+        else "give device=auto"
+    )
+    raise InputError("config", "device", f"{name!r}{why}", f"auto, or what is there: {', '.join(found)}", todo)
 
 
 def fits(size: int, device: torch.device) -> bool:

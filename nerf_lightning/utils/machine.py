@@ -4,7 +4,6 @@ import os
 import platform
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import torch
 
 CROWDED = 0.1
 """A machine counts as busy if other work took more than this share of a run's threads."""
-SHORTEST = 0.5
+MIN_SECONDS = 0.5
 """Shortest time, in seconds, over which the load can be measured: the system counts in hundredths."""
 
 
@@ -62,19 +61,15 @@ def work_clocks(threads: int) -> tuple[float, float]:
     return time.thread_time(), time.process_time() / threads
 
 
-def taken(cores: float, threads: float, others: float) -> float:
-    """Share of a run's threads taken by other work: what that used beyond the cores the run left free."""
-    return max(0.0, others - max(0.0, cores - threads)) / max(threads, 1.0)
-
-
 def crowding(results: Mapping[str, Any]) -> float | None:
-    """`taken`, from a run's results.json; None if it is not in there."""
-    load, machine = results.get("load"), results.get("machine")
-    if not isinstance(load, Mapping) or not isinstance(machine, Mapping):
+    """Share of a run's threads taken by other work, which used more than the cores the run left free; None if unknown."""
+    load, machine, threads = results.get("load"), results.get("machine"), results.get("threads")
+    if not (isinstance(load, Mapping) and isinstance(machine, Mapping) and isinstance(threads, int | float)):
         return None
-    found = (machine.get("cores"), results.get("threads"), load.get("others"))
-    figures = [figure for figure in found if isinstance(figure, int | float)]
-    return taken(*figures) if len(figures) == len(found) else None
+    others, cores = load.get("others"), machine.get("cores")
+    if not (isinstance(others, int | float) and isinstance(cores, int | float)):
+        return None
+    return max(0.0, others - max(0.0, cores - threads)) / max(threads, 1.0)
 
 
 def _busy_seconds() -> float:
@@ -85,15 +80,12 @@ def _busy_seconds() -> float:
     return sum(times) - idle - guests
 
 
-@dataclass
 class Load:
     """CPU seconds spent between `start` and `stop`, by this process and by everything else."""
 
-    seconds: float = 0.0
-    """On the wall clock."""
-    own: float = 0.0
-    others: float = 0.0
-    _since: tuple[float, float, float] | None = field(default=None, repr=False)
+    def __init__(self) -> None:
+        self.seconds = self.own = self.others = 0.0
+        self._since: tuple[float, float, float] | None = None
 
     @staticmethod
     def _now() -> tuple[float, float, float]:
@@ -108,12 +100,10 @@ class Load:
             return
         wall, own, busy = (now - then for now, then in zip(self._now(), self._since, strict=True))
         self._since = None
-        self.seconds += wall
-        self.own += own
-        self.others += busy - own  # briefly below zero, as the system counts in hundredths
+        self.seconds, self.own, self.others = self.seconds + wall, self.own + own, self.others + busy - own
 
     def cores(self) -> dict[str, float] | None:
         """Cores in use on average; None if too little time has passed."""
-        if self.seconds < SHORTEST:
+        if self.seconds < MIN_SECONDS:
             return None
         return {"own": round(self.own / self.seconds, 3), "others": round(max(0.0, self.others) / self.seconds, 3)}

@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal
 
 from nerf_lightning.errors import InputError
 
-WHOLE = 2**63 - 1
-"""The largest whole number that tensors and arrays hold: beyond it an option is none."""
-SINGLE = (2 - 2**-23) * 2.0**127
-"""The largest number of single precision, in which nearly everything is computed: beyond it an option would be infinite."""
+MAX_INT = 2**63 - 1
+"""The largest whole number that tensors hold."""
+MAX_FLOAT = (2 - 2**-23) * 2.0**127
+"""The largest number of single precision, in which nearly everything is computed."""
 
 
 @dataclass(frozen=True)
@@ -31,17 +31,15 @@ class AtMost:
 
 
 Count = Annotated[int, AtLeast(1)]
-"""A whole number of at least one."""
 Side = Annotated[int, AtLeast(1), AtMost(2**20)]
-"""Cells along a side of a grid: single precision tells 16 places within each apart, and their cube is still below `WHOLE`."""
+"""Cells along a side of a grid: single precision tells 16 places within each apart, and their cube is below `MAX_INT`."""
 Entries = Annotated[int, AtLeast(1), AtMost(30)]
-"""Logarithm of the entries of a table, whose places are whole numbers of 32 bits."""
+"""Logarithm of the entries of a table, which are indexed with 32 bits."""
 Layers = Annotated[int, AtLeast(1), AtMost(1024)]
-"""A number of parts that are made and run one after the other, as layers and levels: as many take a second a step."""
+"""Layers or levels, which are made and run one after the other."""
 Octaves = Annotated[int, AtLeast(0), AtMost(127)]
 """A number of frequencies, each twice the one before: the next is infinite in single precision."""
 Seed = Annotated[int, AtLeast(0), AtMost(2**32 - 1)]
-"""What NumPy and Lightning take."""
 Port = Annotated[int, AtLeast(0), AtMost(65535)]
 FramesPerSecond = Annotated[float, AtLeast(0.01), AtMost(1000)]
 """Films state how long a frame stays in thousandths of a second."""
@@ -70,37 +68,27 @@ def check_options(
     open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
     prefix = f"{where}." if where else ""
     for name, value in options.items():
-        if name not in parameters:
-            if open_ended:
-                continue
+        if name not in parameters and not open_ended:
             near = difflib.get_close_matches(name, parameters, 1)
             known = ", ".join(key for key in parameters if key not in given and key != "self")
-            raise InputError(
-                source,
-                prefix + name,
-                "an unknown option",
-                f"one of {known}",
-                f"did you mean {near[0]}?" if near else "",
-            )
+            todo = f"did you mean {near[0]}?" if near else ""
+            raise InputError(source, prefix + name, "an unknown option", f"one of {known}", todo)
         hint = hints.get(name, Any)
         if not _fits(value, hint):
-            raise InputError(source, prefix + name, repr(value)[:60], _describe(hint), _range_of(value))
+            raise InputError(source, prefix + name, repr(value)[:60], _describe(hint))
     for name, parameter in parameters.items():
-        required = parameter.default is inspect.Parameter.empty and parameter.kind in (
-            inspect.Parameter.POSITIONAL_OR_KEYWORD,
-            inspect.Parameter.KEYWORD_ONLY,
-        )
+        kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+        required = parameter.default is inspect.Parameter.empty and parameter.kind in kinds
         if complete and required and name not in options and name not in given:
-            raise InputError(
-                source, prefix + name, "nothing", _describe(hints.get(name, Any)), f"give {prefix}{name}=..."
-            )
+            expected, todo = _describe(hints.get(name, Any)), f"give {prefix}{name}=..."
+            raise InputError(source, prefix + name, "nothing", expected, todo)
 
 
 def _fits(value: Any, hint: Any) -> bool:
     """Whether a value from YAML fits an annotation; annotations other than plain values always fit."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        return _fits(value, arguments[0]) and all(_within(value, bound) for bound in arguments[1:])
+        return _fits(value, arguments[0]) and all(_is_within(value, bound) for bound in arguments[1:])
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, argument) for argument in arguments)
     if origin is Literal:
@@ -112,23 +100,16 @@ def _fits(value: Any, hint: Any) -> bool:
     if origin is dict:
         return isinstance(value, Mapping) and all(_fits(item, arguments[1]) for item in value.values())
     if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= SINGLE
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_FLOAT
     if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= WHOLE
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_INT
     if hint in (str, bool, type(None)):
         return isinstance(value, hint)
     # YAML cannot hold other classes, but a mapping may describe one (with a target of its own).
     return hint is Any or not inspect.isclass(hint) or isinstance(value, (hint, Mapping, list))
 
 
-def _range_of(value: Any) -> str:
-    """What numbers may be, for one that is too large or none."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) <= WHOLE:
-        return ""
-    return f"numbers are finite, whole ones at most {WHOLE:.3g}, others {SINGLE:.3g}"
-
-
-def _within(value: Any, bound: Any) -> bool:
+def _is_within(value: Any, bound: Any) -> bool:
     """Whether a number keeps a bound; other annotations are none."""
     if isinstance(bound, AtLeast):
         return value >= bound.value
@@ -139,8 +120,8 @@ def _describe(hint: Any) -> str:
     """An annotation in words."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        how = {AtLeast: "at least", AtMost: "at most"}
-        bounds = [f"{how[type(bound)]} {bound.value:.12g}" for bound in arguments[1:] if type(bound) in how]
+        sides = {AtLeast: "at least", AtMost: "at most"}
+        bounds = [f"{sides[type(bound)]} {bound.value:.12g}" for bound in arguments[1:] if type(bound) in sides]
         return f"{_describe(arguments[0])} {' and '.join(bounds)}"
     if origin in (typing.Union, types.UnionType):
         return " or ".join(_describe(argument) for argument in arguments)

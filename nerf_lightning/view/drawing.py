@@ -15,7 +15,7 @@ from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.sampler import UniformSampler
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 OVERVIEW_FOV = math.radians(50)
 """Vertical field of view of the browser's camera at first."""
@@ -135,10 +135,10 @@ def colour_points(
     points: Float[Tensor, "P 3"], views: Views
 ) -> tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
     """Some of the points of a subject, and for each the colour that it has in the nearest of some photos; grey in none."""
-    points = points[evenly(len(points), MAX_POINTS)].float()
+    points = points[subsample(len(points), MAX_POINTS)].float()
     rgb = torch.full((len(points), 3), 128, dtype=torch.uint8)
     nearest = torch.full((len(points),), math.inf)
-    for view in evenly(len(views), COLOUR_VIEWS):
+    for view in subsample(len(views), COLOUR_VIEWS):
         pixels, _, seen = views.cameras.project(points, view)
         distance = (points - views.cameras.centres[view]).norm(dim=1)
         closer = seen & (distance < nearest)

@@ -169,7 +169,9 @@ class FieldPage(Page):
             self.points("/ray/samples", places.cpu().numpy(), rgb(VERMILLION), 0.006)
         colour = ", ".join(f"{float(c):.2f}" for c in rendered.rgb[0])
         depth, opacity = float(rendered.depth[0]), float(rendered.opacity[0])
-        self.status.content = f"clicked: {len(samples)} samples, colour {colour}, opacity {opacity:.2f}, depth {depth:.3f}"
+        self.status.content = (
+            f"clicked: {len(samples)} samples, colour {colour}, opacity {opacity:.2f}, depth {depth:.3f}"
+        )
 
     def wish(self, visitor: Visitor) -> Wish:
         """The picture that a visitor asks for now."""

@@ -16,7 +16,7 @@ from nerf_lightning.drawing.panels import to_bytes
 from nerf_lightning.renderer import Rendered
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.device import synchronize
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 SLICE = 4
 """Chunks of rays rendered between two checks of whether the picture is still wanted."""
@@ -75,7 +75,7 @@ class Painter:
     def depths(self) -> tuple[float, float]:
         """The range of depths, from bright to dark."""
         if self._depths is None:
-            self._depths = depth_range(self.system, self.orbit[torch.tensor(evenly(len(self.orbit), 3))])
+            self._depths = depth_range(self.system, self.orbit[torch.tensor(subsample(len(self.orbit), 3))])
         return self._depths
 
     def forget(self) -> None:

@@ -4,7 +4,7 @@ import ipaddress
 import socket
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.extras import require
+from nerf_lightning.utils.libraries import require
 
 
 def require_viser() -> None:

@@ -19,7 +19,7 @@ from nerf_lightning.stability.methods import METHODS
 from nerf_lightning.stability.toys import MARBLE, toy
 from nerf_lightning.system import NeRF2D, StepStats, constant
 from nerf_lightning.training.train import train
-from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.libraries import silence_lightning
 
 
 class Blob(PictureField):
@@ -97,7 +97,7 @@ def run(system: NeRF2D, guard: Guard, tmp_path: Path, steps: int = 250, picture:
 
 @pytest.fixture(autouse=True)
 def without_lightnings_hints() -> None:
-    quiet()
+    silence_lightning()
 
 
 @pytest.mark.parametrize("how", ["not at all", "spike"])

@@ -2,7 +2,7 @@ import pytest
 
 from nerf_lightning.callbacks import Budget, HeldOut
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 
 @pytest.mark.parametrize(
@@ -15,13 +15,13 @@ from nerf_lightning.utils.evenly import evenly
     ],
 )
 def test_evenly_spaced_subset_has_expected_indices(total, count, expected):
-    assert evenly(total, count) == expected
+    assert subsample(total, count) == expected
 
 
 def test_evenly_spaced_subset_any_count_is_distinct_and_spread():
     for total in range(1, 60):
         for count in range(1, total):
-            chosen = evenly(total, count)
+            chosen = subsample(total, count)
             assert len(set(chosen)) == count and chosen == sorted(chosen)
             assert chosen[0] >= 0 and chosen[-1] < total
             gaps = [b - a for a, b in zip([-1, *chosen], [*chosen, total], strict=True)]

@@ -27,7 +27,7 @@ from nerf_lightning.runs.compact import decode, encode, without_folders
 from nerf_lightning.runs.folder import RunFolder
 from nerf_lightning.runs.scene_file import frame_from
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.utils.html import address_from
+from nerf_lightning.utils.text import relative_url
 
 HOSTILE = "</script><img src=x onerror=\"document.title='run'\">'\""
 SIDE = 24
@@ -193,7 +193,7 @@ def test_pages_side_by_side_turn_together_and_rest(browser: Any, tmp_path: Path)
     for name in names:
         (tmp_path / name).mkdir()
         (tmp_path / name / "field.html").write_text(page_of(made("voxels"), name)[0], encoding="utf-8")
-    pages = [(address_from(tmp_path, tmp_path / name / "field.html"), name, "20 dB") for name in names]
+    pages = [(relative_url(tmp_path, tmp_path / name / "field.html"), name, "20 dB") for name in names]
     (tmp_path / "gallery.html").write_text(gallery_page("made", pages), encoding="utf-8")
     page = browser.new_page(viewport={"width": 720, "height": 420})
     page.goto((tmp_path / "gallery.html").as_uri())

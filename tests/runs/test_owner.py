@@ -8,15 +8,13 @@ import pytest
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.verb import NAMES
-from nerf_lightning.runs.owner import LOCK, MADE, Taken, clear, holds_run, own_folder, owned
+from nerf_lightning.runs.owner import LOCK, Taken, clear, own_folder, owned
 
-MANY = 20
+MANY = 8
 
 
 @pytest.mark.parametrize("renamed", [True, False])
-def test_twenty_at_once(renamed: bool, tmp_path: Path):
-    """In folders of their own, or one alone, also once it has ended."""
+def test_runs_that_begin_together_get_folders_of_their_own_or_an_error(renamed: bool, tmp_path: Path):
     together = Barrier(MANY)
 
     def begin(_: int) -> str:
@@ -34,29 +32,34 @@ def test_twenty_at_once(renamed: bool, tmp_path: Path):
         found = list(pool.map(begin, range(MANY)))
     names = [name for name in found if name.startswith("run")]
     assert len(set(names)) == len(names) == (MANY if renamed else 1)
-    assert all("found a run that is still going on" in line for line in set(found) - set(names))
-    assert not list(tmp_path.rglob(LOCK))
+    assert all("a run that is in progress" in line for line in set(found) - set(names))
     with pytest.raises(Taken, match="found a run in it already"), own_folder(tmp_path / "run", overwrite=False):
         pass
     with own_folder(tmp_path / "run", overwrite=True) as folder:
         assert folder == tmp_path / "run"
     with own_folder(tmp_path / "run", overwrite=True, renamed=True) as folder:
-        assert folder.name == ("run-21" if renamed else "run-2"), "nobody asked for that very name"
+        assert folder.name == (f"run-{MANY + 1}" if renamed else "run-2"), "nobody asked for that very name"
 
 
-def test_what_was_made_for_nothing_is_removed(tmp_path: Path):
-    with pytest.raises(KeyError), owned(tmp_path / "a"):
+def test_owned_removes_what_was_made_for_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(KeyError), owned(Path("a/b")):
         raise KeyError
-    (tmp_path / "b").mkdir()
-    with owned(tmp_path / "b"):
-        pass
-    assert [path.name for path in tmp_path.iterdir()] == ["b"]
+    assert not list(tmp_path.iterdir())
+    with owned(Path("kept")):
+        Path("kept/file").touch()
+    assert sorted(path.name for path in Path("kept").iterdir()) == [LOCK, "file"]
 
 
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path):
+def test_owned_refuses_what_it_cannot_write_and_files_of_others(tmp_path: Path):
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="expected a folder that can be written"), owned(tmp_path / "file" / "run"):
+    with pytest.raises(InputError, match="a folder that can be written"), owned(tmp_path / "file" / "run"):
         pass
+    with pytest.raises(InputError, match="other files in it"), owned(tmp_path):
+        pass
+    with owned(tmp_path, resumed=True):
+        pass
+    assert (tmp_path / "file").exists()
 
 
 def test_processes_that_share_a_run_leave_the_folder_to_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -65,16 +68,15 @@ def test_processes_that_share_a_run_leave_the_folder_to_the_first(tmp_path: Path
         assert folder == tmp_path / "run" and not folder.exists()
 
 
-def test_a_finished_runs_files_are_all_removed_and_others_stay(small_run: Path, tmp_path: Path):
-    assert all(any(path.match(name) for name in MADE) for path in small_run.iterdir())
-    assert set(NAMES.values()) <= set(MADE)
+@pytest.mark.parametrize("own", [True, False])
+def test_clear_removes_all_of_its_own_folder_and_only_runs_elsewhere(own: bool, tmp_path: Path):
+    (tmp_path / "notes.txt").touch()
+    clear(tmp_path)
+    assert (tmp_path / "notes.txt").exists(), "there is no run"
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "last.ckpt").touch()
-    for name in ("notes.txt", "events.out.tfevents.1.machine.2.0"):
-        (tmp_path / name).touch()
-    assert holds_run(tmp_path)
+    (tmp_path / "results.json").touch()
+    if own:
+        (tmp_path / LOCK).touch()
     clear(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-    (tmp_path / "snapshots").mkdir()
-    clear(tmp_path)
-    assert (tmp_path / "snapshots").is_dir(), "of something else: no run is there"
+    assert [path.name for path in tmp_path.iterdir()] == [LOCK if own else "notes.txt"]

@@ -18,7 +18,7 @@ from commands import ROOT
 from nerf_lightning.errors import InputError
 from nerf_lightning.stability.cell import Cell
 from nerf_lightning.stability.suite import run_all
-from nerf_lightning.utils.ending import Interrupted, listen
+from nerf_lightning.utils.signals import Interrupted, handle_signals
 
 LONG = 60.0
 """Seconds after which something will not come."""
@@ -59,10 +59,9 @@ def wait_for(what: Callable[[], bool]) -> None:
 
 def test_asked_to_end_it_ends_also_those_that_do_not_hear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("nerf_lightning.stability.suite.GRACE", 0.2)
-    listen()
     main = os.getpid()
     Thread(target=lambda: (begun(tmp_path), os.kill(main, signal.SIGTERM)), daemon=True).start()
-    with pytest.raises(Interrupted):
+    with pytest.raises(Interrupted), handle_signals():
         list(run_all([DEAF], tmp_path, 1))
     child = begun(tmp_path)
     wait_for(lambda: not psutil.pid_exists(child))

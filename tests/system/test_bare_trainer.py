@@ -13,7 +13,7 @@ from nerf_lightning.runs.folder import load_run
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import prepare, train
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.quiet import quiet
+from nerf_lightning.utils.libraries import silence_lightning
 
 STEPS = 24
 OPTIONS = ("+experiment=smoke_3d", "dataset.size=16", "dataset.train_views=6", f"budget.steps={STEPS}", "device=cpu")
@@ -21,7 +21,7 @@ OFF = ("callbacks.heldout=null", "callbacks.snapshots=null", "callbacks.orbit=nu
 
 
 def bare(steps: int) -> L.Trainer:
-    quiet()
+    silence_lightning()
     return L.Trainer(
         max_steps=steps,
         max_epochs=-1,

@@ -4,8 +4,6 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,9 +11,7 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
-from nerf_lightning.__main__ import main as train
 from nerf_lightning.callbacks.results import peak_memory_bytes
-from nerf_lightning.config import cli
 from nerf_lightning.config.build import build_system, build_trainer, device_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.limits import Limits, limits_of
@@ -23,27 +19,13 @@ from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.dataset.picture import builtin_picture
 from nerf_lightning.dataset.pixels import Picture
 from nerf_lightning.errors import InputError
-from nerf_lightning.evaluate.__main__ import task as evaluate
-from nerf_lightning.export.__main__ import task as export
-from nerf_lightning.render.__main__ import task as render
-from nerf_lightning.rightsize.__main__ import task as rightsize
+from nerf_lightning.runs.owner import LOCK
 from nerf_lightning.stability.toys import MARBLE, toy
 from nerf_lightning.system import NeRF2D
 from nerf_lightning.utils.device import CPU, devices, synchronize, the_device
 from nerf_lightning.utils.machine import accelerator, device_in_words
-from nerf_lightning.view.__main__ import task as view
 
 ROOT = Path(__file__).resolve().parents[2]
-VERBS: dict[str, tuple[Callable[[], None], list[str]]] = {
-    "train": (train, ["dataset.path=nowhere.npz", "dataset=photos"]),
-    "sweep": (train, ["-m", "+experiment=smoke_2d", "seed=0,1"]),
-    "rightsize": (partial(cli.run, "rightsize", rightsize), ["dataset=photos", "dataset.path=nowhere.npz"]),
-    "render": (partial(cli.run, "render", render), ["run=nowhere"]),
-    "view": (partial(cli.run, "view", view), ["run=nowhere"]),
-    "evaluate": (partial(cli.run, "evaluate", evaluate), ["run=nowhere"]),
-    "compact": (partial(cli.run, "export", export), ["run=nowhere"]),
-    "mesh": (partial(cli.run, "export", export), ["run=nowhere", "format=ply"]),
-}
 
 
 @pytest.fixture
@@ -56,30 +38,22 @@ def plain_torch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("device", ["cuda", "nonsense"])
-@pytest.mark.parametrize("name", VERBS)
-def test_a_missing_device_is_one_line_and_nothing_is_written(
-    name: str, device: str, verb, plain_torch: None, tmp_path: Path
-):
-    main, given = VERBS[name]
-    code, _, err = verb(main, *given, f"device={device}")
-    assert code == 2 and err.count("\n") == 1, err
-    found = {"cuda": "cuda, but this PyTorch has no CUDA", "nonsense": "'nonsense'"}[device]
-    assert f"config: device: found {found}, expected auto, or what is there: cpu" in err
+def test_missing_device_is_refused_before_anything_is_written(device: str, inside, plain_torch: None, tmp_path: Path):
+    code, _, err = inside("dataset.path=nowhere.npz", "dataset=photos", f"device={device}")
+    assert code == 2 and err.count("\n") == 1 and f"config: device: found '{device}'" in err, err
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     "given", [["device=cpu,cuda"], ["trainer.accelerator=cuda", "seed=0,1"], ["trainer.accelerator=cpu,cuda"]]
 )
-def test_no_job_of_a_sweep_starts_where_one_asks_for_a_missing_device(
-    given: list[str], verb, plain_torch: None, tmp_path: Path
-):
-    code, _, err = verb(train, "-m", "+experiment=smoke_2d", *given)
-    assert code == 2 and err.count("\n") == 1 and "no CUDA" in err, err
+def test_sweep_with_a_missing_device_starts_no_job(given: list[str], inside, plain_torch: None, tmp_path: Path):
+    code, _, err = inside("-m", "+experiment=smoke_2d", *given)
+    assert code == 2 and err.count("\n") == 1 and "'cuda'" in err, err
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_there_is_known_on_the_machine_that_runs_the_jobs(plain_torch: None, tmp_path: Path):
+def test_devices_of_a_cluster_are_not_checked_here(plain_torch: None, tmp_path: Path):
     from nerf_lightning.training.sweep_plan import devices_asked
 
     cfg = composed(["device=cuda"], tmp_path)
@@ -88,7 +62,7 @@ def test_what_is_there_is_known_on_the_machine_that_runs_the_jobs(plain_torch: N
         assert devices_asked(OmegaConf.merge(cfg, {"hydra": hydra})) == asked
 
 
-def test_a_resumed_run_may_go_on_elsewhere(inside, small_run: Path, plain_torch: None, tmp_path: Path):
+def test_resumed_run_may_use_another_device(inside, small_run: Path, plain_torch: None, tmp_path: Path):
     run = tmp_path / "run"
     shutil.copytree(small_run, run)
     config = yaml.safe_load((run / "config.yaml").read_text())
@@ -97,8 +71,9 @@ def test_a_resumed_run_may_go_on_elsewhere(inside, small_run: Path, plain_torch:
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     for key in ("device", "trainer.accelerator"):
         code, _, err = inside(f"resume={run}", f"{key}=cuda")
-        assert code == 2 and err.count("\n") == 1 and "device: found cuda, but" in err, err
-    assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*")}, "nothing was touched"
+        assert code == 2 and err.count("\n") == 1 and "device: found 'cuda', but" in err, err
+    after = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.name != LOCK}
+    assert before == after, "nothing was touched"
     code, _, err = inside(f"resume={run}", "device=cpu", "limits.chunk=100", "budget.steps=12")
     assert code == 0, err
     saved = yaml.safe_load((run / "config.yaml").read_text())
@@ -107,7 +82,7 @@ def test_a_resumed_run_may_go_on_elsewhere(inside, small_run: Path, plain_torch:
     assert json.loads((run / "results.json").read_text())["steps"] == 12
 
 
-def test_the_best_that_is_there(monkeypatch: pytest.MonkeyPatch, plain_torch: None):
+def test_auto_is_the_best_device(monkeypatch: pytest.MonkeyPatch, plain_torch: None):
     assert devices()[:1] == ["cpu"] and the_device("auto") == the_device("cpu") == CPU
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     assert the_device("auto") == the_device("mps") == torch.device("mps")
@@ -118,15 +93,16 @@ def test_the_best_that_is_there(monkeypatch: pytest.MonkeyPatch, plain_torch: No
 @pytest.mark.parametrize(
     ("name", "built", "words"),
     [
-        ("cuda", True, "cuda, but there is no such card, expected auto, or what is there: cpu"),
-        ("cuda", False, "cuda, but this PyTorch has no CUDA, expected auto, or what is there: cpu; install"),
-        ("mps", True, "mps, but this machine has no MPS"),
-        ("mps", False, "mps, but this PyTorch has no MPS"),
+        ("cuda", True, "'cuda', but there is no such chip, expected auto, or what is there: cpu"),
+        ("cuda", False, "install PyTorch's CUDA build"),
+        ("mps", False, "'mps', but this PyTorch"),
         ("gpu", True, "'gpu', expected auto, or what is there: cpu"),
         ("privateuseone", True, "'privateuseone'"),
     ],
 )
-def test_why_it_is_not_there(name: str, built: bool, words: str, monkeypatch: pytest.MonkeyPatch, plain_torch: None):
+def test_missing_device_says_why(
+    name: str, built: bool, words: str, monkeypatch: pytest.MonkeyPatch, plain_torch: None
+):
     for kind in (torch.backends.cuda, torch.backends.mps):
         monkeypatch.setattr(kind, "is_built", lambda: built)
     with pytest.raises(InputError, match=words):
@@ -157,13 +133,13 @@ assert waited
 """
 
 
-def test_a_backend_that_somebody_registered_with_torch():
+def test_registered_backend_is_found():
     """In a process of its own: it is registered for good."""
     done = subprocess.run([sys.executable, "-c", REGISTERED], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
 
 
-def test_the_trainer_and_the_verbs_agree(tmp_path: Path, plain_torch: None):
+def test_trainer_uses_the_device(tmp_path: Path, plain_torch: None):
     for given in (["device=cpu"], ["trainer.accelerator=cpu"], ["device=cuda", "trainer.accelerator=cpu"], []):
         cfg = composed([*given, "callbacks=picture", "~logger"], tmp_path)
         assert device_of(cfg) == CPU
@@ -175,14 +151,13 @@ def test_the_trainer_and_the_verbs_agree(tmp_path: Path, plain_torch: None):
     ("device", "batch", "chunk"),
     [("cpu", 1, 32768), ("cuda", 4, 524288), ("mps", 4, 131072), ("xpu", 1, 32768)],
 )
-def test_each_device_has_limits_of_its_own_that_a_run_overrides(device: str, batch: int, chunk: int):
+def test_limits_follow_device_and_run(device: str, batch: int, chunk: int):
     where = torch.device(device)
 
     def limits(**given: object) -> Limits:
         return limits_of(OmegaConf.create({"limits": given}), where)
 
     assert limits() == limits(batch=None, chunk=None) == Limits(batch, chunk)
-    assert limits_of(OmegaConf.create({}), where) == Limits(batch, chunk), "of an earlier version"
     assert (limits(batch=3), limits(chunk=7)) == (Limits(3, chunk), Limits(batch, 7))
     for broken in ({"batch": 0}, {"chunk": "many"}, {"rays": 3}):
         with pytest.raises(InputError, match=f"limits.{next(iter(broken))}"):
@@ -191,7 +166,7 @@ def test_each_device_has_limits_of_its_own_that_a_run_overrides(device: str, bat
         limits_of(OmegaConf.create({"limits": 3}), where)
 
 
-def test_a_system_renders_as_much_at_once_as_its_device_takes(tmp_path: Path):
+def test_chunk_follows_the_device(tmp_path: Path):
     from nerf_lightning.config.build import PictureFrame, frame_of
 
     cfg, data = composed([], tmp_path), RayDataModule(toy(MARBLE, size=4, views=3, held_out=1))
@@ -203,7 +178,7 @@ def test_a_system_renders_as_much_at_once_as_its_device_takes(tmp_path: Path):
     assert isinstance(flat, NeRF2D) and flat.chunk == 5
 
 
-def test_a_training_step_takes_as_much_as_its_device_takes(inside, tmp_path: Path):
+def test_batch_follows_limits(inside, tmp_path: Path):
     given = ["+experiment=smoke_2d", "dataset.max_side=16", "dataset.pixels=10", "budget.steps=3", "~logger"]
     plain = ["callbacks.training_gif=null", "callbacks.charts=null", "callbacks.baselines=null"]
     assert inside(*given, *plain, "limits.batch=7")[0] == 0
@@ -212,7 +187,7 @@ def test_a_training_step_takes_as_much_as_its_device_takes(inside, tmp_path: Pat
     assert told["rays"] == 3 * 70
 
 
-def test_batches_of_other_devices():
+def test_resumed_batch_is_scaled_to_the_device():
     picture = PixelDataModule(Picture("sunset", "test", builtin_picture(8)), pixels=10)
     picture.enlarge(4)
     assert len(picture.draw(0).uv) == 40
@@ -225,14 +200,12 @@ def test_batches_of_other_devices():
     assert large.rays == 1040
     small.load_state_dict(large.state_dict())
     assert small.rays == 130, "resumed where a step takes an eighth"
-    large.load_state_dict({"rays": 55})
-    assert large.rays == 440, "of an earlier version"
     other = RayDataModule(scene, 100)
     other.load_state_dict(fixed.state_dict())
     assert other.rays == 100
 
 
-def test_chips_have_names(monkeypatch: pytest.MonkeyPatch):
+def test_accelerators_are_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "H100")
     monkeypatch.setattr(torch.backends.mps, "get_name", lambda: "Apple M9", raising=False)
     told = {name: accelerator(torch.device(name)) for name in ("cpu", "cuda:1", "mps", "xpu")}
@@ -241,14 +214,14 @@ def test_chips_have_names(monkeypatch: pytest.MonkeyPatch):
     assert words == ["cpu", "cuda (H100)", "mps (Apple M9)", "xpu"]
 
 
-def test_memory_is_that_of_the_device(monkeypatch: pytest.MonkeyPatch):
+def test_peak_memory_is_that_of_the_device(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 5)
     monkeypatch.setattr(torch.mps, "driver_allocated_memory", lambda: 7)
     assert (peak_memory_bytes(torch.device("cuda:1")), peak_memory_bytes(torch.device("mps"))) == (5, 7)
     assert (peak_memory_bytes(CPU) or 0) > 1000
 
 
-def test_clocks_wait_for_the_device(monkeypatch: pytest.MonkeyPatch):
+def test_synchronize_waits_for_the_device(monkeypatch: pytest.MonkeyPatch):
     waited = []
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: waited.append("cuda"))
     monkeypatch.setattr(torch.mps, "synchronize", lambda: waited.append("mps"))

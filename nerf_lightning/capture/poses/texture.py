@@ -15,7 +15,7 @@ from nerf_lightning.capture.poses.tracks import Keypoint, linked, triangulated
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.dataset.placing.structure import SIDE, find_features, match_photos, write_copies
 from nerf_lightning.dataset.resize import fit_size
-from nerf_lightning.utils.extras import require
+from nerf_lightning.utils.libraries import require
 
 log = logging.getLogger(__name__)
 

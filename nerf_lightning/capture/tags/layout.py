@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from nerf_lightning.dataset.formats.checks import FARTHEST
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.untrusted import read_yaml
+from nerf_lightning.utils.parsing import read_yaml
 
 SQUARE = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) / 2
 """Corners of a tag of side 1 in its own frame, in OpenCV's order: the printed top left first, then clockwise."""

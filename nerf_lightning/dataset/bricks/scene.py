@@ -17,9 +17,9 @@ from nerf_lightning.dataset.bricks.trace import picture, shadow
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError, Unwritable
-from nerf_lightning.utils.arrays import Header, Headers, read_npz
 from nerf_lightning.utils.files import atomic, cache_folder
 from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.parsing import Header, Headers, read_npz
 
 VERSION = 1
 """Part of the cache file's name: raise it whenever model, shading or cameras change."""

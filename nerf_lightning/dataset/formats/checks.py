@@ -15,9 +15,8 @@ from jaxtyping import Float, Shaped, UInt8
 
 from nerf_lightning.cameras import axes_meet, focus_point
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.arrays import Header
 from nerf_lightning.utils.memory import check_memory
-from nerf_lightning.utils.untrusted import read_json
+from nerf_lightning.utils.parsing import Header, read_json
 
 log = logging.getLogger(__name__)
 

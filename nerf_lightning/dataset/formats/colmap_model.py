@@ -16,7 +16,7 @@ from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.colmap_cameras import MODELS, NUMBERS, optics_of
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.untrusted import read_content
+from nerf_lightning.utils.parsing import read_content
 
 FILES = ("cameras", "images", "points3D")
 LONGEST_NAME = 4096

@@ -16,10 +16,9 @@ from PIL.JpegImagePlugin import JpegImageFile
 
 from nerf_lightning.dataset.formats.header import DAMAGED, JPEG, QUARTER_TURNS, read_header
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.extras import require
+from nerf_lightning.utils.libraries import require
 from nerf_lightning.utils.memory import check_memory
-from nerf_lightning.utils.quiet import native_errors_hidden
-from nerf_lightning.utils.untrusted import existing_file
+from nerf_lightning.utils.parsing import existing_file
 
 THREADS = 4
 TURNS = {
@@ -67,10 +66,9 @@ def read_pixels(path: Path, upright: bool = False, size: tuple[int, int] | None 
         if data.startswith(PNG):
             _check_png(path, data)
         # UNCHANGED keeps alpha and 16 bits, and leaves the EXIF rotation alone.
-        with native_errors_hidden():  # what follows says it in a line
-            raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-            if raw is not None and upright and (raw.ndim == 2 or raw.shape[2] < 4):
-                raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+        raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        if raw is not None and upright and (raw.ndim == 2 or raw.shape[2] < 4):
+            raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     except (cv2.error, OSError) as error:
         raise InputError(path, "", f"an unreadable image ({error})", "a PNG, JPEG or TIFF") from error
     if raw is None and data[8:12] in HEIC:

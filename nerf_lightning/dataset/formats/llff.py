@@ -14,7 +14,7 @@ from nerf_lightning.dataset.posed import Hints, build_scene
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.arrays import Header, read_npy
+from nerf_lightning.utils.parsing import Header, read_npy
 
 POSES = "poses_bounds.npy"
 

@@ -22,8 +22,8 @@ from nerf_lightning.dataset.shots import AS_IT_IS, Reading
 from nerf_lightning.dataset.size import choose_resize
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.arrays import Headers, read_npz
 from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.parsing import Headers, read_npz
 
 log = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from nerf_lightning.dataset.placing.video import colours, frames, grey, seconds_
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic_folder
-from nerf_lightning.utils.untrusted import existing_file
+from nerf_lightning.utils.parsing import existing_file
 
 log = logging.getLogger(__name__)
 

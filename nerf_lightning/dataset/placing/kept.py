@@ -8,7 +8,7 @@ from typing import Any
 
 from nerf_lightning.errors import InputError, Unwritable
 from nerf_lightning.utils.files import atomic_folder, cache_folder, write_json
-from nerf_lightning.utils.untrusted import read_json
+from nerf_lightning.utils.parsing import read_json
 
 log = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from nerf_lightning.dataset.placing.kept import find_kept, keep, made_of
 from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.dataset.placing.structure import reconstruct
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.extras import require
-from nerf_lightning.utils.listing import first_few
+from nerf_lightning.utils.libraries import require
+from nerf_lightning.utils.text import join_truncated
 
 log = logging.getLogger(__name__)
 
@@ -69,4 +69,4 @@ def _told(target: Path, count: int, missing: Sequence[str]) -> str:
     line = f"{count - len(missing)} of {count} photos placed, kept in {target}"
     if not missing:
         return line
-    return f"{line}; not placed, for they share too few points with the others: {first_few(missing, SHOWN)}"
+    return f"{line}; not placed, for they share too few points with the others: {join_truncated(missing, SHOWN)}"

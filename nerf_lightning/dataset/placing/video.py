@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.extras import require
+from nerf_lightning.utils.libraries import require
+from nerf_lightning.utils.parsing import existing_file
 from nerf_lightning.utils.progress import tracked
-from nerf_lightning.utils.untrusted import existing_file
 
 if TYPE_CHECKING:
     import av

@@ -64,7 +64,6 @@ class SoftenableReLU(torch.nn.Module):
         return shifted_softplus(x) if self._soft else torch.relu(x)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        state_dict.setdefault(prefix + "soft", torch.tensor(False))  # older checkpoints lack it
         super()._load_from_state_dict(state_dict, prefix, *rest)
         self._soft = bool(self.soft)
 

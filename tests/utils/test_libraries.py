@@ -5,9 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from commands import ROOT
 
 from nerf_lightning.evaluate import perceptual
+from nerf_lightning.utils.libraries import SPIN_COUNT, shorten_openmp_waits
 
 BROKEN = "raise RuntimeError('operator torchvision::nms does not exist')"
 FITTING = {
@@ -64,7 +66,7 @@ def run(code: str, folder: Path, files: dict[str, str]) -> list[str]:
     return [*done.stdout.splitlines(), *done.stderr.splitlines()]
 
 
-def test_one_that_does_not_fit_costs_a_line_and_no_training(tmp_path: Path):
+def test_torchvision_for_another_pytorch_costs_one_warning(tmp_path: Path):
     lines = run(TRAIN + MEASURE, tmp_path, {"__init__.py": BROKEN})
     assert (tmp_path / "run" / "results.json").exists()
     warning, lpips = [line for line in lines if "torchvision" in line]
@@ -75,6 +77,20 @@ def test_one_that_does_not_fit_costs_a_line_and_no_training(tmp_path: Path):
     assert lpips == f"LPIPS: {warning.removeprefix('WARNING: ')} None"
 
 
-def test_one_that_fits_measures_lpips(tmp_path: Path):
+def test_fitting_torchvision_measures_lpips(tmp_path: Path):
     lines = run(MEASURE, tmp_path, FITTING)
     assert lines == ["LPIPS:  (0.0, True)"]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [({}, str(SPIN_COUNT)), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "ACTIVE"}, None)],
+)
+def test_openmp_waits_briefly_unless_told_otherwise(given: dict, expected: str | None, monkeypatch: pytest.MonkeyPatch):
+    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
+        monkeypatch.setenv(name, "")  # so that it is as before afterwards
+        monkeypatch.delenv(name)
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    shorten_openmp_waits()
+    assert os.environ.get("GOMP_SPINCOUNT") == expected

@@ -1,0 +1,207 @@
+"""JSON, YAML and .npz files from outside: read whole or refused in one line. Nothing in them is executed."""
+
+import io
+import json
+import lzma
+import math
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import yaml
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.memory import check_memory
+
+MAX_YAML_BYTES = 1 << 20
+JSON_BYTES_PER_BYTE = 32
+"""Of memory for a byte of JSON: `{},` becomes 72 bytes."""
+VALUE_ERRORS = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
+"""What Python and libraries raise for values of a wrong kind, where a file's content goes through code that trusts it."""
+DAMAGE_ERRORS = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, tokenize.TokenError, SyntaxError),
+    *VALUE_ERRORS,
+)
+"""What zipfile, NumPy and PyTorch raise for a damaged file."""
+
+
+def existing_file(path: Path, expected: str = "a file", missing: str = "check the path") -> Path:
+    """Refuses a folder, and what is no ordinary file: a pipe or a device may never end; `missing` is what to do without one."""
+    try:
+        folder, file = path.is_dir(), path.is_file()
+    except (OSError, ValueError) as error:  # a name too long, or with a zero byte
+        raise InputError(path, "", f"no file's name ({error})", expected, missing) from error
+    if not file:
+        raise InputError(path, "", "a folder" if folder else "nothing there", expected, "" if folder else missing)
+    return path
+
+
+def read_content(path: Path, expected: str = "a file that can be read", cost: float = 1) -> bytes:
+    """All bytes of a file, of which each will need `cost` bytes of memory.
+
+    Raises:
+        InputError: it is missing, cannot be read, or is too large for the memory that is left.
+    """
+    existing_file(path, expected)
+    try:
+        check_memory(path, "", "content", path.stat().st_size * cost)
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "", f"something unreadable ({error})", expected) from error
+
+
+def read_json(path: Path, expected: str, todo: str = "export it again") -> Any:
+    """What a JSON file holds, in UTF-8, UTF-16 or UTF-32; `expected` and `todo` are for messages.
+
+    Raises:
+        InputError: as `read_content`, and where it is no JSON.
+    """
+    return parse_json(read_content(path, expected, JSON_BYTES_PER_BYTE), path, expected, todo)
+
+
+def parse_json(content: bytes, where: object, expected: str, todo: str = "") -> Any:
+    """As `read_json`, of a file's content; `where` it came from is for messages.
+
+    Raises:
+        InputError: it is no JSON.
+    """
+    try:
+        return json.loads(content.decode(json.detect_encoding(content)))
+    except json.JSONDecodeError as error:
+        broken = f"broken JSON at line {error.lineno}, column {error.colno} ({error.msg})"
+        raise InputError(where, "", broken, expected, todo) from error
+    except (RecursionError, ValueError, MemoryError) as error:
+        raise InputError(where, "", f"no JSON ({type(error).__name__}: {error})", expected, todo) from error
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """A SafeLoader without aliases, of which a few lines can stand for any amount of values."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError(
+                f"line {self.peek_event().start_mark.line + 1}: an alias (*{self.peek_event().anchor})"
+            )
+        return super().compose_node(parent, index)
+
+
+def read_yaml(path: Path, expected: str, todo: str = "") -> Any:
+    """What a YAML file holds: plain values; `expected` and `todo` are for messages.
+
+    Raises:
+        InputError: as `read_content`, and where it is no YAML, larger than `MAX_YAML_BYTES`, or has aliases.
+    """
+    if (size := existing_file(path, expected).stat().st_size) > MAX_YAML_BYTES:
+        raise InputError(path, "", f"{size} bytes", f"{expected}, of at most {MAX_YAML_BYTES} bytes", todo)
+    content = read_content(path, expected)
+    try:
+        return yaml.load(content.decode("utf-8-sig"), _PlainLoader)  # noqa: S506  (a SafeLoader)
+    except (yaml.YAMLError, *VALUE_ERRORS) as error:  # Python's own for a date or a number that is none
+        raise InputError(path, "", f"no YAML ({type(error).__name__}: {error})", expected, todo) from error
+
+
+@dataclass(frozen=True)
+class Header:
+    """Shape and type of an array that has not been read yet."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+    @property
+    def nbytes(self) -> int:
+        return self.size * self.dtype.itemsize
+
+
+Headers = Mapping[str, Header]
+
+
+def read_npz(
+    source: Path | bytes,
+    known: Iterable[str] | None,
+    check: Callable[[Headers], None],
+    where: object = None,
+    expected: str = "plain numeric arrays in a whole .npz file",
+) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file; other entries stay unread.
+
+    Args:
+        source: the file, or its content.
+        known: names of the arrays to read, as far as they are there; None reads all.
+        check: gets their headers before any is unpacked, and raises InputError for what should not be.
+        where: a content came from, for messages.
+        expected: for messages.
+
+    Raises:
+        InputError: it is no such file, is damaged, holds pickled objects, or unpacks to more than fits into memory.
+    """
+    where = source if isinstance(source, Path) else where
+    if isinstance(source, Path):
+        existing_file(source, expected)
+    with (
+        _reporting_damage(where, expected),
+        zipfile.ZipFile(source if isinstance(source, Path) else io.BytesIO(source)) as archive,
+    ):
+        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        names = list(members) if known is None else [name for name in known if name in members]
+        headers = {}
+        for name in names:
+            with archive.open(members[name]) as stream:
+                headers[name] = _read_header(stream, members[name].file_size)
+        check(headers)
+        check_memory(where, "", "arrays", sum(header.nbytes for header in headers.values()))
+        arrays = {}
+        for name in names:
+            with archive.open(members[name]) as stream:
+                arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
+        return arrays
+
+
+def read_npy(path: Path, check: Callable[[Header], None]) -> np.ndarray:
+    """The array of an .npy file; `check` gets its header before it is read.
+
+    Raises:
+        InputError: it is no such file, is damaged or cut short, or holds pickled objects.
+    """
+    existing_file(path)
+    with _reporting_damage(path, "an .npy array of numbers"), path.open("rb") as file:
+        header = _read_header(file, path.stat().st_size)
+        check(header)
+        check_memory(path, "", "an array", header.nbytes)
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False)
+
+
+@contextmanager
+def _reporting_damage(where: object, expected: str) -> Iterator[None]:
+    try:
+        yield
+    except InputError:
+        raise
+    except DAMAGE_ERRORS as error:
+        found = f"something unreadable ({type(error).__name__}: {error})"
+        raise InputError(where, "", found, expected, "save or copy it again") from error
+
+
+def _read_header(stream: io.BufferedIOBase | IO[bytes], size: int) -> Header:
+    """An array's header, if as many bytes follow it as it declares; `size` is that of the whole file or entry."""
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version} of the format .npy")  # 3 only adds letters to the names of fields
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    if dtype.hasobject:
+        raise ValueError("Object arrays cannot be loaded")
+    header = Header(shape, dtype)
+    if min(shape, default=0) < 0 or header.nbytes != size - stream.tell():
+        raise ValueError(f"{size - stream.tell()} bytes for an array of shape {shape} and type {dtype}")
+    return header

@@ -1,0 +1,98 @@
+"""SIGINT (Ctrl-C) and SIGTERM: the first one ends the process in order, with exit code 128 + signal, the second one at once."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+CONTINUE = "the same command continues"
+_received: int | None = None
+_deferred = False
+
+
+class Interrupted(BaseException):
+    """A signal; `hint` says what continues the work. No KeyboardInterrupt, which Lightning turns into exit code 1."""
+
+    def __init__(self, signum: int, hint: str = CONTINUE):
+        super().__init__(signum)
+        self.signum, self.hint = signum, hint
+
+
+@contextmanager
+def handle_signals() -> Iterator[None]:
+    """Within the block a signal raises `Interrupted`, inside `defer_signals` at the end of that. Nested, it does nothing."""
+    global _received
+    handlers = {signum: signal.getsignal(signum) for signum in SIGNALS}
+    if _handle in handlers.values() or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    install_handlers()
+    try:
+        yield
+    finally:
+        _received = None
+        for signum, handler in handlers.items():
+            signal.signal(signum, handler)
+
+
+def install_handlers() -> None:
+    """Takes both signals, also back from Lightning, whose handler of SIGTERM ends a training with exit code 0."""
+    if threading.current_thread() is threading.main_thread():
+        for signum in SIGNALS:
+            signal.signal(signum, _handle)
+
+
+@contextmanager
+def exit_on_signal() -> Iterator[None]:
+    """`handle_signals` for a command line: prints one line and exits."""
+    with handle_signals():
+        try:
+            yield
+        except BaseException as error:  # a library may have turned `Interrupted` into an error of its own
+            if _received is None:
+                raise
+            hint = error.hint if isinstance(error, Interrupted) else CONTINUE
+            print(
+                f"nerf_lightning: interrupted ({signal.Signals(_received).name}); {hint}", file=sys.stderr, flush=True
+            )
+            sys.exit(128 + _received)
+
+
+@contextmanager
+def defer_signals(deferred: bool = True) -> Iterator[None]:
+    """Defers the first signal to the end of a block; with False, lets it interrupt a part of such a block."""
+    global _deferred
+    before, _deferred = _deferred, deferred
+    try:
+        if not deferred:
+            raise_if_signalled()
+        yield
+    finally:
+        _deferred = before
+    if not _deferred:
+        raise_if_signalled()
+
+
+def received_signal() -> int | None:
+    """The signal that asks this process to end, if one has come."""
+    return _received
+
+
+def raise_if_signalled() -> None:
+    if _received is not None:
+        raise Interrupted(_received)
+
+
+def _handle(signum: int, frame: FrameType | None) -> None:
+    global _received
+    if _received is not None:
+        os._exit(128 + signum)
+    _received = signum
+    if _deferred:  # os.write, as a print may be under way
+        os.write(2, f"nerf_lightning: {signal.Signals(signum).name}: stopping soon; again stops at once\n".encode())
+    else:
+        raise_if_signalled()

@@ -1,0 +1,70 @@
+"""A run is found by its folder, its compact file, a folder of runs, or as the newest of all."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.runs.find import find_run, link_latest
+from nerf_lightning.runs.owner import LOCK
+
+
+def make_run(folder: Path, seconds: float) -> Path:
+    """A run that was last written at a time."""
+    (folder / "checkpoints").mkdir(parents=True)
+    for name in ("config.yaml", "results.json", "checkpoints/last.ckpt", LOCK):
+        (folder / name).touch()
+        os.utime(folder / name, (seconds, seconds))
+    return folder
+
+
+@pytest.fixture
+def outputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two runs of one name, a newer one of another, and a job that failed before its first checkpoint."""
+    monkeypatch.chdir(tmp_path)
+    make_run(Path("outputs/lego/1"), 300)
+    make_run(Path("outputs/lego/2"), 200)
+    make_run(Path("outputs/chair/sweep/seed=0"), 400)
+    Path("outputs/chair/sweep/seed=1").mkdir()
+    Path("outputs/chair/sweep/seed=1/config.yaml").touch()
+    return tmp_path / "outputs"
+
+
+def test_find_run_takes_runs_and_files_as_they_are(outputs: Path):
+    Path("small.npz").touch()
+    assert find_run(Path("outputs/lego/2")) == Path("outputs/lego/2")
+    assert find_run("small.npz") == Path("small.npz")
+
+
+def test_find_run_takes_the_newest_of_a_folder_and_of_all(outputs: Path):
+    assert find_run(Path("outputs/lego")) == Path("outputs/lego/1")
+    assert find_run() == Path("outputs/chair/sweep/seed=0")
+    os.utime("outputs/lego/2/results.json", (500, 500))
+    assert find_run() == Path("outputs/lego/2")
+
+
+def test_find_run_says_what_it_looked_for(outputs: Path):
+    Path("empty").mkdir()
+    for name, found in (("nowhere", "nothing there"), ("empty", "a folder without a run")):
+        with pytest.raises(InputError, match=f"{name}: found {found}, expected a run"):
+            find_run(name)
+
+
+def test_latest_points_to_the_run_that_began_last(outputs: Path, monkeypatch: pytest.MonkeyPatch):
+    for name in ("2", "1"):
+        link_latest(Path("outputs/lego") / name)
+        assert os.readlink(outputs / "lego" / "latest") == name
+    assert find_run("outputs/lego/latest").resolve() == outputs / "lego" / "1"
+    link_latest(Path("outputs/chair/sweep/seed=0"))
+    assert not (outputs / "chair" / "sweep" / "latest").exists(), "a job is no run of its own"
+
+
+def test_latest_without_links_is_the_newest(outputs: Path, monkeypatch: pytest.MonkeyPatch, caplog):
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(1, "not permitted")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    link_latest(Path("outputs/lego/2"))
+    assert "not permitted" in caplog.text and not (outputs / "lego" / "latest").exists()
+    assert find_run("outputs/lego/latest") == Path("outputs/lego/1")

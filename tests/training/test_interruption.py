@@ -1,0 +1,193 @@
+"""Runs that end before they are done, asked to or on a full disk: what is done is kept, and resuming gives the same weights."""
+
+import json
+import resource
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from nerf_lightning.callbacks import Checkpoints, HeldOut, Progress
+from nerf_lightning.callbacks.checkpoints import check_disk
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.config.compose import composed
+from nerf_lightning.errors import NoRoom
+from nerf_lightning.model import TensoRFField
+from nerf_lightning.runs.folder import load_run
+from nerf_lightning.runs.owner import LOCK
+from nerf_lightning.system import System
+from nerf_lightning.training.train import train
+
+SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=12", "model.width=8"]
+SMALL += ["callbacks.heldout.at=[0.5]", *(f"callbacks.{name}=null" for name in ("charts", "training_gif", "baselines"))]
+STOP = 6
+State = tuple[int, dict[str, torch.Tensor]]
+
+
+def run_of(name: str) -> Path:
+    return Path("outputs", name, "latest").resolve()
+
+
+def read_state(folder: Path) -> State:
+    state = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    return state["global_step"], state["state_dict"]
+
+
+def read_status(folder: Path) -> str:
+    return json.loads((folder / "results.json").read_text())["status"]
+
+
+def assert_same(one: State, other: State) -> None:
+    assert one[0] == other[0] and all(torch.equal(one[1][key], other[1][key]) for key in one[1])
+
+
+def temporary_files() -> list[Path]:
+    return [path for path in Path().rglob(".*") if path.name != LOCK]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
+    """The folder of a run that nothing befell."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    train(composed(SMALL, folder), folder=folder)
+    return folder
+
+
+def at_step(
+    monkeypatch: pytest.MonkeyPatch, kind: type, hook: str, action: Callable[[], None], step: int = STOP
+) -> None:
+    """Does something at the beginning of a callback's hook, after some steps, once."""
+    before, done = getattr(kind, hook), []
+
+    def hooked(self: Any, *given: Any) -> Any:
+        at = self if isinstance(self, System) else given[0]  # or a callback, which is given its trainer
+        if at.global_step == step and not done:
+            done.append(True)
+            action()
+        return before(self, *given)
+
+    monkeypatch.setattr(kind, hook, hooked)
+
+
+MOMENTS = {
+    "in a step": (Progress, "on_train_batch_end", STOP),
+    "before a measurement": (HeldOut, "measure", STOP),
+    "while a view is rendered": (System, "evaluate_held_out", STOP),
+    "in the test": (Checkpoints, "on_test_batch_end", 12),
+}
+
+
+@pytest.mark.parametrize(("moment", "signum"), [*((m, signal.SIGTERM) for m in MOMENTS), ("in a step", signal.SIGINT)])
+def test_interrupted_run_is_saved_and_resumed_to_the_same_weights(
+    moment: str, signum: int, undisturbed: Path, inside, monkeypatch: pytest.MonkeyPatch
+):
+    kind, hook, step = MOMENTS[moment]
+    with monkeypatch.context() as patch:
+        at_step(patch, kind, hook, lambda: signal.raise_signal(signum), step)
+        code, _, err = inside(*SMALL, "name=broken")
+    assert code == 128 + signum, err
+    line = err.splitlines()[-1]
+    assert signal.Signals(signum).name in line and " resume=outputs/broken/" in line, err
+    assert read_status(run_of("broken")) == "interrupted" and read_state(run_of("broken"))[0] == step
+    assert not temporary_files()
+    code, _, err = inside(line.split()[-1])
+    assert code == 0, err
+    assert read_status(run_of("broken")) == read_status(undisturbed)
+    assert_same(read_state(run_of("broken")), read_state(undisturbed))
+
+
+def test_signal_before_training_leaves_nothing(inside, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("nerf_lightning.training.train.build_data", lambda cfg: signal.raise_signal(signal.SIGINT))
+    code, _, err = inside(*SMALL)
+    assert code == 130 and "the same command continues" in err and err.count("\n") == 1
+    assert not list(Path().iterdir())
+
+
+@pytest.fixture
+def limit() -> Iterator[Callable[[int], None]]:
+    """Sets the size of files beyond which writing fails, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_out_of_memory_is_one_line_and_an_untrained_run_leaves_nothing(inside, tmp_path: Path, monkeypatch):
+    def fail() -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of")
+
+    with monkeypatch.context() as patch:
+        at_step(patch, Progress, "on_train_batch_start", fail, step=0)
+        code, _, err = inside(*SMALL)
+    assert code == 2 and "20.00 GiB" in err and err.count("\n") == 1
+    assert not [path for path in tmp_path.rglob("*") if not path.is_dir() and not path.is_symlink()]
+    with monkeypatch.context() as patch:
+        at_step(patch, Progress, "on_train_batch_start", fail)
+        assert inside(*SMALL)[0] == 2
+    assert read_status(run_of("smoke_2d")) == "failed"
+
+
+@pytest.mark.parametrize("room", [0, 5000])
+def test_full_disk_keeps_the_last_checkpoint(room: int, undisturbed: Path, inside, limit, monkeypatch):
+    """Nothing fits at all, or checkpoints alone do not."""
+    with monkeypatch.context() as patch:
+        at_step(patch, Progress, "on_train_batch_end", lambda: limit(room))
+        # Who reads what the process has said needs files too.
+        patch.setattr("nerf_lightning.config.cli.give_up", lift_limit(limit))
+        code, _, err = inside(*SMALL, "logger=null", "callbacks.checkpoints.every_seconds=1e-9", "name=broken")
+    assert code == 2 and err.count("\n") == 1 and "no space left on the device" in err, err
+    assert read_state(run_of("broken"))[0] == STOP - 1 and not temporary_files()
+    results = run_of("broken") / "results.json"
+    assert not results.exists() or read_status(run_of("broken")) == "failed"
+    code, _, err = inside(f"resume={run_of('broken')}")
+    assert code == 0, err
+    assert_same(read_state(run_of("broken")), read_state(undisturbed))
+
+
+def lift_limit(limit: Callable[[int], None]) -> Callable[[Exception], None]:
+    from nerf_lightning.config import cli
+
+    end = cli.give_up
+
+    def give_up(error: Exception) -> None:
+        limit(resource.RLIM_INFINITY)
+        end(error)
+
+    return give_up
+
+
+def test_checkpoints_that_do_not_fit_are_refused_before_training(undisturbed: Path, inside, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
+        code, _, err = inside(*SMALL)
+    assert code == 2 and err.count("\n") == 1 and "MB for checkpoints" in err, err
+    assert not list(Path().iterdir())
+    system, folder = load_run(undisturbed).system, undisturbed / "checkpoints"
+    size = (folder / "last.ckpt").stat().st_size
+    one = 4 * 3 * sum(p.numel() for p in system.parameters())
+    assert one <= size < one + 60_000, "the rest does not grow with the model"
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=one))
+    check_disk(folder, system)  # two are there already, and are replaced
+    with pytest.raises(NoRoom):
+        check_disk(undisturbed / "elsewhere", system)
+
+
+def test_growing_field_counts_its_last_size():
+    box = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+    field = TensoRFField(box, coarsest=4, finest=12, stages=3, size="fixed")
+    expected, first = field.values_grown(), field.values
+    field.grow(1.0)
+    assert expected == field.values > 3 * first
+
+
+def test_clock_that_jumps_changes_nothing(undisturbed: Path, inside, monkeypatch: pytest.MonkeyPatch):
+    now, jumps = time.time(), iter([1e9, -1e9] * 100_000)
+    monkeypatch.setattr(time, "time", lambda: now + next(jumps))
+    code, _, err = inside(*SMALL, "name=jumps")
+    assert code == 0, err
+    assert_same(read_state(run_of("jumps")), read_state(undisturbed))

@@ -1,0 +1,163 @@
+"""Readers of JSON, YAML and arrays: damaged, absurd and malicious files get one line."""
+
+import io
+import json
+import os
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.utils import memory
+from nerf_lightning.utils.parsing import MAX_YAML_BYTES, Header, read_json, read_npy, read_npz, read_yaml
+
+ROWS = np.arange(6.0).reshape(2, 3)
+ALIASES = "a: &a [1, 1, 1, 1, 1]\n" + "".join(
+    f"{b}: &{b} [*{a}, *{a}, *{a}]\n" for a, b in zip("abcd", "bcde", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        (ALIASES, "alias"),
+        ("a: &a [*a]", "alias"),
+        ("[" * 5000, "RecursionError"),
+        ("x" * (MAX_YAML_BYTES + 1), "bytes"),
+        ("a: " + "9" * 5000, "no YAML"),
+        ("a: 2001-99-99", "no YAML"),
+        ("a: \udcff", "no YAML"),
+        ("a: [1", "no YAML"),
+        ("!!python/object/apply:os.getcwd []", "no YAML"),
+    ],
+)
+def test_read_yaml_refuses_in_one_line(text: str, found: str, tmp_path: Path):
+    (tmp_path / "a.yaml").write_text(text, encoding="utf-8", errors="surrogateescape")
+    with pytest.raises(InputError, match=r"a\.yaml: found .*, expected options") as caught:
+        read_yaml(tmp_path / "a.yaml", "options")
+    assert found in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_read_yaml_reads_plain_values(tmp_path: Path):
+    (tmp_path / "a.yaml").write_text("\ufeffmore: [1.5, yes, null, {a: 2}]\nbig: 0xffff\n", encoding="utf-8")
+    assert read_yaml(tmp_path / "a.yaml", "options") == {"more": [1.5, True, None, {"a": 2}], "big": 0xFFFF}
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("[" * 100_000, "RecursionError"),
+        ("[" + "9" * 5000 + "]", "ValueError"),
+        ("[1", "line 1, column 3"),
+        ("", "broken JSON"),
+        ('"\udcff"', "UnicodeDecodeError"),
+    ],
+)
+def test_read_json_refuses_in_one_line(text: str, found: str, tmp_path: Path):
+    (tmp_path / "a.json").write_text(text, encoding="utf-8", errors="surrogateescape")
+    with pytest.raises(InputError, match=r"a\.json: found .*, expected figures; export it again") as caught:
+        read_json(tmp_path / "a.json", "figures")
+    assert found in str(caught.value)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32"])
+def test_read_json_reads_every_encoding(encoding: str, tmp_path: Path):
+    (tmp_path / "a.json").write_bytes(json.dumps({"ü": [1, 2.5]}, ensure_ascii=False).encode(encoding))
+    assert read_json(tmp_path / "a.json", "figures") == {"ü": [1, 2.5]}
+
+
+def test_special_files_are_refused_without_waiting(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe")
+    for name, found in (("pipe", "nothing there"), ("", "a folder"), ("x" * 5000, "no file's name")):
+        with pytest.raises(InputError, match=f"found {found}"):
+            read_json(tmp_path / name, "figures")
+
+
+def npy(array: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def archive(*members: tuple[str, bytes]) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as made:
+        for name, content in members:
+            made.writestr(name, content)
+    return file.getvalue()
+
+
+def npy_of_shape(shape: str) -> bytes:
+    header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}}}".encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(6)
+
+
+def read_all(content: bytes) -> dict[str, np.ndarray]:
+    return read_npz(content, None, lambda headers: None, "given.npz")
+
+
+def test_read_npz_reads_known_arrays_only():
+    content = archive(("a.npy", npy(ROWS)), ("b.npy", b"damaged"), ("note.txt", b"hello"))
+    read = read_npz(content, ("a", "c"), lambda headers: None)
+    assert list(read) == ["a"] and (read["a"] == ROWS).all()
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (archive(("a", b"text")), "unreadable"),
+        (archive(("a.npy", npy(ROWS)[:-1])), "47 bytes for an array"),
+        (archive(("a.npy", npy_of_shape("(10000, 10000, 10000)"))), "6 bytes for an array"),
+        (archive(("a.npy", npy_of_shape("(-2, -3)"))), "6 bytes for an array"),
+        (archive(("a.npy", npy(np.array([{}])))), "Object arrays"),
+        (b"PK", "BadZipFile"),
+        (b"no zip", "BadZipFile"),
+    ],
+)
+def test_read_npz_refuses_damage(content: bytes, found: str):
+    with pytest.raises(InputError, match="given.npz") as caught:
+        read_all(content)
+    assert found in str(caught.value)
+
+
+def refuse(header: object) -> None:
+    raise InputError("given.npz", "a", str(header), "something else")
+
+
+def test_headers_are_checked_before_arrays_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(np.lib.format, "read_array", lambda *_, **__: pytest.fail("unpacked"))
+    header = Header((2, 3), np.dtype(np.float64))
+    (tmp_path / "a.npy").write_bytes(npy(ROWS))
+    for read in (
+        lambda: read_npz(archive(("a.npy", npy(ROWS))), None, refuse),
+        lambda: read_npy(tmp_path / "a.npy", refuse),
+    ):
+        with pytest.raises(InputError) as caught:
+            read()
+        assert str(header) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda path: read_all(archive(("a.npy", path.read_bytes()))),
+        lambda path: read_npy(path, lambda _: None),
+        lambda path: read_json(path, "figures"),
+    ],
+)
+def test_content_larger_than_memory_is_refused(read: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "a.npy").write_bytes(npy(ROWS))
+    monkeypatch.setattr(memory, "free_memory", lambda *_: ROWS.nbytes - 1.0)
+    with pytest.raises(InputError, match="that take at least"):
+        read(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("kind", [InputError, NoRoom])
+def test_errors_come_back_whole_from_other_processes(kind: type[InputError]):
+    error = kind("a.npz", "K", "nothing", "a matrix", "give one")
+    back = pickle.loads(pickle.dumps(error))
+    assert type(back) is kind and str(back) == str(error)
