@@ -86,8 +86,7 @@ def _errors(folder: Path, c2w: Float[np.ndarray, "N 4 4"], chosen: int) -> Row:
     truth = np.stack([c2w[round(float(image.name.removesuffix("s.jpg")) * FPS)] for image in images])
     last = [[0.0, 0.0, 0.0, 1.0]]
     found = np.stack([inverse(np.concatenate([image.cam_from_world().matrix(), last])) for image in images])
-    onto = similarity(*(torch.from_numpy(poses[:, :3, 3]) for poses in (found, truth)))
-    moved = in_other_frame(torch.from_numpy(found), onto).numpy()
+    moved = aligned(found, truth)
     distance = np.linalg.norm(truth[:, :3, 3] - truth[:, :3, 3].mean(0), axis=-1)
     camera = model.cameras[images[0].camera_id]
     return {
@@ -96,3 +95,9 @@ def _errors(folder: Path, c2w: Float[np.ndarray, "N 4 4"], chosen: int) -> Row:
         "degrees": float(np.degrees(np.median([angle_between(a, b) for a, b in zip(moved, truth, strict=True)]))),
         "focal_percent": 100 * abs(camera.mean_focal_length() / LENS.fx - 1),
     }
+
+
+def aligned(found: Float[np.ndarray, "N 4 4"], truth: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
+    """Camera poses turned, shifted and scaled so that their centres fit the truth best."""
+    onto = similarity(*(torch.from_numpy(poses[:, :3, 3]) for poses in (found, truth)))
+    return in_other_frame(torch.from_numpy(found), onto).numpy()
