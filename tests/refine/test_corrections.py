@@ -32,6 +32,8 @@ from tests.helpers.soft_ball import BOX, cameras_around_ball, soft_ball
 VIEWS, SIZE = 5, 12
 """Photos, and pixels along a side of each."""
 STEPS = 300
+OFF = ("callbacks.orbit=null", "callbacks.snapshots=null", "callbacks.heldout=null", "~logger")
+"""Callbacks whose files nobody looks at here."""
 
 
 def everything(cameras: Cameras) -> Corrections:
@@ -195,7 +197,7 @@ def test_corrections_gradients_match_differences_for_each_field(name: str, camer
 def test_run_with_corrections_reports_and_exports_them(tmp_path: Path, capsys, monkeypatch):
     monkeypatch.setattr(aligned, "PIXELS", 64)
     few = ["dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", "dataset.rays=64", "budget.steps=12"]
-    train(composed(["+experiment=smoke_3d", "refine=both", *few], tmp_path))
+    train(composed(["+experiment=smoke_3d", "refine=both", *few, *OFF], tmp_path))
     assert "refine: cameras turned by up to" in capsys.readouterr().out
     found = json.loads((tmp_path / "results.json").read_text())["corrections"]
     assert [len(found[key]) for key in ("turned_degrees", "moved", "exposure")] == [4, 4, 4]
@@ -222,7 +224,7 @@ def test_run_with_corrections_reports_and_exports_them(tmp_path: Path, capsys, m
 
 def test_refine_auto_bad_outlines_start_pose_correction(tmp_path: Path):
     size = {"size": 16, "train_views": 12, "val_views": 1}
-    options = ["+experiment=smoke_3d", "refine=auto", "dataset.rays=64", f"budget.steps={FIRST - 1}"]
+    options = ["+experiment=smoke_3d", "refine=auto", "dataset.rays=64", f"budget.steps={FIRST - 1}", *OFF]
     for scene, wanted in ((bricks(**size), False), (damage.with_pose_noise(bricks(**size), 0, 15.0, 0.1), True)):
         folder = tmp_path / str(wanted)
         train(composed(options, folder), folder=folder, scene=scene)
