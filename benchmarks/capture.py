@@ -1,5 +1,6 @@
 """How well a capture finds the known cameras of synthetic photos, and what its errors cost a field."""
 
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import torch
 
 from benchmarks.methods import train
 from benchmarks.synthetic.photos import Flaws, Truth, write_capture
+from benchmarks.tables import Rows, named
 from nerf_lightning.cameras import look_at
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.pack import pack
@@ -188,12 +190,14 @@ def fields(folder: Path, found: Capture, truth: Truth, seed: int) -> list[dict[s
     return rows
 
 
-def measure(seeds: list[int], folder: Path) -> dict[str, list[dict[str, Any]]]:
+def measure(args: argparse.Namespace) -> Rows:
     """All tables."""
+    seeds, folder = args.seeds, args.output
     rows, done = accuracy(folder / "capture", seeds[0])
-    return {
+    tables = {
         "capture": rows,
         "flips": flips(seeds),
         "hidden tags": hidden_tags(folder / "hidden_tags", seeds[0]),
         "capture fields": fields(folder / "capture", *done["six tags"], seeds[0]),
     }
+    return named(tables)

@@ -1,13 +1,14 @@
 """Sizes: what the search for the smallest model chooses on scenes of rising complexity, against every rung trained in full."""
 
+import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as imageio
 import torch
 from torch import Tensor
 
+from benchmarks.tables import Rows, named
 from nerf_lightning.cli.rightsize import describe_scene, rightsize
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
@@ -23,8 +24,6 @@ BODIES, GRAIN = 80, 12.0
 FEW = 6
 """Training views that a scene is left with, to see whether its model shrinks too."""
 
-Rows = list[dict[str, Any]]
-
 
 def make_heap(count: int = BODIES, seed: int = 0) -> list[Body]:
     """Balls and blocks, thrown together within about 1 of the origin."""
@@ -38,8 +37,9 @@ def make_heap(count: int = BODIES, seed: int = 0) -> list[Body]:
     return bodies
 
 
-def measure(overrides: list[str], seconds: float, output: Path) -> dict[str, Rows]:
+def measure(args: argparse.Namespace) -> Rows:
     """Two tables: for each scene the choice, and all rungs of the ladder trained in full; Lego with few views."""
+    overrides, seconds, output = args.overrides, args.budgets[0], args.output
     scenes, folder = {"sphere": "", "bricks": "bricks", "heap": "", "lego": "lego"}, output / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
     for name, bodies in {"sphere": [Ball((0.0, 0.0, 0.0), 0.8, grain=0.0)], "heap": make_heap()}.items():
@@ -47,7 +47,8 @@ def measure(overrides: list[str], seconds: float, output: Path) -> dict[str, Row
         save_npz(make_scene(bodies, size=SIZE, views=VIEWS, held_out=HELD_OUT), Path(scenes[name]))
     given = ["recipe=tensorf_medium", f"budget.seconds={seconds}", "callbacks.orbit=null", *overrides]
     rungs = read_ladder("tensorf").rungs
-    rows, few = Rows(), Rows()
+    rows: Rows = []
+    few: Rows = []
     for name, scene in scenes.items():
         place = output / "sizes" / name
         found = rightsize(scene, given, output=place)
@@ -73,7 +74,7 @@ def measure(overrides: list[str], seconds: float, output: Path) -> dict[str, Row
         default = train_in_full(of, {}, {}, build_data(of), output / "sizes" / f"default_{views}")
         row = {"views": views, "rung": result["rung"], "kB": chosen["size"] / 1000, "psnr": chosen["psnr"]}
         few.append({**row, "default_kB": default.size / 1000, "default_psnr": default.psnr})
-    return {"sizes": rows, "few": few}
+    return named({"sizes": rows, "few": few})
 
 
 def png_bytes(images: Tensor) -> float:

@@ -15,7 +15,7 @@ from nerf_lightning.synthetic.objects import trace_rays
 from nerf_lightning.synthetic.rooms import ROOMS
 
 
-def test_a_scene_of_a_room_knows_what_its_rays_meet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_true_view_of_room_gives_distance_and_body(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name, value in (("WIDTH", 48), ("HEIGHT", 36), ("VIEWS", 16)):
         monkeypatch.setattr(rooms, name, value)
     room = ROOMS["filling subject"]
@@ -50,7 +50,7 @@ def rays_in_the_room(rays: Rays, scene) -> tuple[torch.Tensor, torch.Tensor]:
     return rays.origins @ turn.mT + scene.to_source[:3, 3], torch.nn.functional.normalize(directions, dim=1)
 
 
-def test_fog_is_measured_up_to_the_surface():
+def test_opacity_before_surface_measures_fog():
     """Rays along x meet thin fog between 1 and 2, and a wall at 4. One interval may span the surface."""
 
     def density(places: torch.Tensor) -> torch.Tensor:

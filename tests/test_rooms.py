@@ -29,18 +29,18 @@ UP = {("callbacks", "view")}
 """While a field trains, a callback may show the page that the verb shows of a finished one."""
 
 
-def imported(file: Path) -> set[str]:
+def imported_rooms(file: Path) -> set[str]:
     """The rooms a module takes something from."""
     nodes = [node for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(node, ast.ImportFrom)]
     return {(node.module or "").split(".")[1] for node in nodes if (node.module or "").startswith("nerf_lightning.")}
 
 
-def test_imports_run_one_way():
+def test_imports_between_rooms_run_one_way():
     level = {room: number for number, rooms in enumerate(ORDER) for room in rooms}
     package = ROOT / "nerf_lightning"
     found = set()
     for file in package.rglob("*.py"):
         room = file.relative_to(package).parts[0].removesuffix(".py")
-        found |= {(room, other) for other in imported(file) - {room}}
+        found |= {(room, other) for other in imported_rooms(file) - {room}}
     assert len(found) > 50
     assert {(room, other) for room, other in found if level[room] <= level[other]} == UP

@@ -1,9 +1,9 @@
 """What torch.compile makes of fields and trainings, beside what they are without it: a process of its own, where no types are
 checked, as the checks would be compiled too. Prints what it found as JSON.
 
-python compiling.py mlp voxels FOLDER     some fields, and a training where there is a folder for it; without the compiler's
-                                          kernels, which take most of the time
-python compiling.py whole                 one field as users have it
+python compile_models.py mlp voxels FOLDER     some fields, and a training where there is a folder for it; without the
+                                               compiler's kernels, which take most of the time
+python compile_models.py whole                 one field as users have it
 """
 
 import copy
@@ -15,7 +15,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import torch
-from every_model import MODELS
 from torch._dynamo.utils import counters
 from torch.nn.functional import normalize
 
@@ -27,6 +26,7 @@ from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import Samples
 from nerf_lightning.system.compiled import BACKEND, part
 from nerf_lightning.training import train as training
+from tests.helpers.train_models import MODELS
 
 TRACED, DIFFERENTIATED = "eager", "aot_eager"  # as inductor has it up to its kernels, in a tenth of the time
 BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))

@@ -11,7 +11,9 @@ from nerf_lightning.kernels import use_kernels
 T = TypeVar("T")
 
 
-def outcome(call: Callable[..., object], inputs: list[Tensor], constants: tuple[int, ...] = ()) -> list[Tensor]:
+def values_and_gradients(
+    call: Callable[..., object], inputs: list[Tensor], constants: tuple[int, ...] = ()
+) -> list[Tensor]:
     """What `call` returns, then the gradient of a random sum of it with respect to each floating input.
 
     Args:
@@ -26,7 +28,7 @@ def outcome(call: Callable[..., object], inputs: list[Tensor], constants: tuple[
     return [x.detach() for x in outputs] + (list(torch.autograd.grad(sum(sums), free)) if sums else [])
 
 
-def agree(
+def assert_agrees(
     call: Callable[..., object],
     inputs: list[Tensor],
     constants: tuple[int, ...] = (),
@@ -41,12 +43,12 @@ def agree(
         any_threads: whether the bits are also the same with another number of threads.
     """
     use_kernels("reference")
-    expected = outcome(call, inputs, constants)
+    expected = values_and_gradients(call, inputs, constants)
     use_kernels("auto")
     threads = torch.get_num_threads()
     other = threads if not any_threads else 2 if threads == 1 else 1
-    first = outcome(call, inputs, constants)
-    again = with_threads(lambda: outcome(call, inputs, constants), other)
+    first = values_and_gradients(call, inputs, constants)
+    again = run_with_threads(lambda: values_and_gradients(call, inputs, constants), other)
     assert len(first) == len(expected)
     for number, (got, repeated, wanted) in enumerate(zip(first, again, expected, strict=True)):
         assert got.dtype == wanted.dtype and got.shape == wanted.shape, number
@@ -55,7 +57,7 @@ def agree(
         torch.testing.assert_close(got, wanted, rtol=rtol, atol=atol * scale, msg=lambda m, n=number: f"{n}: {m}")
 
 
-def with_threads(call: Callable[[], T], threads: int) -> T:
+def run_with_threads(call: Callable[[], T], threads: int) -> T:
     """What `call` gives with this number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)

@@ -9,7 +9,7 @@ MANY = [int(n) for n in torch.randint(0, 40, (150,), generator=torch.Generator()
 """How many samples the rays hold."""
 
 
-def ragged(counts: list[int], dtype: torch.dtype = torch.float32) -> Samples:
+def ragged_samples(counts: list[int], dtype: torch.dtype = torch.float32) -> Samples:
     """Touching intervals of random lengths, the given number on each ray, from t = 1 on."""
     dt = 0.05 + 0.2 * torch.rand(sum(counts), dtype=dtype)
     ray = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts, dtype=torch.int64))

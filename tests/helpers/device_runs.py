@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import torch
-from every_model import MODELS
 
 from nerf_lightning.config.build import build_data, build_system, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.system import System
 from nerf_lightning.utils.seeding import Stream, step_generator
+from tests.helpers.train_models import MODELS
 
 SCENES = ("hashgrid", "voxels", "tensorf", "mlp")
 ON_IT = ("device=pretend", "+trainer.inference_mode=false", "~logger")
