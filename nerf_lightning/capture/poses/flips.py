@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, gaussian_filter1d, shift
 
 from nerf_lightning.capture.poses.geometry import inverse, move, normalised
 from nerf_lightning.capture.poses.pose import Hypothesis
@@ -27,6 +27,8 @@ MARGIN_RAD = np.radians(10.0)
 """Around the directions of all hypotheses."""
 STEPS_RAD = np.radians([1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 25.0])
 """Standard deviations of the change of direction between photos, by axis, among which the evidence chooses."""
+SMOOTHING_PHOTOS = 1.0
+"""Standard deviation of the average over photos from which the drift is taken."""
 JUMP_PROBABILITY = 0.01
 """That a photo was taken from anywhere, wherever the one before."""
 MAX_LOG_RATIO = 12.0
@@ -65,7 +67,10 @@ def resolve_flips(
         # The middle of a cell may be farther from a sharp minimum than the noise allows.
         np.minimum.at(squares, chart.cells(place), [h.squares for h in options])
         likelihoods.append(np.exp((squares.min() - squares) / (2 * variance)).reshape(chart.side, chart.side))
-    means = chart.axis @ _posterior(likelihoods)
+    means = _posterior_means(likelihoods, chart.axis, np.zeros((len(likelihoods) - 1, 2)))
+    # Photographers keep moving the way they move: from the first means it shows which way.
+    drift = np.diff(gaussian_filter1d(means, SMOOTHING_PHOTOS, axis=0), axis=0)
+    means = _posterior_means(likelihoods, chart.axis, drift)
     return [int(np.linalg.norm(p - mean, axis=1).argmin()) for p, mean in zip(places, means, strict=True)]
 
 
@@ -142,27 +147,36 @@ def _squared_errors(
     return (np.vdot(seen, seen).real - explained) * lens.fx * lens.fy
 
 
-def _posterior(likelihoods: Sequence[Float[np.ndarray, "S S"]]) -> Float[np.ndarray, "N S 2"]:
-    """Marginals of both coordinates of each photo's cell given all photos, with the step width of most evidence (the
-    forward-backward algorithm; Rabiner 1989)."""
+def _posterior_means(
+    likelihoods: Sequence[Float[np.ndarray, "S S"]], axis: Float[np.ndarray, "S"], drift: Float[np.ndarray, "N-1 2"]
+) -> Float[np.ndarray, "N 2"]:
+    """Mean direction of each photo given all photos, with the step width of most evidence (the forward-backward algorithm;
+    Rabiner 1989).
 
-    def move_on(belief: Float[np.ndarray, "S S"], step: float) -> Float[np.ndarray, "S S"]:
-        blurred = gaussian_filter(belief, step / CELL_RAD)
-        return (1 - JUMP_PROBABILITY) * blurred + JUMP_PROBABILITY * belief.mean()
+    Args:
+        likelihoods: of each cell, by photo.
+        axis: middles of the cells along one side.
+        drift: expected change of direction from each photo to the next, radians.
+    """
+
+    def predict(belief: Float[np.ndarray, "S S"], step: float, by: Float[np.ndarray, "2"]) -> Float[np.ndarray, "S S"]:
+        moved = shift(belief, by / CELL_RAD, order=1, mode="nearest") if by.any() else belief
+        return (1 - JUMP_PROBABILITY) * gaussian_filter(moved, step / CELL_RAD) + JUMP_PROBABILITY * belief.mean()
 
     fits = []
     for step in STEPS_RAD:
         forward, evidence = [likelihoods[0] / likelihoods[0].sum()], 0.0
-        for likelihood in likelihoods[1:]:
-            joint = move_on(forward[-1], step) * likelihood
+        for likelihood, by in zip(likelihoods[1:], drift, strict=True):
+            joint = predict(forward[-1], step, by) * likelihood
             evidence += float(np.log(joint.sum()))
             forward.append(joint / joint.sum())
         fits.append((evidence, step, forward))
     _, step, forward = max(fits, key=lambda fit: fit[0])
-    backward, marginals = np.ones_like(likelihoods[0]), []
-    for belief, likelihood in zip(reversed(forward), reversed(likelihoods), strict=True):
-        joint = belief * backward
-        marginals.append(np.stack([joint.sum(1), joint.sum(0)], axis=1) / joint.sum())
-        backward = move_on(backward * likelihood, step)
-        backward /= backward.sum()
-    return np.stack(marginals[::-1])
+    backward, means = np.ones_like(likelihoods[0]), np.empty((len(likelihoods), 2))
+    for i in reversed(range(len(likelihoods))):
+        joint = forward[i] * backward
+        means[i] = np.array([axis @ joint.sum(1), axis @ joint.sum(0)]) / joint.sum()
+        if i:
+            backward = predict(backward * likelihoods[i], step, -drift[i - 1])
+            backward /= backward.sum()
+    return means
