@@ -29,7 +29,7 @@ from nerf_lightning.export.verb import export
 from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.runs.open import open_scene_run
-from nerf_lightning.runs.owner import Taken, may_overwrite, own_folder
+from nerf_lightning.runs.owner import Taken, own_folder
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train as train_configured
 from nerf_lightning.utils.device import the_device
@@ -171,7 +171,7 @@ def train(
     with undisturbed(), listening():
         cfg = composed([*given, *options], place)
         try:
-            with own_folder(place, may_overwrite(cfg), renamed=folder is None) as place:
+            with own_folder(place, cfg.overwrite, renamed=folder is None) as place:
                 train_configured(cfg, folder=place, scene=scene)
         except Taken as error:
             raise FileExistsError(f"{error}; load_run opens it, another folder= keeps both") from error

@@ -5,53 +5,54 @@ from typing import TYPE_CHECKING, Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import ChecksData, data_of
+from nerf_lightning.callbacks.attached import ChecksData, attached, data_of
 from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.callbacks.heldout import HeldOut
+from nerf_lightning.callbacks.progress import Progress
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.utils.options import Port
-from nerf_lightning.view.serve import announcement, find_port, require_viser
+from nerf_lightning.view.serve import announce, require_viser, resolve_host
 
 if TYPE_CHECKING:
     from nerf_lightning.view.field_page import FieldPage
 
-SAVED = 0.2
-"""Most seconds of drawing that can be saved up while nobody is looking."""
-ONE = 0.06
-"""Seconds that one picture may take."""
+MAX_SAVED_SECONDS = 0.2
+"""Of drawing, that can be saved up while nobody is looking."""
+IMAGE_SECONDS = 0.06
+"""That one image may take."""
+PROGRESS_SECONDS = 0.5
+"""Between two updates of the page's progress."""
 
 
 class Live(ChecksData):
-    """Serves a page that shows the field between training steps, with the training clock stopped.
+    """Serves a page that shows the field between training steps, with the training clock stopped, and how far training is.
 
-    It draws only while somebody is looking, and for at most a share of the time.
+    It draws only while somebody is looking, and for at most a share of the time. When training is done, the page stays open
+    as long as a browser shows it.
 
     Args:
         host: address to listen on; 0.0.0.0 shares the page with the network.
         port: the next free one if it is in use; 0 for any.
         share: of the time that drawing may take, above 0 and below 1.
-        photo_side: longest side of the photos on the frusta, pixels.
-        side: pixels along the longer side of the finest picture.
+        side: pixels along the longer side of the finest image.
 
     Raises:
-        InputError: for any other share; at the start of training, if it is a picture's, Viser is not installed, or the
+        InputError: for any other share; at the start of training, if it is an image's, Viser is not installed, or the
             address does not exist.
     """
 
-    def __init__(
-        self, host: str = "127.0.0.1", port: Port = 8080, share: float = 0.06, photo_side: int = 120, side: int = 512
-    ):
+    def __init__(self, host: str = "127.0.0.1", port: Port = 8080, share: float = 0.06, side: int = 512):
         if not 0 < share < 1:
             raise InputError("callbacks.live.share", "", str(share), "above 0 and below 1")
         self.host = host
         self.port = port
         self.share = share
-        self.photo_side = photo_side
         self.side = side
         self.page: FieldPage | None = None
         self._credit = 0.0
-        self._seen = 0.0
+        self._drawn = self._told = 0.0
 
     def check(self, data: RayDataModule | PixelDataModule) -> None:
         if isinstance(data, PixelDataModule):
@@ -63,16 +64,25 @@ class Live(ChecksData):
             return
         scene = data_of(trainer).scene
         assert isinstance(pl_module, NeRF3D) and isinstance(scene, Scene)  # `check` sees to it
-        address, free = find_port(self.host, self.port)
+        resolve_host(self.host)
 
         from nerf_lightning.view.field_page import FieldPage
 
-        self.page = FieldPage(scene.name, pl_module, scene.orbit, scene, self.host, free, self.photo_side, self.side)
-        line = announcement(scene.name, self.host, address, self.port, self.page.port)
-        print(f"live: {line.removesuffix('; Ctrl-C ends it')}", flush=True)
+        self.page = FieldPage(scene.name, pl_module, scene.orbit, scene, self.host, self.port, self.side, live=True)
+        print(f"live: {announce(scene.name, self.host, self.port, self.page.port)}", flush=True)
+
+    def describe(self, trainer: L.Trainer) -> str:
+        """Step, held-out dB and time left."""
+        held_out, progress = attached(trainer, HeldOut), attached(trainer, Progress)
+        parts = [f"step {trainer.global_step:,}"]
+        if held_out is not None and held_out.latest is not None:
+            parts.append(f"held out {held_out.latest:.2f} dB")
+        if progress is not None:
+            parts.append(progress.left(trainer)[1])
+        return ", ".join(filter(None, parts))
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        self._seen = time.perf_counter()
+        self._drawn = time.perf_counter()
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
@@ -80,17 +90,41 @@ class Live(ChecksData):
         if self.page is None:
             return
         now = time.perf_counter()
-        self._credit = min(self._credit + self.share * (now - self._seen), SAVED)
-        self._seen = now
+        self._credit = min(self._credit + self.share * (now - self._drawn), MAX_SAVED_SECONDS)
+        self._drawn = now
         if self._credit <= 0 or not self.page.visitors:
             return
         with Budget.of(trainer).paused():
+            if now - self._told > PROGRESS_SECONDS:
+                self.page.show_progress(pl_module.progress, self.describe(trainer))
+                self._told = now
             self.page.again()
-            self.page.paint(ONE)
-        self._seen = time.perf_counter()
-        self._credit -= self._seen - now
+            self.page.paint(IMAGE_SECONDS)
+        self._drawn = time.perf_counter()
+        self._credit -= self._drawn - now
 
-    def teardown(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
-        if self.page is not None and stage == "fit":
+    def on_test_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if self.page is not None:
+            self.page.show_progress(1.0, f"trained; measuring: {self.describe(trainer)}")
+            self.page.paint(IMAGE_SECONDS)
+
+    def stay_open(self, psnr: float | None) -> None:
+        """Serves the finished field until no browser shows it any more; called when all is written."""
+        if self.page is None:
+            return
+        page, self.page = self.page, None
+        page.again()
+        page.show_progress(1.0, "training is done" + ("" if psnr is None else f": held out {psnr:.2f} dB"))
+        try:
+            if page.visitors:
+                print("live: training is done; the page stays open until it is closed, or Ctrl-C", flush=True)
+            page.run(ended=lambda: not page.visitors)
+        finally:
+            page.stop()
+
+    def on_exception(self, trainer: L.Trainer, pl_module: System, exception: BaseException) -> None:
+        if self.page is not None:
             self.page.stop()
             self.page = None

@@ -14,17 +14,10 @@ from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.rendering import render_seconds_left
 from nerf_lightning.system import System
-from nerf_lightning.utils.progress import animates, sweep_left
+from nerf_lightning.utils.progress import animates, clock
 
 FIRST_SECONDS = 10.0
 """Of training, before which nobody can tell how long the rest takes: an early field is full of fog."""
-
-
-def clock(seconds: float) -> str:
-    """1:02:03 or 2:03."""
-    minutes, second = divmod(round(seconds), 60)
-    hours, minute = divmod(minutes, 60)
-    return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"
 
 
 class Progress(L.Callback):
@@ -54,8 +47,7 @@ class Progress(L.Callback):
         if training is None or rendering is None or (training and budget.seconds < FIRST_SECONDS):
             return None, subject
         seconds = training + rendering
-        sweep = sweep_left(seconds)
-        words = f"left {clock(seconds)}" + ("" if sweep is None else f", sweep {clock(sweep)}")
+        words = f"left {clock(seconds)}"
         return seconds, f"{words}: {subject}" if subject else words
 
     def status(self, trainer: L.Trainer) -> str:

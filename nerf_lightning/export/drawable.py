@@ -48,7 +48,7 @@ class Drawable(NamedTuple):
     """What that was, in words; where there is any, the occupied cells are those that the cameras see."""
 
 
-def drawn_as_it_is(system: NeRF3D) -> bool:
+def is_drawable(system: NeRF3D) -> bool:
     """Whether a page can draw a system without any change."""
     return isinstance(system.field, TensoRFField | VoxelField) and isinstance(system.sampler, OccupancySampler)
 
@@ -64,7 +64,7 @@ def drawable(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: in
     """
     config = copy.deepcopy(config)
     changes: list[str] = []
-    if drawn_as_it_is(system):
+    if is_drawable(system):
         return Drawable(system, config, changes)
     field, sampler = system.field, system.sampler
     keeps_field, keeps_sampler = isinstance(field, TensoRFField | VoxelField), isinstance(sampler, OccupancySampler)

@@ -1,7 +1,9 @@
 """Meshes, point clouds and voxel grids for other programs, in the place and at the scale of the photos' own file."""
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,18 +12,25 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.cameras import Cameras
+from nerf_lightning.cameras import Cameras, spiral_like
+from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.drawing.panels import to_bytes
+from nerf_lightning.errors import InputError
 from nerf_lightning.export.shapes import encode_mesh, encode_ply, format_offset
+from nerf_lightning.export.smallest import MOST_VIEWS, some_cameras
 from nerf_lightning.export.surface import Surface, find_surface, lit_cells
-from nerf_lightning.export.volume import PLACES, Volume
-from nerf_lightning.runs.open import SceneRun
+from nerf_lightning.export.volume import PLACES, Volume, volume_of
+from nerf_lightning.runs.data import data_again
+from nerf_lightning.runs.open import SceneRun, open_scene_run
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.utils.evenly import evenly
 
 if TYPE_CHECKING:
     import trimesh
 
-OFFSETS = {"stl": "offset {} subtracted, see the header", "glb": "offset {} in the node's transform"}
+SUFFIXES = {"mesh": (".ply", ".glb", ".obj", ".stl"), "points": (".ply",), "voxels": (".npz",)}
+"""Of files, by what they hold; the default first."""
+OFFSETS = {".stl": "offset {} subtracted, see the header", ".glb": "offset {} in the node's transform"}
 """How messages state it, by format: single precision does not hold coordinates that are large for the mesh's size."""
 
 
@@ -31,6 +40,55 @@ class Shape:
 
     content: bytes
     words: str
+
+
+def export_shape(
+    source: Path,
+    device: torch.device,
+    kind: str,
+    suffix: str,
+    resolution: int | None = None,
+    box: Sequence[float] | None = None,
+    threshold: float | None = None,
+    photos: str | None = None,
+) -> Shape:
+    """A run as a mesh, points or voxels.
+
+    Args:
+        source: the run.
+        kind, suffix: see `SUFFIXES`.
+        resolution: cells along the longest side; None takes about the photos' resolution.
+        box: lower and upper corner in the frame of the photos' own file; None takes all.
+        threshold: see `find_surface`.
+        photos: where the photos are, if they have moved.
+    """
+    run = open_scene_run(source, device)
+    corners = None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3)
+    volume = volume_of(run, resolution, corners)
+    if kind == "voxels":
+        shape = voxels_file(run, volume)
+    elif kind == "points":
+        shape = points_file(run, training_views(run, photos), volume, threshold)
+    else:
+        shape = mesh_file(run, training_views(run, photos), volume, threshold, suffix)
+    words = f"{len(shape.content) / 1e6:,.2f} MB, {shape.words}, cells of {volume.cell * run.scale:.4g}"
+    return Shape(shape.content, words)
+
+
+def training_views(run: SceneRun, photos: str | None = None) -> Cameras:
+    """Some of the views that a field was trained from; without photos, its orbit and a spiral above it."""
+    try:
+        data = data_again(run.cfg, run.scene, photos)
+    except InputError as error:
+        if photos is not None:
+            raise
+        print(f"without the photos' cameras, from the orbit: {error}")
+        spiral, count = spiral_like(run.orbit, MOST_VIEWS // 2), MOST_VIEWS // 2
+        orbit = run.orbit[torch.tensor(evenly(len(run.orbit), count))]
+        K, c2w, sizes = (torch.cat([getattr(x, name) for x in (orbit, spiral)]) for name in ("K", "c2w", "sizes"))
+        return Cameras(K, c2w, sizes)
+    assert isinstance(data, RayDataModule)  # of a scene's run
+    return some_cameras(data)
 
 
 @torch.no_grad()

@@ -1,16 +1,15 @@
 """A field as one web page: its compact file, a ray marcher for the browser's graphics, and what a person's hands do with it."""
 
 import base64
-import hashlib
-import html
 import re
 from collections.abc import Sequence
-from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from markupsafe import Markup
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras, Rays, pivot_of, upward
@@ -19,10 +18,12 @@ from nerf_lightning.model import TensoRFField, VoxelField
 from nerf_lightning.model.layers.activation import SoftenableReLU, shifted_softplus
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.utils.html import script_data
+from nerf_lightning.utils.html import read_source, render_page, script_data
 
-SCRIPTS = ("common.js", "compact.js", "textures.js", "camera.js", "renderer.js", "page.js")
-PICTURE_SCRIPTS = ("common.js", "picture.js")
+WEB = Path(__file__).with_name("web")
+STYLE = WEB / "view.css"
+SCRIPTS = [WEB / f"{name}.js" for name in ("common", "compact", "textures", "camera", "renderer", "page")]
+IMAGE_SCRIPTS = [WEB / "common.js", WEB / "picture.js"]
 FAR = 1e9
 """Where a ray ends that nothing else ends, world units."""
 LEAST = 1e-4
@@ -30,15 +31,6 @@ LEAST = 1e-4
 FRUSTUM = 0.06
 """Depth of a photo's pyramid, as a share of the cameras' distance to what they look at."""
 WORD = re.compile(r"[^\w.-]+")
-
-
-def part(name: str) -> str:
-    """A source of the page, without the comments and indents that only its readers need."""
-    text = files(__package__).joinpath("web", name).read_text(encoding="utf-8")
-    if name.endswith(".html"):
-        return text
-    lines = (re.sub(r"(^|\s\s+)//.*$", "", line).strip() for line in text.splitlines())
-    return "\n".join(filter(None, lines))
 
 
 def activation_of(field: TensoRFField | VoxelField) -> int:
@@ -121,46 +113,37 @@ def field_page(
     Args:
         compact: a compact file.
         system, orbit: what it holds, see `described`.
-        name: of the scene.
+        name: of the scene, the page's title.
         facts: about the field, by name.
         photos: cameras to look through, if there are any.
         names: of those.
     """
     about = described(system, orbit)
     about |= {
-        "name": name,
         "file": WORD.sub("_", name) or "field",
         "facts": [list(fact) for fact in facts],
         "photos": None if photos is None else photos_of(photos, names, torch.tensor(about["focus"])),
     }
-    return filled(
-        "page", SCRIPTS, shader=part("march.glsl"), about=script_data(about), compact=base64.b64encode(compact).decode()
+    shader, data = Markup(read_source(WEB / "march.glsl")), base64.b64encode(compact).decode()
+    return render_page(
+        WEB / "field.html",
+        [STYLE],
+        SCRIPTS,
+        title=name,
+        facts=facts,
+        photos=photos is not None,
+        about=script_data(about),
+        shader=shader,
+        compact=Markup(data),
     )
 
 
 def picture_page(picture: UInt8[np.ndarray, "H W 3"], name: str, facts: Sequence[tuple[str, str]]) -> str:
-    """The page of a picture's field: the field's picture, without loss, and facts about it."""
-    about = {"name": name, "facts": [list(fact) for fact in facts]}
-    return filled("picture", PICTURE_SCRIPTS, about=script_data(about), picture=data_url(picture, ".webp"))
+    """The page of an image's field: what the field renders, without loss, and facts about it."""
+    image = data_url(picture, ".webp")
+    return render_page(WEB / "picture.html", [STYLE], IMAGE_SCRIPTS, title=name, facts=facts, image=image)
 
 
 def gallery_page(title: str, pages: Sequence[tuple[str, str, str]]) -> str:
     """Pages side by side, whose views turn together: of each its address, its name, and a line about it."""
-    figures = "\n".join(
-        f'<figure><iframe sandbox="allow-scripts" title="{html.escape(name)}" src="{html.escape(address)}">'
-        f"</iframe><figcaption><b>{html.escape(name)}</b>{html.escape(line)}</figcaption></figure>"
-        for address, name, line in pages
-    )
-    return filled("gallery", ("gallery.js",), title=html.escape(title), figures=figures)
-
-
-def filled(name: str, scripts: Sequence[str], **values: str) -> str:
-    """A template with its style, its scripts, and the content policy that allows those alone."""
-    style, script = part("gallery.css" if name == "gallery" else "page.css"), "\n".join(map(part, scripts))
-    values |= {"style": style, "script": script, "style_hash": hash_of(style), "script_hash": hash_of(script)}
-    return part(f"{name}.html").format(**values)
-
-
-def hash_of(text: str) -> str:
-    """As a page's content policy names what may be used of it."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return render_page(WEB / "gallery.html", [WEB / "gallery.css"], [WEB / "gallery.js"], title=title, pages=pages)

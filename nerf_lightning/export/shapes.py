@@ -76,16 +76,16 @@ def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, turn: Float[ndarray, "4 4"
     """
     colours: Any = mesh.visual
     content: Any
-    if suffix == "ply":
+    if suffix == ".ply":
         return encode_ply(mesh.vertices, colours.vertex_colors[:, :3], mesh.faces), np.zeros(3)
-    if suffix == "obj":
+    if suffix == ".obj":
         digits = max(COLOUR_DIGITS, DIGITS - math.floor(math.log10(float(mesh.extents.max()))))
         content = mesh.export(file_type="obj", digits=digits, header="nerf_lightning", include_normals=False)
         return content.encode(), np.zeros(3)
     offset = find_offset(mesh.vertices)
     moved = mesh.copy()
     moved.vertices = mesh.vertices - offset
-    if suffix == "stl":
+    if suffix == ".stl":
         header = f"nerf_lightning, binary STL; offset {format_offset(offset)}".encode().ljust(STL_HEADER_BYTES)
         content = moved.export(file_type="stl")
         return header[:STL_HEADER_BYTES] + content[STL_HEADER_BYTES:], offset

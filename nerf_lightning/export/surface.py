@@ -108,12 +108,10 @@ def find_surface(volume: Volume, lit: Bool[ndarray, "X Y Z"], threshold: float |
         threshold: opacity of a cell at the surface, in (0, 1); None finds it from the histogram of cells in the light.
 
     Raises:
-        InputError: where nothing is as dense as that, or the threshold is none.
+        InputError: where nothing is as dense as that.
     """
     from skimage.measure import marching_cubes
 
-    if threshold is not None and not 0 < threshold < 1:
-        raise InputError("config", "threshold", str(threshold), "between 0 and 1")
     level = volume.opacity.numpy()
     if threshold is None:
         threshold = solid_from(level[lit & (level > EMPTY)])
@@ -122,7 +120,7 @@ def find_surface(volume: Volume, lit: Bool[ndarray, "X Y Z"], threshold: float |
     pieces, _ = ndimage.label(level > threshold, structure=np.ones((3, 3, 3)))
     if not most > threshold:
         found, expected = f"nothing above an opacity of {threshold:.2f} a cell", f"at most {most:.2f}"
-        raise InputError("config", "threshold", found, expected, "train longer, or lower threshold")
+        raise InputError("export", "threshold", found, expected, "train longer, or lower --threshold")
     sizes = np.bincount(pieces.ravel())[1:]
     floating = np.flatnonzero(sizes < FLOATER * sizes.max()) + 1
     # A margin closes the box's sides; pieces that float go, with the haze around them.

@@ -77,7 +77,7 @@ def region_of(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tensor
         where = transform(to_source, torch.cartesian_prod(*aabb.double().T))
         low, high = ([round(x, 4) for x in corner.tolist()] for corner in (where.amin(0), where.amax(0)))
         raise InputError(
-            "config", "box", str(box.flatten().tolist()), f"something within {low} to {high}, the scene's box"
+            "export", "box", str(box.flatten().tolist()), f"something within {low} to {high}, the scene's box"
         )
     return region
 
@@ -104,7 +104,7 @@ def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] 
     cell = float(sides.max()) / resolution
     shape = [max(1, math.ceil(float(side) / cell - 1e-6)) for side in sides]
     cells = math.prod(shape)
-    check_memory("config", "resolution", f"{cells:,} cells", CELL * cells)
+    check_memory("export", "resolution", f"{cells:,} cells", CELL * cells)
     # Cubic cells may reach beyond the region: equally on both sides.
     low = corners.mean(0) - torch.tensor(shape, device=system.device) * (cell / 2)
     volume = Volume(torch.zeros(shape), low.cpu(), cell)

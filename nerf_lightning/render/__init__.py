@@ -1,1 +1,1 @@
-"""Films and pictures of a trained run: a camera path, a frame for each of its views, a file of them."""
+"""Videos and images of a trained run: a camera path, a frame for each of its views, a file of them."""

@@ -16,7 +16,6 @@ from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.untrusted import read_json
 
-FRAMES = ("auto", "run", "file")
 OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 """instant-ngp's world is scale * x + offset with axes cycled (nerf_loader.h); a path does not say if a scene sets others."""
@@ -60,7 +59,7 @@ def read_path(file: Path, orbit: Cameras, to_source: Float[Tensor, "4 4"], frame
     _check(file, cameras)
     taken = own if frame == "auto" else frame
     where = "the run's frame" if taken == "run" else "the world frame of the photos' own file"
-    print(f"{file}: {kind} in {where} (path_frame={'file' if taken == 'run' else 'run'} takes the other)")
+    print(f"{file}: {kind} in {where} (--path-frame {'file' if taken == 'run' else 'run'} takes the other)")
     if taken == "run":
         return cameras
     moved = in_other_frame(cameras.c2w, torch.linalg.inv(to_source.double()))

@@ -7,7 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from nerf_lightning.config.literal import escape
-from nerf_lightning.runs.owner import may_overwrite, own_folder, owned
+from nerf_lightning.runs.owner import own_folder, owned
 from nerf_lightning.training.train import train
 
 
@@ -26,7 +26,7 @@ def run(cfg: DictConfig) -> float:
         with owned(folder):
             return train(cfg)
     timed = "${now:" in str(OmegaConf.to_container(hydra.run, resolve=False))
-    with own_folder(folder, may_overwrite(cfg), renamed=timed) as place:
+    with own_folder(folder, cfg.overwrite, renamed=timed) as place:
         with read_write(hydra):  # further processes of this run ask Hydra
             hydra.run.dir = hydra.runtime.output_dir = escape(str(place))
         return train(cfg)

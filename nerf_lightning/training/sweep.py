@@ -1,7 +1,9 @@
 """Sweeps: each job runs once, a failing one does not stop the others, and a table lists them all."""
 
 import csv
+import math
 import sys
+import time
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
@@ -9,21 +11,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
-from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerf_lightning.config import cli  # noqa: F401  (a job's process needs its resolvers)
+from nerf_lightning.config import resolvers  # noqa: F401  (a job's process needs them)
 from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.runs.index import FINISHED, Run, failed_results, find_runs, read_run, varied
 from nerf_lightning.utils.ending import AGAIN, listen_again
 from nerf_lightning.utils.files import atomic, full_disk, write_json
-from nerf_lightning.utils.progress import set_sweep
+from nerf_lightning.utils.progress import clock
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
-
-    from nerf_lightning.training.sweep_plan import SweepProgress
 
 TABLE = "sweep.csv"
 COLUMNS = ("psnr", "ssim", "train_seconds", "steps", "parameters", "artifact_bytes")
@@ -66,14 +66,16 @@ def job(cfg: "DictConfig") -> float | None:
 
 def trained(cfg: "DictConfig", folder: Path) -> float | None:
     """The held-out PSNR of a job in a folder that this process owns, from now, from before, or from its last checkpoint on."""
+    from nerf_lightning.config.options import check_run_options
     from nerf_lightning.runs.folder import plain_config
-    from nerf_lightning.runs.owner import already, holds_run, leads, may_overwrite, remove
+    from nerf_lightning.runs.owner import already, holds_run, leads, remove
     from nerf_lightning.training.before import left_of
     from nerf_lightning.training.train import train
 
+    check_run_options(cfg, HydraConfig.get().runtime.choices)
     before = read_run(folder)
     other = holds_run(folder) and before.config != plain_config(cfg)
-    if other and before.status != "failed" and not may_overwrite(cfg):
+    if other and before.status != "failed" and not cfg.overwrite:
         raise already(folder)
     done, checkpoint = left_of(before, cfg)
     if leads():
@@ -142,39 +144,34 @@ def print_table(root: Path, runs: Sequence[Run]) -> None:
             console.print(f"{run.folder.relative_to(root)}: {run.diagnosis}", style="dim", markup=False, soft_wrap=True)
 
 
+def count_jobs(config: "DictConfig") -> int | None:
+    """Number of jobs of a sweep over a grid; None where the sweeper chooses them as it goes."""
+    if not config.hydra.sweeper._target_.endswith("BasicSweeper"):
+        return None
+    values = {key: f"{key}={value}" for key, value in (config.hydra.sweeper.get("params") or {}).items()}
+    parsed = OverridesParser.create().parse_overrides([*values.values(), *config.hydra.overrides.task])
+    choices = {one.key_or_group: len([*one.sweep_iterator()]) if one.is_sweep_override() else 1 for one in parsed}
+    return math.prod(choices.values())
+
+
 class SweepReport(Callback):
     """Hydra's hooks around the jobs: progress, then table, figure, and exit code 1 if a job failed."""
 
     def __init__(self) -> None:
-        self.progress: SweepProgress | None = None
+        self.jobs: int | None = None
+        self.began = 0.0
 
     def on_multirun_start(self, config: "DictConfig", **kwargs: Any) -> None:
-        from nerf_lightning.config.keys import check_keys, check_swept
-        from nerf_lightning.training.sweep_plan import SweepProgress, devices_asked, planned
-        from nerf_lightning.utils.device import the_device
-
-        try:
-            check_swept(config.hydra.overrides.task)
-            own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-            check_keys(own, "config", config.hydra.runtime.choices)
-            for name in devices_asked(config):
-                the_device(name)
-        except InputError as error:  # Hydra would only warn
-            cli.give_up(error)
         # Names come from this process's command line: resolved here, they are cached for jobs in other processes.
         print(f"sweep: {config.hydra.sweep.dir}, one folder a job, such as {config.hydra.sweep.subdir}", flush=True)
-        jobs = planned(config)
-        self.progress = SweepProgress(Path(config.hydra.sweep.dir), jobs) if jobs else None
+        self.jobs, self.began = count_jobs(config), time.monotonic()
 
     def on_job_start(self, config: "DictConfig", **kwargs: Any) -> None:
-        if self.progress is not None:
-            print(self.progress.begin(config.hydra.job.num), flush=True)
-            set_sweep(self.progress.seconds_left)
-
-    def on_job_end(self, config: "DictConfig", **kwargs: Any) -> None:
-        if self.progress is not None:
-            set_sweep(None)
-            self.progress.end(config.hydra.job.num)
+        if self.jobs is not None:
+            number = config.hydra.job.num
+            left = (time.monotonic() - self.began) / max(number, 1) * (self.jobs - number)
+            words = f", about {clock(left)} left" if number else ""
+            print(f"job {number + 1} of {self.jobs}{words}", flush=True)
 
     def on_multirun_end(self, config: "DictConfig", **kwargs: Any) -> None:
         from nerf_lightning.gallery.figure import write_contact_figure
@@ -189,7 +186,7 @@ class SweepReport(Callback):
         failed = [run for run in runs if run not in (*done, *going, *stopped)]
         try:
             print(f"table: {root / TABLE}; figure: {write_contact_figure(root, runs)}")
-            print(f"speed against accuracy: python -m nerf_lightning.chart runs={root}")
+            print(f"speed against accuracy: nerf_lightning compare {root}")
         finally:
             ended = ((failed, "failed"), (going, "have not ended"), (stopped, f"were interrupted ({AGAIN})"))
             for some, what in ended:

@@ -14,7 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from nerf_lightning.callbacks import Budget, Checkpoints, Results
+from nerf_lightning.callbacks import Budget, Checkpoints, Live, Results
 from nerf_lightning.callbacks.attached import ChecksData, attached
 from nerf_lightning.callbacks.budget import AT_ROW
 from nerf_lightning.callbacks.checkpoints import check_disk
@@ -166,6 +166,9 @@ def train(
         if trainer.logger is not None:
             log_hyperparameters(trainer.logger, cfg, results.summary)
         report(results.summary, folder, trainer.logger)
+    live = attached(trainer, Live)
+    if live is not None:
+        live.stay_open(results.summary["psnr"])
     quality: float | None = results.summary["psnr"]
     return math.nan if quality is None else quality  # views of a field that has broken down may have none
 

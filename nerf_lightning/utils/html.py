@@ -1,14 +1,54 @@
-"""What goes into web pages: data, and addresses of other pages."""
+"""Web pages of one file each: templates filled by Jinja2, a content policy that allows a page's own style and script alone."""
 
+import base64
+import hashlib
 import json
 import os
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 
-def script_data(content: object) -> str:
+HOME = Path(__file__).parent
+"""Of page.html, which templates extend, and of page.css, which gives all pages one look."""
+
+
+def render_page(template: Path, styles: Sequence[Path] = (), scripts: Sequence[Path] = (), **values: object) -> str:
+    """Fills a template that extends page.html. Values are escaped, except those that are Markup.
+
+    Args:
+        template: an HTML file.
+        styles, scripts: put into the page, after page.css.
+        values: of the template, with `title`.
+    """
+    loader = FileSystemLoader([template.parent, HOME])
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    texts = {"style": (HOME / "page.css", *styles), "script": scripts}
+    for name, files in texts.items():
+        text = "\n".join(map(read_source, files))
+        values |= {name: Markup(text), f"{name}_hash": hash_source(text)}
+    return environment.get_template(template.name).render(values)
+
+
+def read_source(file: Path) -> str:
+    """A script, shader or style without the comments and indents that only its readers need."""
+    lines = (re.sub(r"(^|\s\s+)//.*$", "", line).strip() for line in file.read_text(encoding="utf-8").splitlines())
+    return "\n".join(filter(None, lines))
+
+
+def hash_source(text: str) -> str:
+    """The name of a style or script in a content security policy."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def script_data(content: object) -> Markup:
     """Strict JSON in which nothing can end the script element that holds it."""
-    return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
+    return Markup(json.dumps(content, allow_nan=False).replace("<", "\\u003c"))
 
 
 def address_from(folder: Path, file: Path) -> str:

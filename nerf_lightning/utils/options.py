@@ -4,9 +4,9 @@ import difflib
 import inspect
 import types
 import typing
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from nerf_lightning.errors import InputError
 
@@ -48,7 +48,12 @@ FramesPerSecond = Annotated[float, AtLeast(0.01), AtMost(1000)]
 
 
 def check_options(
-    where: str, target: Callable, options: Mapping[str, Any], given: Container[str] = (), complete: bool = True
+    where: str,
+    target: Callable,
+    options: Mapping[str, Any],
+    given: Container[str] = (),
+    complete: bool = True,
+    source: str = "config",
 ) -> None:
     """Raises InputError if an option is unknown, missing, of the wrong type, not finite or out of its bounds.
 
@@ -58,6 +63,7 @@ def check_options(
         options: names and plain values.
         given: names of further arguments that will be passed.
         complete: whether the target gets no other arguments later.
+        source: what holds the options, for the message.
     """
     parameters = inspect.signature(target).parameters
     hints = typing.get_type_hints(target.__init__ if inspect.isclass(target) else target, include_extras=True)
@@ -70,7 +76,7 @@ def check_options(
             near = difflib.get_close_matches(name, parameters, 1)
             known = ", ".join(key for key in parameters if key not in given and key != "self")
             raise InputError(
-                "config",
+                source,
                 prefix + name,
                 "an unknown option",
                 f"one of {known}",
@@ -78,7 +84,7 @@ def check_options(
             )
         hint = hints.get(name, Any)
         if not _fits(value, hint):
-            raise InputError("config", prefix + name, repr(value)[:60], _describe(hint), _range_of(value))
+            raise InputError(source, prefix + name, repr(value)[:60], _describe(hint), _range_of(value))
     for name, parameter in parameters.items():
         required = parameter.default is inspect.Parameter.empty and parameter.kind in (
             inspect.Parameter.POSITIONAL_OR_KEYWORD,
@@ -86,7 +92,7 @@ def check_options(
         )
         if complete and required and name not in options and name not in given:
             raise InputError(
-                "config", prefix + name, "nothing", _describe(hints.get(name, Any)), f"give {prefix}{name}=..."
+                source, prefix + name, "nothing", _describe(hints.get(name, Any)), f"give {prefix}{name}=..."
             )
 
 
@@ -97,8 +103,12 @@ def _fits(value: Any, hint: Any) -> bool:
         return _fits(value, arguments[0]) and all(_within(value, bound) for bound in arguments[1:])
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, argument) for argument in arguments)
-    if origin is list:
-        return isinstance(value, list) and all(_fits(item, arguments[0]) for item in value)
+    if origin is Literal:
+        return value in arguments
+    if origin in (list, Sequence):
+        return isinstance(value, list | tuple) and all(_fits(item, arguments[0]) for item in value)
+    if hint is dict:
+        return isinstance(value, Mapping)
     if origin is dict:
         return isinstance(value, Mapping) and all(_fits(item, arguments[1]) for item in value.values())
     if hint is float:
@@ -108,7 +118,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if hint in (str, bool, type(None)):
         return isinstance(value, hint)
     # YAML cannot hold other classes, but a mapping may describe one (with a target of its own).
-    return not inspect.isclass(hint) or isinstance(value, Mapping | list)
+    return hint is Any or not inspect.isclass(hint) or isinstance(value, (hint, Mapping, list))
 
 
 def _range_of(value: Any) -> str:
@@ -118,7 +128,7 @@ def _range_of(value: Any) -> str:
     return f"numbers are finite, whole ones at most {WHOLE:.3g}, others {SINGLE:.3g}"
 
 
-def _within(value: float, bound: Any) -> bool:
+def _within(value: Any, bound: Any) -> bool:
     """Whether a number keeps a bound; other annotations are none."""
     if isinstance(bound, AtLeast):
         return value >= bound.value
@@ -134,9 +144,18 @@ def _describe(hint: Any) -> str:
         return f"{_describe(arguments[0])} {' and '.join(bounds)}"
     if origin in (typing.Union, types.UnionType):
         return " or ".join(_describe(argument) for argument in arguments)
-    if origin is list:
+    if origin is Literal:
+        return f"one of {', '.join(map(str, arguments))}"
+    if origin in (list, Sequence):
         return f"a list, each {_describe(arguments[0])}"
     if origin is dict:
         return f"names, each with {_describe(arguments[1])}"
-    words = {int: "a whole number", float: "a number", str: "text", bool: "true or false", type(None): "null"}
+    words = {
+        int: "a whole number",
+        float: "a number",
+        str: "text",
+        bool: "true or false",
+        dict: "options by name",
+        type(None): "null",
+    }
     return words.get(hint, "a value")

@@ -9,18 +9,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 T = TypeVar("T")
-_sweep_left: Callable[[float], float] | None = None
 
 
-def set_sweep(left: Callable[[float], float] | None) -> None:
-    """Around the jobs of a sweep: what tells its seconds left from those of the job that begins; None after the job."""
-    global _sweep_left
-    _sweep_left = left
-
-
-def sweep_left(job_left: float) -> float | None:
-    """Seconds left of the sweep, if this process runs one's job, from those of the job."""
-    return None if _sweep_left is None else _sweep_left(job_left)
+def clock(seconds: float) -> str:
+    """1:02:03 or 2:03."""
+    minutes, second = divmod(round(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"
 
 
 def animates(console: Console) -> bool:

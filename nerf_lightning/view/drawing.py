@@ -15,10 +15,13 @@ from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.sampler import UniformSampler
+from nerf_lightning.utils.evenly import evenly
 
 OVERVIEW_FOV = math.radians(50)
 """Vertical field of view of the browser's camera at first."""
 OVERVIEW_ELEVATION = math.radians(25)
+MAX_POINTS, COLOUR_VIEWS = 40_000, 24
+"""Points that are shown, and photos that give them colours."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,22 @@ def ray_figure(rays: Rays, bounds: Bounds, samples: int, stump: float, generator
 def _no_density(positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
     """Stands in for a field: the uniform sampler never asks for density."""
     raise RuntimeError("a uniform sampler asked for density")
+
+
+def colour_points(
+    points: Float[Tensor, "P 3"], views: Views
+) -> tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
+    """Some of the points of a subject, and for each the colour that it has in the nearest of some photos; grey in none."""
+    points = points[evenly(len(points), MAX_POINTS)].float()
+    rgb = torch.full((len(points), 3), 128, dtype=torch.uint8)
+    nearest = torch.full((len(points),), math.inf)
+    for view in evenly(len(views), COLOUR_VIEWS):
+        pixels, _, seen = views.cameras.project(points, view)
+        distance = (points - views.cameras.centres[view]).norm(dim=1)
+        closer = seen & (distance < nearest)
+        col, row = pixels[closer].long().unbind(1)
+        rgb[closer], nearest[closer] = views.image(view)[row, col, :3], distance[closer]
+    return points.numpy(), rgb.numpy()
 
 
 def box_edges(aabb: Float[Tensor, "2 3"]) -> Float[np.ndarray, "12 2 3"]:

@@ -13,6 +13,7 @@ from viser.transforms import SO3
 from nerf_lightning.cameras import Cameras, Rays, pivot_of, upward
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.frame import CHANNELS
+from nerf_lightning.drawing.ink import GREEN, GREY, VERMILLION, rgb
 from nerf_lightning.renderer.renderer import NAMED
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.view.drawing import Viewpoint, box_edges
@@ -23,7 +24,6 @@ FIRST_SECONDS = 0.08
 """Time to render the first picture after a movement: with encoding and transport it arrives within 0.2 s."""
 FINER = 2
 """Times as many pixels along each side in each further picture, while the camera rests."""
-BOX, INSIDE, SAMPLES = (110, 110, 110), (44, 160, 44), (214, 39, 40)
 QUALITY = 80
 """Of the JPEG that is sent, out of 100."""
 
@@ -54,8 +54,8 @@ class FieldPage(Page):
         orbit: its first view is the page's.
         scene: the photos, whose cameras can then be shown; None for none.
         host, port: see `Page`.
-        photo_side: longest side of the photos on the frusta, pixels.
         most: pixels along the longer side of the finest picture.
+        live: whether `show_progress` will be called.
     """
 
     def __init__(
@@ -66,8 +66,8 @@ class FieldPage(Page):
         scene: Scene | None,
         host: str,
         port: int,
-        photo_side: int,
         most: int,
+        live: bool = False,
     ):
         home, distance = home_of(orbit)
         super().__init__(name, home, distance, host, port)
@@ -82,8 +82,8 @@ class FieldPage(Page):
         with self.server.atomic():
             self.set_stage()
             if scene is not None:
-                self.add_cameras(scene, photo_side, visible=False)
-            self._add_controls(most)
+                self.add_cameras(scene, visible=False)
+            self._add_controls(most, live)
         self.server.on_client_connect(self._welcome)
         self.server.on_client_disconnect(self._farewell)
         self.server.scene.on_click()(lambda event: self.click(event.ray_origin, event.ray_direction))
@@ -107,10 +107,12 @@ class FieldPage(Page):
                 visitor.side = 0
             self.changed.notify_all()
 
-    def _add_controls(self, most: int) -> None:
+    def _add_controls(self, most: int, live: bool) -> None:
         gui = self.server.gui
+        if live:
+            self.bar, self.progress = gui.add_progress_bar(0.0), gui.add_markdown("")
         gui.add_markdown(
-            "Drag to rotate, right-drag to move, scroll to zoom. Click into the picture to see a ray's samples."
+            "Drag to turn, right-drag to move, scroll to zoom. Click into the picture to see a ray's samples."
         )
         gui.add_button("reset view").on_click(self.go_home)
         with gui.add_folder("picture"):
@@ -124,7 +126,7 @@ class FieldPage(Page):
             for control in (self.channel, self.background, self.most, self.near, self.far):
                 control.on_update(lambda _: self._want())
         with gui.add_folder("show"):
-            self.lines("/box", box_edges(self.system.field.bounds.aabb.cpu()), BOX)
+            self.lines("/box", box_edges(self.system.field.bounds.aabb.cpu()), rgb(GREY))
             box = self.server.scene.get_handle_by_name("/box")
             assert box is not None  # it has edges
             box.visible = False
@@ -142,6 +144,15 @@ class FieldPage(Page):
         with self.changed:
             self.changed.notify_all()
 
+    def show_progress(self, share: float, words: str) -> None:
+        """Shows how far a live training is.
+
+        Args:
+            share: done, in [0, 1].
+            words: step, quality and time left.
+        """
+        self.bar.value, self.progress.content = 100 * share, words  # type: ignore[misc]  # settable
+
     def draw_ray(self, ray: Rays) -> None:
         """Draws one ray within the bounds and its samples, and prints what was rendered along it."""
         device = self.system.device
@@ -154,11 +165,11 @@ class FieldPage(Page):
         far = torch.minimum(torch.maximum(far, near), near + 4 * self.scale)
         ends = torch.stack([ray.origins.cpu() + t[:, None] * ray.directions.cpu() for t in (near, far)], dim=1)
         with self.redrawing, self.server.atomic():
-            self.lines("/ray/inside", ends.numpy(), INSIDE)
-            self.points("/ray/samples", places.cpu().numpy(), SAMPLES, 0.006)
-        rgb = ", ".join(f"{float(c):.2f}" for c in rendered.rgb[0])
+            self.lines("/ray/inside", ends.numpy(), rgb(GREEN))
+            self.points("/ray/samples", places.cpu().numpy(), rgb(VERMILLION), 0.006)
+        colour = ", ".join(f"{float(c):.2f}" for c in rendered.rgb[0])
         depth, opacity = float(rendered.depth[0]), float(rendered.opacity[0])
-        self.status.content = f"clicked: {len(samples)} samples, colour {rgb}, opacity {opacity:.2f}, depth {depth:.3f}"
+        self.status.content = f"clicked: {len(samples)} samples, colour {colour}, opacity {opacity:.2f}, depth {depth:.3f}"
 
     def wish(self, visitor: Visitor) -> Wish:
         """The picture that a visitor asks for now."""

@@ -12,9 +12,13 @@ import viser
 from viser.transforms import SO3
 
 from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.drawing.ink import BLUE, ORANGE, rgb
 from nerf_lightning.view.drawing import Frustum, Viewpoint, frusta, through
 
-TRAINING, HELD_OUT = (31, 119, 180), (255, 127, 14)
+COLOURS = {"training": rgb(BLUE), "held out": rgb(ORANGE)}
+"""Of the cameras of a split."""
+PHOTO_SIDE = 160
+"""Longest side of the photos on the frusta, pixels."""
 LINE = 1.5
 """Width of lines, screen pixels."""
 FRUSTUM_DEPTH = 0.12
@@ -79,15 +83,14 @@ class Page:
             client.camera.max_orbit_distance = max(1e4, 1e3 * self.scale)
             client.camera.min_orbit_distance = min(1e-2, 1e-3 * self.scale)
 
-    def add_cameras(self, shown: Scene, photo_side: int, visible: bool = True) -> None:
+    def add_cameras(self, shown: Scene, visible: bool = True) -> None:
         """Frusta and their names, one group for each split, shown and hidden as one."""
         scene = self.server.scene
-        splits = (("training", shown.train, TRAINING), ("held out", shown.val, HELD_OUT))
-        for word, views, colour in splits:
+        for word, views in (("training", shown.train), ("held out", shown.val)):
             group = word.replace(" ", "_")
             self.groups[word] = scene.add_frame(f"/{group}", show_axes=False, visible=visible)
             self.names.append(scene.add_frame(f"/{group}/names", show_axes=False, visible=False))
-            for i, frustum in enumerate(frusta(views, word, photo_side)):
+            for i, frustum in enumerate(frusta(views, word, PHOTO_SIDE)):
                 wxyz = SO3.from_matrix(frustum.c2w[:3, :3].astype(np.float64)).wxyz
                 position = frustum.c2w[:3, 3]
                 handle = scene.add_camera_frustum(
@@ -97,7 +100,7 @@ class Page:
                     scale=viser_scale(frustum, FRUSTUM_DEPTH * self.scale),
                     thickness=LINE,
                     thickness_units="screen",
-                    color=colour,
+                    color=COLOURS[word],
                     image=frustum.photo,
                     wxyz=wxyz,
                     position=position,
@@ -125,11 +128,11 @@ class Page:
         """Checkboxes for what to show of the cameras."""
         gui = self.server.gui
         for word, group in self.groups.items():
-            self.switch(word, group)
+            self.switch(f"{word} cameras", group)
         self.switch("names", *self.names)
-        self.photos = gui.add_checkbox("photos", True)
+        self.photos = gui.add_checkbox("photos in them", True)
         self.photos.on_update(lambda _: self.show_photos())
-        self.depth = gui.add_slider("frustum size", 0.01, 0.5, 0.01, FRUSTUM_DEPTH)
+        self.depth = gui.add_slider("camera size", 0.01, 0.5, 0.01, FRUSTUM_DEPTH)
         self.depth.on_update(lambda _: self.size_frusta())
 
     def switch(self, word: str, *handles: viser.SceneNodeHandle | None) -> None:
@@ -166,8 +169,9 @@ class Page:
             return
         self.server.scene.add_line_segments(name, segments, colour, thickness=LINE, thickness_units="screen")
 
-    def points(self, name: str, points: np.ndarray, colour: tuple[int, int, int], size: float) -> None:
-        """Points [N, 3] under a name, in place of what it had; their size is a share of the scene's scale."""
+    def points(self, name: str, points: np.ndarray, colour: tuple[int, int, int] | np.ndarray, size: float) -> None:
+        """Points [N, 3] under a name, in place of what it had, of one colour or [N, 3]; `size` is a share of the scene's
+        scale."""
         if not len(points):
             self.server.scene.remove_by_name(name)
             return
@@ -191,5 +195,5 @@ def look_from(client: viser.ClientHandle, viewpoint: Viewpoint) -> None:
 
 
 def _hushed() -> contextlib.AbstractContextManager[object]:
-    """Viser always announces its start and stop; the verb prints a line of its own."""
+    """Viser always announces its start and stop; the command prints a line of its own."""
     return contextlib.redirect_stdout(io.StringIO())

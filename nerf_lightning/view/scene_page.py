@@ -3,8 +3,10 @@
 import torch
 
 from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.drawing.ink import GREEN, GREY, MAUVE, SKY, VERMILLION, rgb
 from nerf_lightning.view.drawing import (
     box_edges,
+    colour_points,
     overview,
     path_segments,
     random_rays,
@@ -13,9 +15,7 @@ from nerf_lightning.view.drawing import (
 )
 from nerf_lightning.view.page import Page
 
-ORBIT, BOX = (148, 103, 189), (110, 110, 110)
-APPROACH, INSIDE, SAMPLES, FOCUS = (190, 190, 190), (44, 160, 44), (0, 70, 0), (214, 39, 40)
-ONE_EACH, MANY, NO_RAYS = "one ray from each camera", "many rays from one camera", "none"
+ONE_EACH, MANY, NO_RAYS = "one from each camera", "many from one camera", "none"
 
 
 class ScenePage(Page):
@@ -23,23 +23,17 @@ class ScenePage(Page):
 
     Args:
         scene: what is shown.
-        host: address to listen on.
-        port: where to listen; the next free one if it is taken.
-        photo_side: longest side of the photos on the frusta, pixels.
-        rays: how many rays from one camera.
-        samples: samples on each ray that meets the bounds.
+        host, port: see `Page`.
     """
 
-    def __init__(self, scene: Scene, host: str, port: int, photo_side: int, rays: int, samples: int):
+    def __init__(self, scene: Scene, host: str, port: int):
         super().__init__(scene.name, overview(scene), scene_scale(scene), host, port)
         self.scene = scene
-        self.rays = rays
-        self.samples = samples
-        self.draw = 0
-        """Seed of the random pixels."""
+        self.seed = 0
+        """Of the random pixels."""
         with self.server.atomic():
             self.set_stage()
-            self.add_cameras(scene, photo_side)
+            self.add_cameras(scene)
             self._add_surroundings()
             self._add_controls()
             self.draw_rays()
@@ -49,9 +43,11 @@ class ScenePage(Page):
 
     def _add_surroundings(self) -> None:
         scene = self.server.scene
-        self.lines("/orbit", path_segments(self.scene.orbit), ORBIT)
-        self.lines("/box", box_edges(self.scene.bounds.aabb), BOX)
-        self.points("/focus", self.home.look_at[None], FOCUS, 0.02)
+        if self.scene.points is not None:
+            self.points("/points", *colour_points(self.scene.points, self.scene.train), 0.004)
+        self.lines("/orbit", path_segments(self.scene.orbit), rgb(MAUVE))
+        self.lines("/box", box_edges(self.scene.bounds.aabb), rgb(GREY))
+        self.points("/focus", self.home.look_at[None], rgb(VERMILLION), 0.02)
         scene.add_frame("/axes", axes_length=0.2 * self.scale, axes_radius=0.003 * self.scale)
         self.ray_group = scene.add_frame("/rays", show_axes=False)
 
@@ -59,34 +55,39 @@ class ScenePage(Page):
         gui = self.server.gui
         counts = f"{len(self.scene.train)} training cameras (blue), {len(self.scene.val)} held out (orange)"
         width, height = self.scene.resolution
-        gui.add_markdown(f"{counts}, {width} x {height} pixels. Click a camera to look through it.")
+        gui.add_markdown(
+            f"{counts}, {width} x {height} pixels. Drag to turn, scroll to zoom; click a camera to look through it."
+        )
         gui.add_button("whole scene").on_click(self.go_home)
         with gui.add_folder("show"):
-            for word in ("orbit", "box", "axes"):
+            for word in ("points", "orbit", "box", "axes"):
                 self.switch(word, self.server.scene.get_handle_by_name(f"/{word}"))
             self.add_camera_switches()
-        with gui.add_folder("rays"):
-            self.which = gui.add_dropdown("rays", (ONE_EACH, MANY, NO_RAYS))
+        with gui.add_folder("rays", expand_by_default=False):
+            self.which = gui.add_dropdown("rays", (NO_RAYS, ONE_EACH, MANY))
             self.camera = gui.add_slider("camera", 0, len(self.scene.train) - 1, 1, 0, hint="which training camera")
+            self.count = gui.add_slider("how many", 1, 256, 1, 32, hint="rays from one camera")
+            self.samples = gui.add_slider("samples", 1, 256, 1, 64, hint="on each ray")
             self.jitter = gui.add_checkbox("jitter", False, hint="stratified samples, as in training")
-            for control in (self.which, self.camera, self.jitter):
+            for control in (self.which, self.camera, self.count, self.samples, self.jitter):
                 control.on_update(lambda _: self.draw_rays())
-            gui.add_button("other rays", hint="through new random pixels").on_click(
-                lambda _: self.draw_rays(again=True)
-            )
+            button = gui.add_button("other rays", hint="through new random pixels")
+            button.on_click(lambda _: self.draw_rays(again=True))
 
     def draw_rays(self, again: bool = False) -> None:
         """Draws the rays that the controls ask for; the same pixels as before unless `again`."""
         with self.redrawing, self.server.atomic():
-            self.draw += again
-            generator = torch.Generator().manual_seed(self.draw)
-            cameras = self.scene.train.cameras
+            self.seed += again
             self.ray_group.visible = self.which.value != NO_RAYS
+            if not self.ray_group.visible:
+                return
+            generator = torch.Generator().manual_seed(self.seed)
+            cameras = self.scene.train.cameras
             many = self.which.value == MANY
-            views = torch.full((self.rays,), self.camera.value) if many else torch.arange(len(cameras))
+            views = torch.full((self.count.value,), self.camera.value) if many else torch.arange(len(cameras))
             rays = random_rays(cameras, views, generator)
             jitter = generator if self.jitter.value else None
-            figure = ray_figure(rays, self.scene.bounds, self.samples, self.scale, jitter)
-            self.lines("/rays/approach", figure.approach, APPROACH)
-            self.lines("/rays/inside", figure.inside, INSIDE)
-            self.points("/rays/samples", figure.samples, SAMPLES, 0.006)
+            figure = ray_figure(rays, self.scene.bounds, self.samples.value, self.scale, jitter)
+            self.lines("/rays/approach", figure.approach, rgb(SKY))
+            self.lines("/rays/inside", figure.inside, rgb(GREEN))
+            self.points("/rays/samples", figure.samples, rgb(VERMILLION), 0.006)

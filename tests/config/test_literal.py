@@ -10,9 +10,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from PIL import Image
 
-from nerf_lightning.config import cli
 from nerf_lightning.config.literal import escape, override_of, quote_texts
-from nerf_lightning.evaluate.__main__ import task as evaluate
 
 KEYS = ("dataset.path", "resume", "hydra.run.dir", "name")
 NASTY = 'scan (1), ${x} #2 = "ü" [b]'
@@ -119,7 +117,7 @@ def write_picture(folder: Path) -> Path:
     return folder / "photo, 1.png"
 
 
-def test_a_run_in_a_folder_of_any_name_on_a_picture_of_any_name(inside, verb, tmp_path: Path):
+def test_a_run_in_a_folder_of_any_name_on_a_picture_of_any_name(inside, tmp_path: Path):
     """Trained, resumed on a picture that has moved, measured on a third."""
     picture = write_picture(tmp_path / NASTY)
     (tmp_path / f"run {NASTY}").mkdir()
@@ -137,8 +135,7 @@ def test_a_run_in_a_folder_of_any_name_on_a_picture_of_any_name(inside, verb, tm
     assert saved["dataset"]["path"] == str(moved) and saved["budget"]["steps"] == 4
     assert '"steps": 4' in (run / "results.json").read_text(encoding="utf-8")
     picture = write_picture(tmp_path / "(2)")
-    given = [f"run=run {NASTY}", f"dataset.path=(2)/{picture.name}"]
-    code, _, err = verb(lambda: cli.run("evaluate", evaluate, texts=("run", "output", "dataset.path")), *given)
+    code, _, err = inside("evaluate", f"run {NASTY}", "--photos", f"(2)/{picture.name}")
     assert code == 0, err
     assert f"(2)/{picture.name}" in (run / "evaluation" / "views.json").read_text(encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""python -m nerf_lightning.evaluate, on a run of seconds."""
+"""nerf_lightning evaluate, on a run of seconds."""
 
 import json
 import math
@@ -11,13 +11,13 @@ import imageio.v3 as imageio
 import pytest
 import torch
 
+from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.evaluate import perceptual
-from nerf_lightning.evaluate.__main__ import task
+from nerf_lightning.evaluate.metrics import ViewMetrics, average, format_table
 from nerf_lightning.evaluate.perceptual import perceptual_distance
-from nerf_lightning.evaluate.verb import ViewMetrics, averages, table
 from nerf_lightning.training.train import train
 
 
@@ -27,13 +27,14 @@ def run(small_run: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def evaluated(run: Path, *given: str) -> dict:
-    task(composed([f"run={run}", *given], run, "evaluate"))
-    return json.loads((run / "evaluation" / "views.json").read_text())
+def evaluated(run: Path, **options: object) -> dict:
+    found = evaluate(run, **options)
+    assert found == json.loads((run / "evaluation" / "views.json").read_text())
+    return found
 
 
 def test_every_view_is_judged_as_the_run_was(run: Path, capsys: pytest.CaptureFixture[str]):
-    found = evaluated(run, "device=cpu")
+    found = evaluated(run, device="cpu")
     out = capsys.readouterr().out
     results = json.loads((run / "results.json").read_text())
     assert len(found["views"]) == results["scene"]["views"]["val"] == 2
@@ -44,13 +45,13 @@ def test_every_view_is_judged_as_the_run_was(run: Path, capsys: pytest.CaptureFi
     assert out.count("<- worst") == 1 and f"{found['mean']['psnr']:.2f} dB over 2 held-out views" in out
     assert (found["device"], found["machine"]["accelerator"]) == ("cpu", None) and "held-out views on cpu;" in out
     both = imageio.imread(run / "evaluation" / "worst.png")
-    evaluated(run, "worst=1")
+    evaluated(run, worst=1)
     assert len(imageio.imread(run / "evaluation" / "worst.png")) == len(both) // 2
 
 
 def test_other_photos_of_the_same_thing(run: Path, tmp_path: Path):
     save_npz(bricks(size=24, train_views=4, val_views=3, cache=""), tmp_path / "other.npz")
-    found = evaluated(run, f"dataset.path={tmp_path}/other.npz")
+    found = evaluated(run, photos=tmp_path / "other.npz")
     assert len(found["views"]) == 3 and found["scene"]["resolution"] == [24, 24]
 
 
@@ -64,8 +65,8 @@ def test_pictures_too(tmp_path: Path):
 
 def test_means_are_of_what_could_be_told():
     metrics = [ViewMetrics(0, 20.0, math.nan, None, 1.0), ViewMetrics(1, 30.0, 0.5, None, 3.0)]
-    assert averages(metrics) == {"psnr": 25.0, "ssim": None, "lpips": None, "seconds": 2.0}
-    broken = table([ViewMetrics(0, math.nan, math.nan, None, 1.0)])
+    assert average(metrics) == {"psnr": 25.0, "ssim": None, "lpips": None, "seconds": 2.0}
+    broken = format_table([ViewMetrics(0, math.nan, math.nan, None, 1.0)])
     assert [list(column.cells)[0] for column in broken.columns] == ["0", "-", "-", "-", "1.000"]
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from nerf_lightning.callbacks.render_plan import RenderPlan
+from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, Scene
 from nerf_lightning.dataset.bricks.scene import bricks
-from nerf_lightning.evaluate import verb
-from nerf_lightning.evaluate.__main__ import task
+from nerf_lightning.errors import InputError
 from nerf_lightning.training.train import train
 
 OPTIONS = ["+experiment=smoke_3d", "budget.steps=3", "callbacks.orbit=null", "callbacks.snapshots=null", "~logger"]
@@ -41,10 +41,9 @@ def test_its_figures_stand_beside_those_of_held_out_views(scene: Scene, tmp_path
         in capsys.readouterr().out
     )
 
-    monkeypatch.setattr(verb, "data_again", lambda *given: RayDataModule(scene))
+    monkeypatch.setattr("nerf_lightning.runs.data.data_again", lambda *given: RayDataModule(scene))
     for split, expected in (("val", found), ("test", test)):
-        task(composed([f"run={tmp_path}", f"split={split}"], tmp_path, "evaluate"))
-        judged = json.loads((tmp_path / "evaluation" / "views.json").read_text())
+        judged = evaluate(tmp_path, split=split)
         assert judged["mean"]["psnr"] == pytest.approx(expected["psnr"], abs=0.02)
         assert judged["mean"]["ssim"] == pytest.approx(expected["ssim"], abs=1e-3)
         worst = min(view["psnr"] for view in judged["views"])
@@ -61,7 +60,7 @@ def test_where_there_is_not_time_for_all_some_of_it_is_evaluated(scene: Scene, t
     assert "dB on 2 of 5 test views, after" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("split", "words"), [("test", "have no test split"), ("all", "expected val or test")])
+@pytest.mark.parametrize(("split", "words"), [("test", "have no test split"), ("all", "one of val, test")])
 def test_another_split_is_refused(split: str, words: str, scene: Scene, small_run: Path, tmp_path: Path):
-    with pytest.raises(verb.InputError, match=words):
-        task(composed([f"run={small_run}", f"split={split}", f"output={tmp_path}"], tmp_path, "evaluate"))
+    with pytest.raises(InputError, match=words):
+        evaluate(small_run, split=split, output=tmp_path)

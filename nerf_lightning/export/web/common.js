@@ -1,8 +1,7 @@
-// What the pages of scenes and of pictures share.
+// What the pages of scenes and of images share.
 "use strict";
 
 const $ = id => document.getElementById(id);
-const about = JSON.parse($("about").textContent);
 const middle = points => points.reduce((a, b) => [a[0] + b[0] / points.length, a[1] + b[1] / points.length], [0, 0]);
 const apart = ([a, b]) => b ? Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1])) : 1;
 
@@ -19,15 +18,6 @@ function fullScreen() {
   else document.documentElement.requestFullscreen?.().catch(() => {});
 }
 
-// Name and facts, as text: whatever they hold, nothing of it is read as HTML.
-function tell() {
-  document.title = $("title").textContent = about.name;
-  for (const [key, text] of about.facts) {
-    const term = document.createElement("dt"), told = document.createElement("dd");
-    term.textContent = key;
-    told.textContent = text;
-    $("list").append(term, told);
-  }
-  $("full").addEventListener("click", fullScreen);
-  $("information").addEventListener("click", () => $("facts").showModal());
-}
+const hideHint = () => $("hint").classList.add("gone");
+$("full").addEventListener("click", fullScreen);
+$("information").addEventListener("click", () => $("facts").showModal());

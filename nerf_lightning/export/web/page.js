@@ -1,7 +1,9 @@
 // The page: what a person's mouse, fingers and keys do, and what the controls show.
 
+const about = JSON.parse($("about").textContent);
 const QUALITY = [[0.2, 6], [0.35, 12], [0.5, 20], [0.75, 30], [1, 45]];  // share of the screen's pixels at rest, milliseconds while moving
 const REST = 160, ROUND = 14000;            // milliseconds without a move before the fine picture, and of a turn of the turntable
+const QUICK = 40;                           // milliseconds for a picture with half of the screen's sides, below which the turntable starts by itself
 const CAMERA = "nerf_lightning camera";     // the kind of message by which pages side by side turn together
 
 function posesOf(text, lenses) {
@@ -18,7 +20,7 @@ class Page {
     this.photos = about.photos ? posesOf(about.photos.poses, about.photos.lenses) : [];
     this.camera = this.orbit[0].copy();
     this.up = about.up;
-    this.turning = window.parent === window && !matchMedia("(prefers-reduced-motion: reduce)").matches;
+    this.turning = this.touched = false;
     this.turnedFor = 0;                     // milliseconds
     this.moved = -REST;
     this.atRest = Promise.resolve();
@@ -33,7 +35,11 @@ class Page {
   changed(by = "touch") {
     this.moved = performance.now();
     this.dirty = true;
-    if (by === "touch") { this.turntable(false); this.flight = null; }
+    if (by === "touch") {
+      this.turntable(false);
+      this.flight = null;
+      this.touched = true;
+    }
     if (by !== "message" && by !== "turntable" && window.parent !== window) parent.postMessage({ kind: CAMERA, camera: { ...this.camera } }, "*");
     if (!this.resting) this.atRest = new Promise(resolve => { this.resting = resolve; });
     this.wake();
@@ -86,6 +92,9 @@ class Page {
     if (on) this.changed("turntable");
   }
 
+  // As measured while the last pictures were drawn.
+  get quick() { return this.renderer.perPixel * this.canvas.width * this.canvas.height / 4 < QUICK; }
+
   resize() {
     const ratio = Math.min(devicePixelRatio, 2), [width, height] = this.fixed ?? [this.canvas.clientWidth * ratio, this.canvas.clientHeight * ratio].map(Math.round);
     if (!width || !height) return;
@@ -114,6 +123,7 @@ class Page {
       if (after.length > 1) this.camera.approach(Math.min(2, Math.max(0.5, apart(before) / apart(after))));
       if (after.length > 1 || event.buttons & 2 || event.shiftKey) this.camera.slide(x, y, width, height);
       else this.camera.turn(-x / Math.min(width, height) * 3, -y / Math.min(width, height) * 3, this.up);
+      hideHint();
       this.changed();
     });
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, event => down.delete(event.pointerId));
@@ -156,27 +166,23 @@ class Page {
     on("reset", "click", () => this.flyTo(this.orbit[0]));
     on("shot", "click", () => { this.renderer.present(); this.canvas.toBlob(blob => this.save(blob, about.file + ".png")); });
     on("file", "click", () => this.save(new Blob([fromBase64($("compact").textContent)]), about.file + ".npz"));
-    on("settings", "click", () => { const hidden = $("panel").toggleAttribute("hidden"); $("settings").setAttribute("aria-expanded", !hidden); });
+    const settings = open => { $("panel").hidden = !open; $("settings").setAttribute("aria-expanded", open); };
+    on("settings", "click", () => settings($("panel").hidden));
+    on("shut", "click", () => settings(false));
+    addEventListener("keydown", event => { if (event.key === "Escape" && !$("facts").open) settings(false); });
     on("shown", "change", event => { look.shown = Number(event.target.value); this.changed("look"); });
     const behind = { run: [...about.background, 1], none: [0, 0, 0, 0], black: [0, 0, 0, 1], white: [1, 1, 1, 1] };
     on("behind", "change", event => { look.background = behind[event.target.value]; this.changed("look"); });
     on("quality", "input", () => this.changed("look"));
-    for (const [axis, name] of ["x", "y", "z"].entries()) for (const end of [0, 1]) {
-      const slider = Object.assign(document.createElement("input"), { type: "range", min: 0, max: 1, step: 0.005, value: end, className: "crop" });
-      slider.setAttribute("aria-label", `crop ${name}, ${end ? "upper" : "lower"} end`);
-      slider.addEventListener("input", () => { look.keep[3 * end + axis] = Number(slider.value); this.changed("look"); });
-      $("crop").append(slider);
-    }
-    on("uncrop", "click", () => {
-      look.keep = [0, 0, 0, 1, 1, 1];
-      document.querySelectorAll(".crop").forEach((slider, i) => { slider.value = i % 2; });
-      this.changed("look");
-    });
+    const sliders = document.querySelectorAll(".crop");  // from and to of x, y and z
+    const crop = () => { sliders.forEach((slider, i) => { look.keep[3 * (i % 2) + (i >> 1)] = Number(slider.value); }); this.changed("look"); };
+    for (const slider of sliders) slider.addEventListener("input", crop);
+    on("uncrop", "click", () => { sliders.forEach((slider, i) => { slider.value = i % 2; }); crop(); });
     this.photoControls();
   }
 
   photoControls() {
-    if (!this.photos.length) { $("photos").hidden = true; return; }
+    if (!this.photos.length) return;
     about.photos.names.forEach((name, i) => $("photo").append(new Option(name, i)));
     $("photo").addEventListener("change", event => { if (event.target.value) this.flyTo(this.photos[event.target.value]); });
     $("frusta").addEventListener("change", () => this.changed("look"));
@@ -192,8 +198,9 @@ class Page {
 
   // Each photo's camera as a pyramid over the picture.
   drawPhotos() {
-    $("cameras").toggleAttribute("hidden", !$("frusta").checked);
-    if (!$("frusta").checked) return;
+    const shown = Boolean($("frusta")?.checked);
+    $("cameras").toggleAttribute("hidden", !shown);
+    if (!shown) return;
     const { width, height } = this.canvas, deep = about.photos.depth;
     $("cameras").setAttribute("viewBox", `0 0 ${width} ${height}`);
     this.photos.forEach((photo, i) => {
@@ -206,7 +213,7 @@ class Page {
 
   // For other programs, and pages side by side: looks through a camera, on a canvas of a size if one is given.
   show({ rows, lens }, size) {
-    this.turntable(false);
+    this.changed();
     if (size) this.fixed = size;
     this.camera = Camera.from(rows, lens, about.focus);
     this.resize();
@@ -227,15 +234,16 @@ class Page {
 }
 
 async function open() {
-  tell();
   document.body.classList.toggle("framed", window.parent !== window);
   const compact = await Compact.read(fromBase64($("compact").textContent));
   const renderer = new Renderer($("view"), compact, about, $("march").textContent), page = new Page(renderer);
   $("view").addEventListener("webglcontextlost", event => { event.preventDefault(); $("view").dataset.drawn = "lost"; });
   $("view").addEventListener("webglcontextrestored", () => { renderer.prepare(); page.changed("look"); });
   page.listen();
-  page.turntable(page.turning);
   window.field = page;
+  await page.atRest;
+  const still = window.parent !== window || matchMedia("(prefers-reduced-motion: reduce)").matches;
+  if (!still && !page.touched && page.quick) page.turntable(true);
 }
 
 open().catch(error => {

@@ -27,6 +27,7 @@ view.addEventListener("pointermove", event => {
   const after = [...held.values()], [was, is] = [before, after].map(middle);
   put(place[0] + is[0] - was[0], place[1] + is[1] - was[1], place[2]);
   if (after.length > 1) closer(apart(after) / apart(before), ...is);
+  hideHint();
 });
 for (const name of ["pointerup", "pointercancel"]) view.addEventListener(name, event => held.delete(event.pointerId));
 view.addEventListener("wheel", event => { event.preventDefault(); closer(Math.exp(-event.deltaY * 0.0015), event.clientX, event.clientY); }, { passive: false });
@@ -39,5 +40,4 @@ const steps = {
 keys({ ...steps, r: whole, R: whole, f: fullScreen, F: fullScreen });
 $("reset").addEventListener("click", whole);
 addEventListener("resize", whole);
-tell();
 picture.decode().then(whole);

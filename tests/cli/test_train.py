@@ -1,7 +1,6 @@
 """The command line: help, errors, resuming after a kill, and the installed wheel."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -12,105 +11,60 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from commands import BARE, command, popen
+from commands import BARE, popen
 
 from nerf_lightning.config import conf_dir
 from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.owner import owned
-from nerf_lightning.training.train import train
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def test_help_speaks_plainly_and_imports_nothing_heavy(tmp_path: Path):
-    done = command("--help", cwd=tmp_path)
-    assert done.returncode == 0
-    assert "+experiment=lego" in done.stdout
-    assert "model: fourier, hashgrid, hashgrid2d" in done.stdout
-    probe = "import sys; sys.argv = ['x', '--help']\nfrom nerf_lightning.__main__ import main\n"
-    probe += "try: main()\nfinally: print(sorted({'torch', 'lightning', 'cv2'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", probe], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.stdout.endswith("[]\n"), done.stdout[-200:] + done.stderr
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["model.widht=3"], ["model.widht", "--cfg job"]),
-        (["+model.widht=3"], ["model.widht", "unknown option", "did you mean width?"]),
-        ([f"logger.name={'x' * 300}"], ["letters, expected a path that a file or folder can have"]),
-        (["+logger.flush_sec=3"], ["logger.flush_sec", "unknown option", "did you mean flush_secs?"]),
+        (["model.widht=3"], ["model.widht", "did you mean model.width?"]),
+        (["+model.widht=3"], ["model.widht", "did you mean width?"]),
+        (["budget.second=3"], ["budget.second", "did you mean budget.seconds?"]),
+        (["+buget.steps=1"], ["buget", "did you mean budget?"]),
+        (["+limits.chnk=1"], ["limits.chnk", "did you mean chunk?"]),
+        (["--experiment=lego"], ["did you mean +experiment=lego?"]),
+        (["--experimental-rerun=notes.txt"], ["--experimental-rerun"]),
         (["model=nope"], ["model/nope", "hashgrid hashgrid2d"]),
         (["+experiment=nope"], ["experiment/nope", "lego"]),
-        (["model.levels=many"], ["model.levels", "'many'", "a whole number at least 1"]),
         (["model.levels=0"], ["model.levels", "found 0", "at least 1"]),
         (["model.density=magic"], ["model.density", "'magic'", "relu, softplus or exp"]),
         (["model=picture_mlp"], ["model", "PictureMLP", "three coordinates"]),
-        (["+experiment=picture", "model=hashgrid"], ["model", "HashGridField", "two coordinates"]),
         (["model._target_=nerf_lightning.model.Nope"], ["model._target_", "Nope", "an importable class"]),
         (["budget.steps=0"], ["budget.steps", "found 0", "more than 0"]),
-        (["budget.seconds=-3"], ["budget.seconds", "-3", "more than 0"]),
+        (["budget=3"], ["config: budget: found 3"]),
+        (["budget.seconds=nan"], ["budget.seconds", "found nan"]),
         (["optimizer.lr=-1"], ["optimizer", "-1", "torch.optim.Adam"]),
         (["trainer.precision=foo"], ["trainer.precision", "foo", "one of 32-true, 16-mixed, bf16-mixed"]),
-        (["trainer.precision=16-true"], ["trainer.precision", "'16-true'", "one of 32-true, 16-mixed, bf16-mixed"]),
-        (["trainer.precision=64-true"], ["trainer.precision", "'64-true'", "one of 32-true, 16-mixed, bf16-mixed"]),
-        (["trainer.precision=64"], ["trainer.precision", "64", "one of 32-true, 16-mixed, bf16-mixed"]),
         (["trainer.devices=1000000000"], ["trainer.devices", "at most 1024"]),
         (["threads=0"], ["threads", "found 0", "at least 1"]),
         (["seed=x"], ["seed", "'x'", "a whole number"]),
-        (["dataset=photos"], ["dataset.path", "nothing", "give dataset.path="]),
-        (["dataset=photos", "dataset.path=missing.npz"], ["missing.npz", "nothing there", "check the path"]),
-        (["dataset=photos", "dataset.path=notes.txt"], ["notes.txt", "expected"]),
-        (["dataset=photos", "dataset.path=broken.npz"], ["broken.npz", "no zip archive", "expected"]),
-        (
-            ["+dataset._partial_=true"],
-            ["dataset._target_", "makes a partial", "makes a RayDataModule or PixelDataModule"],
-        ),
-        (["dataset.rays=0"], ["dataset.rays", "found 0", "at least 1"]),
-        (["callbacks.orbit.fps=0"], ["callbacks.orbit.fps", "found 0", "at least 0.01"]),
-        (["callbacks.heldout.at=[0.5,0.1]"], ["callbacks.heldout.at", "[0.5, 0.1]", "ascending"]),
-        (["renderer.background=pink"], ["renderer.background", "'pink'", "black, white"]),
-        (["resume=nowhere"], ["nowhere/config.yaml", "nothing there"]),
-        (["resume=notes.txt"], ["notes.txt: found a file, expected the folder of a run"]),
-        (["--experimental-rerun=notes.txt"], ["command line: found --experimental-rerun"]),
-        (["+experiment=aliases.yaml"], ["aliases.yaml", "more than"]),
-        (["kernels=1e400"], ["kernels: found inf", "a finite number"]),
         (["kernels=1e4"], ["kernels", "found 10000.0", "text"]),
-        (["budget.default.steps=-inf"], ["budget.default.steps: found -inf", "a finite number"]),
-        (["schedule._partial_=3"], ["schedule._partial_", "true or false"]),
-        (["--nope"], ["command line: found unrecognized arguments: --nope"]),
-        (["+foo=1"], ["config: foo", "unknown option"]),
-        (["budget.default=3"], ["config: budget.default: found 3", "steps, seconds, each by its name"]),
-        (["budget.steps=1", "~budget.steps", "~budget.default"], ["budget: found neither steps nor seconds"]),
-        (["budget=3"], ["config: budget: found 3", "steps, seconds"]),
-        ([f"optimizer.betas=[0.9,{'9' * 400}]"], ["optimizer.betas.1", "a whole number of 400 digits"]),
-        (["+buget.steps=1"], ["config: buget", "did you mean budget?"]),
-        (["+limits.chnk=1"], ["limits.chnk", "did you mean chunk?"]),
-        (["+budget.default.step=1"], ["budget.default.step", "did you mean steps?"]),
-        (["+experiment=picture", "+render.foo=1"], ["render.foo", "one of scale"]),
         (["schedule=null"], ["schedule: found null", "one of constant, cosine, exponential"]),
         (["sampler=null"], ["sampler: found nothing", "the group sampler"]),
         (["overwrite=yes"], ["overwrite: found 'yes'", "true or false"]),
-        (["callbacks.snapshots.view=99"], ["callbacks.snapshots.view", "99", "from 0 to 9"]),
-        (["dataset=photos", "dataset.path='~nosuchuser/x'"], ["~nosuchuser/x", "home of a user"]),
+        (["renderer.background=pink"], ["renderer.background", "'pink'", "black, white"]),
+        (["callbacks.orbit.fps=0"], ["callbacks.orbit.fps", "found 0", "at least 0.01"]),
+        (["dataset=photos"], ["dataset.path", "nothing", "give dataset.path="]),
+        (["dataset=photos", "dataset.path=missing.npz"], ["missing.npz", "nothing there", "check the path"]),
+        (["dataset=photos", "dataset.path=broken.npz"], ["broken.npz", "no zip archive"]),
         (["dataset=photos", f"dataset.path={'a' * 5000}"], ["'aaa", "5000 letters"]),
-        (["dataset=picture", f"dataset.path={'a' * 5000}"], ["aaa", "expected"]),
-        (["hydra.run.dir='~nosuchuser/x'"], ["~nosuchuser/x", "home of a user"]),
-        ([f"hydra.run.dir={'a' * 5000}"], ["'aaa", "5000 letters"]),
-        (["hydra.run.dir=notes.txt"], ["notes.txt: found a file", "a folder to write into"]),
+        (["resume=nowhere"], ["nowhere/config.yaml", "nothing there"]),
+        (["resume=notes.txt"], ["notes.txt: found a file, expected the folder of a run"]),
+        (["+experiment=broken.yaml"], ["broken.yaml", "YAML"]),
         (["hydra.run.dir=notes.txt/below"], ["notes.txt, which is a file", "a folder to write into"]),
-        (["budget.seconds=nan"], ["budget.seconds", "found nan", "a finite number"]),
-        ([f"seed={2**33}"], ["seed", str(2**33), f"at most {2**32 - 1}"]),
-        (["dataset.rays=1000000000000"], ["dataset.rays", "1,000,000,000,000 rays a step", "GiB that are free"]),
-        (["model=tensorf", "model.size=fixed", "model.finest=1000000"], ["model", "GiB that are free"]),
     ],
 )
-def test_bad_input_gets_one_line_and_exit_code_2(arguments: list[str], words: list[str], inside, tmp_path: Path):
+def test_train_bad_input_one_line_and_exit_code_2(arguments: list[str], words: list[str], inside, tmp_path: Path):
     (tmp_path / "notes.txt").write_text("nothing to see")
     (tmp_path / "broken.npz").write_text("not a zip")
-    many = [f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{n}'])}]" for n in range(9)]
-    (tmp_path / "aliases.yaml").write_text("\n".join(["a0: &a0 [1]", *many]))
+    (tmp_path / "broken.yaml").write_text("a: [1")
     before = {*tmp_path.iterdir()}
     small = [] if any("experiment" in a or a.startswith("dataset=") for a in arguments) else ["dataset.size=16"]
     code, _, err = inside(*small, *arguments)
@@ -192,44 +146,10 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
     code, _, err = inside(f"resume={run}", "sampler.samples=9")
     assert code == 2
     assert "sampler.samples" in err
-    last = run / "checkpoints" / "last.ckpt"
-    state = torch.load(last, weights_only=True)
     before = {name: (run / name).read_bytes() for name in ("config.yaml", "scene.json", "results.json")}
-    described = (run / "config.yaml").read_text()
-    (run / "config.yaml").write_text(yaml.safe_dump({**yaml.safe_load(described), "callbacks": 3}))
-    code, _, err = inside(f"resume={run}")
-    assert code == 2 and "config: callbacks: found 3, expected callbacks by name" in err and err.count("\n") == 1
-    (run / "config.yaml").write_text(described)
     code, _, err = inside(f"resume={run}", "model.width=24")
     assert code == 2 and "last.ckpt: found " in err and err.count("\n") == 1
     assert {name: (run / name).read_bytes() for name in before} == before, "what goes on from this state stays"
-    total, groups = state["loops"]["fit_loop"]["epoch_progress"], state["optimizer_states"][0]["param_groups"]
-    moments = state["optimizer_states"][0]["state"][0]
-    callbacks = state["callbacks"]
-    cfg = composed([f"resume={run}", "budget.steps=12"], run)
-    for where, key, wrong, words in (
-        (callbacks["Throughput"], "rays", [], "last.ckpt: found Type"),
-        (callbacks["HeldOut"], "curve", [1], "last.ckpt: found TypeError"),
-        (callbacks["Guard"], "rate", "fast", "last.ckpt: found ValueError"),
-        (total, "total", 1.0, "last.ckpt: loops: found something else"),
-        (total, "total", 1, "last.ckpt: found TypeError"),
-        (groups[0], "betas", True, "last.ckpt: optimizer_states.betas: found True"),
-        (groups[0], "amsgrad", True, "last.ckpt: optimizer_states.amsgrad: found True"),
-        (groups, 0, torch.zeros(2, 2), "last.ckpt: optimizer_states: found something else"),
-        (groups[0], "initial_lr", ..., "last.ckpt: optimizer_states.initial_lr: found nothing"),
-        (groups[0], "lr", float("nan"), "last.ckpt: optimizer_states.lr: found nan"),
-        (moments, "exp_avg", torch.zeros(3), "last.ckpt: optimizer_states.exp_avg: found torch.float32 (3,)"),
-        (moments, "exp_avg", moments["exp_avg"].to_sparse(), "last.ckpt: optimizer_states.exp_avg: found "),
-        (moments, "exp_avg_sq", ..., "last.ckpt: optimizer_states.exp_avg_sq: found nothing"),
-    ):
-        right, where[key] = where[key], wrong
-        if wrong is ...:
-            del where[key]
-        torch.save(state, last)
-        where[key] = right
-        with pytest.raises(InputError, match=re.escape(words)):
-            train(cfg)
-        assert {name: (run / name).read_bytes() for name in before} == before
 
 
 def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path: Path):

@@ -1,0 +1,1 @@
+"""The command line: a module a command, each a typed function that gives options, ranges, help and the Python interface."""

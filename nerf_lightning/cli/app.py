@@ -1,0 +1,94 @@
+"""nerf_lightning COMMAND: all commands in the order of the work, and errors in one line. Imports nothing heavy."""
+
+import inspect
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import NoReturn
+
+from cyclopts import App, Parameter
+from cyclopts.exceptions import CycloptsError
+
+from nerf_lightning import __version__
+from nerf_lightning.cli.check import check
+from nerf_lightning.cli.evaluate import evaluate
+from nerf_lightning.cli.export import export
+from nerf_lightning.cli.render import render
+from nerf_lightning.cli.train import describe_groups, is_override, train
+from nerf_lightning.cli.view import view
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.ending import AGAIN, Interrupted, asked, be_deaf, leave, listen
+from nerf_lightning.utils.files import full_disk, no_room
+from nerf_lightning.utils.waiting import wait_briefly
+
+TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
+"""Environment variable: set to 1, errors come with the full traceback."""
+
+app = App(
+    name="nerf_lightning",
+    help="Turn photos into a radiance field, on the machine you have.",
+    version=__version__,
+    default_parameter=Parameter(negative=(), show_choices=False),
+    print_error=False,
+    exit_on_error=False,
+    suppress_keyboard_interrupt=False,
+    result_action="return_value",
+)
+_help = f"{inspect.cleandoc(train.__doc__ or '')}\n{describe_groups()}"
+app.command(train, help=_help, help_format="plaintext", usage="Usage: nerf_lightning train KEY=VALUE...\n")
+for _command in (check, view, render, evaluate, export):
+    app.command(_command)
+for _number, _name in enumerate(app.resolved_commands()):
+    app[_name].sort_key = _number
+app.register_install_completion_command()
+for _name in ("--help", "--version", "--install-completion"):
+    app[_name].group = "Options"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs a command line; exits with 2 on bad input or a full disk, 130 after Ctrl-C and 143 after SIGTERM.
+
+    Bad input is anything the user can fix: it gets one line. Anything else is a defect and keeps its traceback.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words and is_override(words[0]):
+        words.insert(0, "train")
+    wait_briefly()
+    listen()
+    try:
+        app(words)
+    except CycloptsError as error:
+        fail(error)
+    except Exception as error:
+        if (known := find_cause(error)) is None:
+            raise
+        fail(known)
+    except BaseException as error:  # whatever a signal has become on its way
+        number = asked()
+        if number is None:
+            raise
+        leave(number, error.go_on if isinstance(error, Interrupted) else AGAIN)
+    finally:
+        be_deaf()
+
+
+def find_cause(error: Exception) -> InputError | None:
+    """What the user can mend about an error: bad input, a full disk, or memory that ran out; None for a defect."""
+    if isinstance(error, InputError):
+        return error
+    if full_disk(error):
+        return no_room(getattr(error, "filename", None) or os.getcwd())
+    if isinstance(error, MemoryError | RuntimeError):
+        from nerf_lightning.utils.memory import out_of_memory
+
+        return out_of_memory(error)
+    return None
+
+
+def fail(error: Exception) -> NoReturn:
+    """Prints an error in one line, with its traceback if the environment asks for it, and exits with 2."""
+    if os.environ.get(TRACEBACK) == "1":
+        traceback.print_exception(error)
+    print(f"nerf_lightning: {' '.join(str(error).split())} ({TRACEBACK}=1 shows the traceback)", file=sys.stderr)
+    sys.exit(2)

@@ -1,0 +1,39 @@
+"""Shared types of the commands' parameters, and the check of their values. Imports nothing heavy."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, ParamSpec, TypeVar
+
+from cyclopts import Parameter
+
+from nerf_lightning.utils.options import check_options
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+Output = Annotated[Path | None, Parameter(alias="-o")]
+"""What a command writes; each says where None puts it."""
+RunPath = Annotated[
+    Path | None,
+    Parameter(help="A run's folder or compact.npz, or a folder of runs for its newest; default: the latest run."),
+]
+Photos = Annotated[Path | None, Parameter(help="The photos, if they have moved since training.")]
+Device = Annotated[str, Parameter(help="auto, cpu, cuda or mps; auto takes the best there is.")]
+
+
+def command(function: Callable[P, T]) -> Callable[P, T]:
+    """Makes a function check its arguments against its annotations, wherever it is called from.
+
+    Raises:
+        InputError: by the function, for a value that its annotation excludes.
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
+        check_options("", function, signature.bind(*args, **kwargs).arguments, source=function.__name__)
+        return function(*args, **kwargs)
+
+    return checked

@@ -1,0 +1,86 @@
+"""nerf_lightning evaluate."""
+
+from typing import Annotated, Any, Literal
+
+from nerf_lightning.cli.command import Device, Output, Photos, RunPath, command
+from nerf_lightning.errors import InputError
+from nerf_lightning.runs.find import find_run
+from nerf_lightning.utils.options import AtLeast
+
+
+@command
+def evaluate(
+    run: RunPath = None,
+    /,
+    *,
+    photos: Photos = None,
+    split: Literal["val", "test"] = "val",
+    worst: Annotated[int, AtLeast(1)] = 3,
+    output: Output = None,
+    device: Device = "auto",
+) -> dict[str, Any]:
+    """Measure a run view by view: PSNR, SSIM and LPIPS on photos that it was not trained on.
+
+    LPIPS needs torchvision and the weights of its AlexNet in torch.hub's folder; nothing is downloaded.
+
+    Args:
+        split: val, or test where the scene's files have a test split, as published figures are measured.
+        worst: How many of the worst views to draw.
+        output: Folder for worst.png and views.json; default: evaluation/ in the run.
+
+    Returns:
+        What views.json holds: `mean` and `views`.
+
+    Raises:
+        InputError: where the device, the run or the photos are no good, or do not fit each other, or have no such split.
+    """
+    from dataclasses import replace
+    from statistics import fmean
+
+    from rich.console import Console
+
+    from nerf_lightning.dataset import RayDataModule
+    from nerf_lightning.drawing.panels import result_panel, stacked, write_png
+    from nerf_lightning.evaluate.metrics import ViewMetrics, format_table, to_json
+    from nerf_lightning.evaluate.perceptual import SMALLEST, TOO_SMALL, perceptual_distance
+    from nerf_lightning.runs.data import data_again
+    from nerf_lightning.runs.open import beside, open_run
+    from nerf_lightning.utils.device import the_device
+    from nerf_lightning.utils.files import output_path, write_json
+    from nerf_lightning.utils.machine import device_in_words
+    from nerf_lightning.utils.progress import tracked
+
+    where, source = the_device(device), find_run(run)
+    found = open_run(source, where)
+    data = data_again(found.cfg, found.scene, None if photos is None else str(photos))
+    if split == "test":
+        if not isinstance(data, RayDataModule) or data.scene.test is None:
+            raise InputError("evaluate", "split", "test", "val: these photos have no test split")
+        data.scene = replace(data.scene, val=data.scene.test)
+    folder = beside(source) / "evaluation" if output is None else output_path(output)
+    distance, reason = perceptual_distance()
+    metrics, results = [], {}
+    views = tracked(range(data.held_out_views), data.held_out_views, "held-out views")
+    for view, result in enumerate(found.system.evaluate_held_out(data, views)):
+        reason = TOO_SMALL if min(result.rgb.shape[:2]) < SMALLEST else reason
+        lpips = None if distance is None else distance(result.rgb, result.comparable)
+        metrics.append(ViewMetrics(view, result.psnr, result.ssim, lpips, result.seconds))
+        results[view] = result
+        if len(results) > worst:
+            del results[max(results, key=lambda one: results[one].psnr)]
+    evaluation = to_json(metrics, source, data.scene.describe(), where)
+    write_json(folder / "views.json", evaluation)
+    panels = []
+    for view in sorted(results, key=lambda one: results[one].psnr):
+        caption = f"view {view}, {metrics[view].psnr:.2f} dB, SSIM {metrics[view].ssim:.3f}"
+        panels.append(result_panel(results[view], caption))
+    write_png(folder / "worst.png", stacked(panels))
+    Console(highlight=False, soft_wrap=True).print(format_table(metrics))
+    mean = fmean(one.psnr for one in metrics)
+    views_of_split = f"{len(metrics)} {'test' if split == 'test' else 'held-out'} views"
+    print(
+        f"{data.scene.name}: {mean:.2f} dB over {views_of_split} on {device_in_words(where)}; {folder}/worst.png, views.json"
+    )
+    if reason:
+        print(f"no LPIPS: {reason}")
+    return evaluation

@@ -1,0 +1,226 @@
+"""nerf_lightning export: a sub-command for each kind of file."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from nerf_lightning.cli.command import Device, Output, Photos, RunPath, command
+from nerf_lightning.errors import InputError
+from nerf_lightning.runs.find import find_run
+from nerf_lightning.utils.options import AtLeast, AtMost, Side
+
+Box = Annotated[
+    tuple[float, float, float, float, float, float] | None,
+    Parameter(help="Keep only this part: X Y Z X Y Z of its lower, then upper corner, in the photos' unit."),
+]
+Resolution = Annotated[Side | None, Parameter(help="Cells along the longest side; default: as fine as the photos.")]
+Threshold = Annotated[
+    Annotated[float, AtLeast(0.001), AtMost(0.999)] | None,
+    Parameter(help="Opacity of a cell at the surface; default: found from the histogram of opacities."),
+]
+Precision = Annotated[
+    Literal["half", "byte"] | None,
+    Parameter(help="half (2 bytes a number) or byte (1); default: the smaller one that loses no more than allowed."),
+]
+LossDb = Annotated[float, AtLeast(0), Parameter(help="dB of held-out PSNR that may be lost.")]
+
+export = App(name="export", help="Write a run as a file for other uses.")
+
+
+@export.command(name="mesh")
+@command
+def export_mesh(
+    run: RunPath = None,
+    /,
+    *,
+    resolution: Resolution = None,
+    threshold: Threshold = None,
+    box: Box = None,
+    output: Output = None,
+    photos: Photos = None,
+    device: Device = "auto",
+) -> Path:
+    """Write the surface with its colours, in the coordinates of the photos' own file.
+
+    Args:
+        output: FILE.ply, .glb (3D viewers), .obj (modellers) or .stl (printers; no colours); default: mesh.ply in the run.
+    """
+    return _write_shape("mesh", run, output, device, resolution, box, threshold, photos)
+
+
+@export.command(name="points")
+@command
+def export_points(
+    run: RunPath = None,
+    /,
+    *,
+    resolution: Resolution = None,
+    threshold: Threshold = None,
+    box: Box = None,
+    output: Output = None,
+    photos: Photos = None,
+    device: Device = "auto",
+) -> Path:
+    """Write points of the surface with their colours, in the coordinates of the photos' own file.
+
+    Args:
+        output: FILE.ply; default: points.ply in the run.
+    """
+    return _write_shape("points", run, output, device, resolution, box, threshold, photos)
+
+
+@export.command(name="voxels")
+@command
+def export_voxels(
+    run: RunPath = None,
+    /,
+    *,
+    resolution: Resolution = None,
+    box: Box = None,
+    output: Output = None,
+    device: Device = "auto",
+) -> Path:
+    """Write density and colour of cubic cells, and where they are.
+
+    Args:
+        output: FILE.npz; default: voxels.npz in the run.
+    """
+    return _write_shape("voxels", run, output, device, resolution, box)
+
+
+@export.command(name="compact")
+@command
+def export_compact(
+    run: RunPath = None,
+    /,
+    *,
+    precision: Precision = None,
+    loss_db: LossDb = 0.1,
+    output: Output = None,
+    photos: Photos = None,
+    device: Device = "auto",
+) -> Path:
+    """Write what the photos' cameras see as one small file, which all commands accept in place of a run.
+
+    Args:
+        output: FILE.npz; default: compact.npz in the run.
+    """
+    from nerf_lightning.export.smallest import compact_run
+    from nerf_lightning.utils.device import the_device
+
+    where, source = the_device(device), find_run(run)
+    target = _target(source, output, "compact.npz", (".npz",))
+    return _write(target, *compact_run(source, where, loss_db, precision, _text(photos)))
+
+
+@export.command(name="html")
+@command
+def export_html(
+    run: RunPath = None,
+    /,
+    *,
+    all: bool = False,
+    cells: Side | None = None,
+    precision: Precision = None,
+    loss_db: LossDb = 0.1,
+    output: Output = None,
+    photos: Photos = None,
+    device: Device = "auto",
+) -> Path:
+    """Write a page to turn the field in any browser, from disk; it asks no server.
+
+    Planes and voxels are drawn as they are; other fields become voxels that learn from them, which takes minutes.
+
+    Args:
+        all: A page of each run in a folder of runs, and gallery.html with all of them side by side.
+        cells: Along a side of the voxels that replace another field; default: as fine as the photos.
+        output: FILE.html; default: field.html in the run.
+    """
+    from nerf_lightning.export.pages import PageOptions, build_page, write_gallery
+    from nerf_lightning.runs.find import OUTPUTS
+    from nerf_lightning.utils.device import the_device
+
+    where, options = the_device(device), PageOptions(cells, precision, loss_db, _text(photos))
+    if all:
+        folder = run or OUTPUTS
+        target = _target(folder, output, "gallery.html", (".html",))
+        print(f"{target}: {write_gallery(folder, target, where, options)} fields side by side: open it in a browser")
+        return target
+    source = find_run(run)
+    target = _target(source, output, "field.html", (".html",))
+    page, words = build_page(source, where, options)
+    return _write(target, page.encode(), f"{len(page) / 1000:,.1f} kB, {words}: open it in a browser")
+
+
+@export.command(name="transforms")
+@command
+def export_transforms(run: RunPath = None, /, *, output: Output = None, photos: Photos = None) -> Path:
+    """Write the photos and their cameras, as training corrected them, for nerfstudio and others.
+
+    Args:
+        output: A new folder; default: posed/ in the run.
+    """
+    from nerf_lightning.export.photos import write_posed_photos
+    from nerf_lightning.utils.files import output_path
+
+    source = find_run(run)
+    target = source / "posed" if output is None else output_path(output)
+    print(f"{target}: {write_posed_photos(source, target, _text(photos))}")
+    return target
+
+
+def _text(photos: Path | None) -> str | None:
+    return None if photos is None else str(photos)
+
+
+def _target(source: Path, output: Path | None, name: str, suffixes: tuple[str, ...]) -> Path:
+    """The file to write: `output`, or one of a name in the run.
+
+    Raises:
+        InputError: for another suffix.
+    """
+    from nerf_lightning.runs.open import beside
+    from nerf_lightning.utils.files import output_path
+
+    if output is None:
+        return beside(source) / name
+    if output.suffix.lower() not in suffixes:
+        raise InputError("export", "output", output.name, f"a name ending in {', '.join(suffixes)}")
+    return output_path(output)
+
+
+def _write(target: Path, content: bytes, words: str) -> Path:
+    """Writes a file and prints what it holds."""
+    from nerf_lightning.utils.files import atomic
+
+    with atomic(target) as temporary:
+        temporary.write_bytes(content)
+    print(f"{target}: {words}")
+    return target
+
+
+def _write_shape(
+    kind: str,
+    run: Path | None,
+    output: Path | None,
+    device: str,
+    resolution: int | None,
+    box: tuple[float, ...] | None,
+    threshold: float | None = None,
+    photos: Path | None = None,
+) -> Path:
+    """Writes a mesh, points or voxels."""
+    from nerf_lightning.export.mesh import SUFFIXES, export_shape
+    from nerf_lightning.utils.device import the_device
+    from nerf_lightning.utils.extras import require
+
+    where, source = the_device(device), find_run(run)
+    suffixes = SUFFIXES[kind]
+    target = _target(source, output, kind + suffixes[0], suffixes)
+    if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+        raise InputError("export", "box", " ".join(map(str, box)), "the lower, then the upper corner: X Y Z X Y Z")
+    if kind != "voxels":
+        require("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
+    shape = export_shape(source, where, kind, target.suffix.lower(), resolution, box, threshold, _text(photos))
+    return _write(target, shape.content, shape.words)

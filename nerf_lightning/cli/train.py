@@ -1,0 +1,216 @@
+"""nerf_lightning train: Hydra's command line. Imports nothing heavy."""
+
+import difflib
+import os
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from nerf_lightning.config import conf_dir
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import output_path, remove_empty, user_path
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+TEXT_KEYS = ("resume", "name", "method", "dataset.path", "dataset.name", "dataset.folder", "dataset.url")
+"""Keys whose values are text, whatever its letters."""
+FOLDER_KEYS = ("hydra.run.dir", "hydra.sweep.dir")
+"""Keys of folders that Hydra makes."""
+
+
+def is_override(word: str) -> bool:
+    """Whether a command line's first word is for Hydra: KEY=VALUE, +KEY=VALUE, ~KEY, or one of its flags."""
+    if word in ("-h", "--help", "--version"):
+        return False
+    return word.startswith(("+", "~", "-")) or re.match(r"[\w./@]+=", word) is not None
+
+
+def describe_groups() -> str:
+    """The options of the groups that users choose most, a line a group."""
+    lines = []
+    for group in ("dataset", "model", "sampler", "refine", "recipe", "experiment"):
+        names = ", ".join(sorted(file.stem for file in (conf_dir() / group).glob("*.yaml")))
+        lines.append(f"{'+' * (group == 'experiment')}{group}: {names}")
+    return "\n".join(lines)
+
+
+def train(*overrides: Annotated[str, Parameter(allow_leading_hyphen=True, show=False)]) -> None:
+    """Train a field from photos, or from a single image.
+
+    train +experiment=lego             the Lego scene, or built-in bricks; 90 s
+    train +experiment=picture          a single image: dataset.path=IMAGE
+    train dataset=photos dataset.path=SCENE
+
+    budget.seconds=60   for a minute; or budget.steps=1000
+    model=mlp           another field; recipe=NAME brings settings that suit it
+    seed=1 name=mine    results go to outputs/mine/TIME
+    resume=RUN          continue a run that was interrupted
+    -m seed=0,1,2       a sweep: a run for each value; run again, it continues
+    hydra.run.dir=DIR   the run's folder; overwrite=true replaces a run in it
+    --cfg job           all keys with their values
+
+    Groups, GROUP=OPTION:
+    """
+    run_hydra(overrides)
+
+
+def run_hydra(overrides: Sequence[str]) -> None:
+    """Composes the configuration from a command line and trains.
+
+    Raises:
+        InputError: for what the user can mend.
+    """
+    import hydra
+    from hydra._internal.utils import get_args_parser
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf, read_write
+    from omegaconf.errors import OmegaConfBaseException
+
+    from nerf_lightning.cli.app import fail
+    from nerf_lightning.config import resolvers  # noqa: F401  (conf/ uses the resolvers)
+    from nerf_lightning.config.literal import escape, quote_texts
+    from nerf_lightning.config.options import replace_nulls
+
+    def job(cfg: "DictConfig") -> float | None:
+        try:
+            runtime: Any = HydraConfig.get().runtime
+            with read_write(runtime):  # Hydra does not escape the path that it puts there
+                runtime.output_dir = escape(OmegaConf.to_container(runtime)["output_dir"])
+            return train_job(cfg)
+        except (InputError, OmegaConfBaseException) as error:
+            remove_empty(Path(HydraConfig.get().runtime.output_dir))
+            fail(error)  # here, as Hydra would print a line of its own
+
+    def refuse(message: str) -> None:
+        raise InputError(
+            "command line", "", message, "KEY=VALUE, or flags that --hydra-help lists", _suggest_flag(message)
+        )
+
+    parser = get_args_parser()
+    parser.allow_abbrev = False  # --experiment is not --experimental-rerun
+    parser.error = refuse  # type: ignore[method-assign,assignment]
+    flags = parser.parse_args(list(overrides))
+    if flags.experimental_rerun:  # it unpickles a file, which may run anything
+        refuse("--experimental-rerun")
+    given = replace_nulls(_find_experiments(_resume_overrides(overrides)))
+    sys.argv[1:] = _make_folders_absolute(quote_texts(given, (*TEXT_KEYS, *FOLDER_KEYS), flags.multirun or None))
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing a report and exiting with 1
+    try:
+        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job)()
+    except (HydraException, OmegaConfBaseException) as error:
+        raise _translate(error) from error
+
+
+def train_job(cfg: "DictConfig") -> float | None:
+    """Trains one run, or one job of a sweep.
+
+    Returns:
+        Held-out PSNR in dB, which a sweep optimises; None for a sweep's job that failed.
+    """
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    from nerf_lightning.config.options import check_run_options
+    from nerf_lightning.utils.ending import Interrupted
+
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        from nerf_lightning.training.sweep import job
+
+        return job(cfg)
+    from nerf_lightning.training.command import run
+
+    check_run_options(cfg, HydraConfig.get().runtime.choices)
+    try:
+        return run(cfg)
+    except Interrupted as interrupted:
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        if (folder / "checkpoints" / "last.ckpt").exists():
+            argument = shlex.quote(f"resume={os.path.relpath(folder)}")
+            interrupted.go_on = f"continue with: nerf_lightning train {argument}"
+        raise
+
+
+def _resume_overrides(arguments: Sequence[str]) -> list[str]:
+    """A command line that, if it resumes a run, continues in that run's folder and may set any of that run's options."""
+    from nerf_lightning.config.literal import override_of
+
+    resumed = [argument.removeprefix("resume=") for argument in arguments if argument.startswith("resume=")]
+    if not resumed or resumed[-1] in ("", "null"):
+        return [*arguments]
+    folder = user_path(resumed[-1])
+    if folder.is_file():  # Hydra would try to make a folder of this name
+        raise InputError(folder, "", "a file", "the folder of a run", "give resume=FOLDER")
+    # conf/ composes another run than the resumed one, with other options in its groups: ++ sets also those that only this has.
+    options = [f"++{one}" if re.match(r"(?!hydra\.)\w+\.[\w.]+=", one) else one for one in arguments]
+    return [*options, override_of("hydra.run.dir", folder.absolute()) if folder.is_dir() else "hydra.run.dir=${resume}"]
+
+
+def _find_experiments(arguments: Sequence[str]) -> list[str]:
+    """Rewrites +experiment=FILE.yaml so that Hydra finds it: relative to the shipped experiments.
+
+    Raises:
+        InputError: where such a file is no YAML.
+    """
+    from nerf_lightning.config.literal import override_of
+    from nerf_lightning.utils.untrusted import read_yaml
+
+    rewritten = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key == "+experiment" and value.endswith(".yaml") and (path := user_path(value)).is_file():
+            read_yaml(path, "an experiment in YAML")  # Hydra reads without limits
+            argument = override_of(key, os.path.relpath(path.with_suffix(""), conf_dir() / "experiment"))
+        rewritten.append(argument)
+    return rewritten
+
+
+def _make_folders_absolute(arguments: Sequence[str]) -> list[str]:
+    """Rewrites the folders that Hydra makes, with ~ filled in.
+
+    Raises:
+        InputError: where there can be no such folder.
+    """
+    from nerf_lightning.config.literal import override_of, parse_argument
+
+    rewritten = []
+    for argument in arguments:
+        key = argument.partition("=")[0]
+        parsed = parse_argument(argument) if key in FOLDER_KEYS else None
+        if parsed is not None and isinstance(text := parsed.value(), str) and "${" not in text:
+            folder = output_path(text)
+            if folder.exists() and not folder.is_dir():
+                raise InputError(folder, "", "a file", f"a folder to write into ({key})", "give another one")
+            argument = override_of(key, folder)
+        rewritten.append(argument)
+    return rewritten
+
+
+def _suggest_flag(message: str) -> str:
+    """What may be meant by a flag that Hydra does not know, such as --experiment=lego."""
+    found = re.search(r"--([\w.]+)(=\S+)?", message)
+    if found is None:
+        return ""
+    key = f"+{found[1]}" if found[1] == "experiment" else found[1]
+    return f"did you mean {key}{found[2] or '=...'}?"
+
+
+def _translate(error: Exception) -> InputError:
+    """An error of Hydra or OmegaConf as bad input, with the nearest key where one is not known."""
+    line = " ".join(str(error).split("Config search path")[0].split())
+    if (unknown := re.match(r"Could not override '([^']+)'", line)) is not None:
+        node = getattr(error.__cause__, "parent_node", None)
+        known = [str(key) for key in node] if node is not None else []
+        near = difflib.get_close_matches(unknown[1].rpartition(".")[2], known, 1)
+        prefix = unknown[1].rpartition(".")[0]
+        todo = f"did you mean {prefix}{'.' if prefix else ''}{near[0]}?" if near else "--cfg job lists all"
+        return InputError("command line", unknown[1], "an unknown key", f"one of {', '.join(sorted(known))}", todo)
+    if re.search(r"hydra/(launcher|sweeper)", line):
+        line += "; joblib, submitit_local, submitit_slurm and optuna come with pip install 'nerf_lightning[sweeps]'"
+    return InputError("command line", "", line, "what nerf_lightning train --help describes")

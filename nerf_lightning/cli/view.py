@@ -1,0 +1,96 @@
+"""nerf_lightning view."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from nerf_lightning.cli.command import Device, command
+from nerf_lightning.errors import InputError
+from nerf_lightning.runs.find import OUTPUTS, find_run
+from nerf_lightning.utils.options import AtLeast, AtMost, Count, Port
+
+if TYPE_CHECKING:
+    from nerf_lightning.view.page import Page
+
+
+@command
+def view(
+    path: Annotated[Path | None, Parameter(help="A run, a folder of runs for its newest, or a scene; default: the latest run.")] = None,
+    /,
+    *,
+    resize: Count | Literal["auto"] | None = "auto",
+    holdout: Annotated[int, AtLeast(2)] = 8,
+    side: Annotated[int, AtLeast(64), AtMost(2048)] = 800,
+    device: Device = "auto",
+    host: str = "127.0.0.1",
+    port: Port = 8080,
+) -> None:
+    """Show a trained run, or a scene's photos and cameras, in the browser, until Ctrl-C.
+
+    Nothing is loaded from the internet. Images of a run are coarse at first, then get finer. To watch a training, give it
+    callbacks=live.
+
+    Args:
+        resize: Of a scene: longest side of its photos in pixels; auto, as for a training of 90 s, or null for their size.
+        holdout: Of a scene: every N-th photo is held out, unless the files say which.
+        side: Of a run: pixels along the longer side of the finest image.
+        host: This machine alone; 0.0.0.0 shares the page with the network.
+        port: The next free one where it is taken; 0 for any.
+
+    Raises:
+        InputError: for no such run, scene, device or address, and where Viser is not installed.
+    """
+    from nerf_lightning.view.serve import announce, require_viser, resolve_host
+
+    require_viser()
+    resolve_host(host)
+    if path is not None and not is_run(path):
+        page = _open_scene(path, resize, holdout, host, port)
+    else:
+        page = _open_run(find_run(path), device, side, host, port)
+    try:
+        print(f"{announce(page.name, host, port, page.port)}; Ctrl-C ends it", flush=True)
+        page.run()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        page.stop()
+
+
+def is_run(path: Path) -> bool:
+    """Whether a path is a run or a folder of runs; all else may be a scene."""
+    import zipfile
+
+    path = path.expanduser()
+    if path.is_file():
+        return zipfile.is_zipfile(path) and "header.npy" in zipfile.ZipFile(path).namelist()
+    if (path / "config.yaml").is_file() or path.absolute() == OUTPUTS.absolute():
+        return True
+    scene = any(path.glob("*.json")) or any((path / name).exists() for name in ("images", "sparse", "poses_bounds.npy"))
+    return not scene and any(file.with_name("checkpoints").is_dir() for file in path.rglob("config.yaml"))
+
+
+def _open_scene(path: Path, resize: int | str | None, holdout: int, host: str, port: int) -> "Page":
+    from nerf_lightning.dataset import Reading, open_scene
+    from nerf_lightning.dataset.size import parse_resize
+    from nerf_lightning.view.scene_page import ScenePage
+
+    return ScenePage(open_scene(str(path), reading=Reading(parse_resize(resize), holdout)), host, port)
+
+
+def _open_run(source: Path, device: str, side: int, host: str, port: int) -> "Page":
+    from nerf_lightning.dataset import Scene
+    from nerf_lightning.runs.data import data_again
+    from nerf_lightning.runs.open import open_scene_run
+    from nerf_lightning.utils.device import the_device
+    from nerf_lightning.view.field_page import FieldPage
+
+    found = open_scene_run(source, the_device(device))
+    scene = None
+    try:
+        scene = data_again(found.cfg, found.scene).scene
+    except InputError as error:
+        print(f"without photos: {error}", flush=True)
+    assert scene is None or isinstance(scene, Scene)  # of a scene's run
+    return FieldPage(source.name, found.system, found.orbit, scene, host, port, side)

@@ -1,0 +1,95 @@
+"""Options of a run at the top level of its configuration, and groups that null leaves out."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from nerf_lightning.config import conf_dir
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.options import AtLeast, AtMost, Count, Seed, check_options
+
+OPTIONAL_GROUPS = ("callbacks", "logger", "recipe", "refine", "renderer", "sampler")
+"""Groups that a run can do without: a 2D field has no sampler and no renderer."""
+NONE = "none"
+"""Name of the option of such a group that sets nothing, as Hydra takes no null for a group."""
+
+for _group in OPTIONAL_GROUPS:
+    ConfigStore.instance().store(name=NONE, node={}, group=_group, package="_global_", provider="nerf_lightning")
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Keys at the top level of a run's configuration, see conf/config.yaml; groups are checked when they are built."""
+
+    name: str
+    method: str
+    recipe: str | None
+    seed: Seed
+    threads: Annotated[Count, AtMost(1024)] | None
+    device: str
+    kernels: str
+    compile: bool
+    resume: str | None
+    overwrite: bool
+    budget: dict
+    limits: dict
+    dataset: Any
+    model: Any
+    optimizer: Any
+    schedule: Any
+    trainer: Any
+    sampler: Any = None
+    renderer: Any = None
+    refine: Any = None
+    callbacks: Any = None
+    logger: Any = None
+    render: dict[str, Annotated[float, AtLeast(0)] | None] | None = None
+    """Of an experiment with a 2D field: `scale` of the enlarged image."""
+
+
+def replace_nulls(arguments: Sequence[str]) -> list[str]:
+    """Rewrites GROUP=null to GROUP=none on a command line, also among the values of a sweep.
+
+    Raises:
+        InputError: for a group that no run can do without.
+    """
+    replaced, groups = [], {folder.name for folder in conf_dir().iterdir() if folder.is_dir()}
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        group, values = key.lstrip("+"), value.split(",")
+        if "null" in values and group in groups:
+            if group not in OPTIONAL_GROUPS:
+                options = ", ".join(sorted(file.stem for file in (conf_dir() / group).glob("*.yaml")))
+                raise InputError("command line", group, "null", f"one of {options}")
+            argument = f"{key}={','.join(NONE if one == 'null' else one for one in values)}"
+        replaced.append(argument)
+    return replaced
+
+
+def check_run_options(cfg: DictConfig, choices: Mapping[str, str | None]) -> None:
+    """Sets groups that were left out to null, and checks the keys at the top level.
+
+    Args:
+        cfg: composed, without Hydra's node.
+        choices: option of each group, as Hydra keeps it.
+
+    Raises:
+        InputError: for a key that nothing reads, a missing one, and a value of the wrong type.
+    """
+    with open_dict(cfg):
+        for group in OPTIONAL_GROUPS:
+            if choices.get(group) == NONE and group != "recipe":
+                cfg[group] = None
+    text = str(OmegaConf.to_container(cfg))
+    used = {str(key) for key in cfg if re.search(rf"\$\{{[^}}]*\b{re.escape(str(key))}\b", text)}
+    known = {field.name for field in fields(RunOptions)}
+    given = {
+        key: value
+        for key, value in OmegaConf.to_container(cfg, resolve=True).items()
+        if key in known or key not in used
+    }
+    check_options("", RunOptions, given)

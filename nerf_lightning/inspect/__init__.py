@@ -1,1 +1,0 @@
-"""A look at a scene's photos before training: sharpness, exposure, cameras, and what the checks doubt."""

@@ -1,0 +1,79 @@
+"""Camera paths: which views a video shows."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.cameras import Cameras, resample_path, spiral_like
+from nerf_lightning.dataset import Scene, Views
+from nerf_lightning.errors import InputError
+from nerf_lightning.render.path_file import read_path
+from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.files import user_path
+
+SPLITS = {"test": "val", "train": "train"}
+"""Paths through photos, and their attribute of a scene."""
+SPIRAL_FRAMES = 120
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Views in the order in which they are shown."""
+
+    cameras: Cameras
+    views: list[int]
+    """Their numbers among the photos, for captions; without photos, among the path's views."""
+    photos: Views | None = None
+    """What the views should show, where that is known."""
+
+
+def check_path(path: str, path_frame: str) -> None:
+    """Raises InputError for a path that is neither a known word nor a file, before the run is opened."""
+    words = ("orbit", "spiral", *SPLITS)
+    if path not in words and not path.endswith(".json"):
+        raise InputError("render", "path", repr(path), f"one of {', '.join(words)}, or a .json file")
+    if path.endswith(".json") and not user_path(path).is_file():
+        raise InputError(path, "", "nothing there", "a camera path in JSON")
+    if path_frame != "auto" and not path.endswith(".json"):
+        found = f"{path_frame!r} with path={path}"
+        raise InputError("render", "path_frame", found, "auto; it is for a .json file of your own")
+
+
+def build_path(
+    path: str,
+    frames: int | None,
+    orbit: Cameras,
+    scene: Scene | None,
+    to_source: Float[Tensor, "4 4"],
+    path_frame: str = "auto",
+) -> CameraPath:
+    """The views that a name or a file stands for.
+
+    Args:
+        path: "orbit", "spiral", "test" (held-out photos), "train" (training photos), or a JSON file.
+        frames: how many; None takes as many as there are.
+        orbit: the run's.
+        scene: with photos, for "test" and "train".
+        to_source: similarity from the run's frame to that of the photos' own file.
+        path_frame: of a file, see `read_path`.
+
+    Raises:
+        InputError: for a file that is no camera path.
+    """
+    if path in SPLITS:
+        assert scene is not None  # the caller opens it for these words
+        photos: Views = getattr(scene, SPLITS[path])
+        chosen = evenly(len(photos), frames)
+        index = torch.tensor(chosen)
+        return CameraPath(photos.cameras[index], chosen, photos[index])
+    if path == "orbit":
+        cameras = resample_path(orbit, frames or len(orbit), closed=True)
+    elif path == "spiral":
+        cameras = spiral_like(orbit, frames or SPIRAL_FRAMES)
+    else:
+        cameras = read_path(Path(user_path(path)), orbit, to_source, path_frame)
+        cameras = resample_path(cameras, frames or len(cameras), closed=False)
+    return CameraPath(cameras, list(range(len(cameras))))

@@ -1,0 +1,87 @@
+"""Frames of a video: what each shows, and its colours."""
+
+import hashlib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from nerf_lightning.drawing.frame import CHANNELS, ERROR_TIMES, Style, draw, error_picture
+from nerf_lightning.drawing.panels import panel
+from nerf_lightning.errors import InputError
+from nerf_lightning.render.camera_path import CameraPath
+from nerf_lightning.render.video import Image
+from nerf_lightning.renderer.renderer import NAMED
+from nerf_lightning.system import NeRF3D
+
+Colour = tuple[float, float, float]
+
+
+def parse_channels(text: str) -> tuple[str, ...]:
+    """The channels' names.
+
+    Raises:
+        InputError: for another name, or one that is there twice.
+    """
+    names = tuple(name.strip() for name in text.split(","))
+    if any(name not in CHANNELS for name in names) or len(set(names)) < len(names):
+        raise InputError("render", "channels", repr(text), f"one or more of {', '.join(CHANNELS)}, separated by commas")
+    return names
+
+
+def parse_background(text: str) -> Colour | None:
+    """A colour in [0, 1]; None for "scene" and "transparent".
+
+    Raises:
+        InputError: for anything else.
+    """
+    if text in ("scene", "transparent"):
+        return None
+    try:
+        red, green, blue = NAMED.get(text) or map(float, text.split(","))
+    except ValueError:
+        red = green = blue = -1.0
+    if not all(0 <= part <= 1 for part in (red, green, blue)):
+        expected = "scene, black, white, transparent, or R,G,B in 0..1"
+        raise InputError("render", "background", repr(text), expected)
+    return red, green, blue
+
+
+def check_photos_background(colour: Colour | None, system: NeRF3D, path: CameraPath) -> None:
+    """Raises InputError where photos have a background that cannot be taken off."""
+    own = system.renderer.colour.tolist()
+    if path.photos is not None and path.photos.channels == 3 and not np.allclose(colour or own, own, atol=1e-3):
+        expected = f"scene: these photos have no alpha, and their background is {[round(part, 3) for part in own]}"
+        raise InputError("render", "background", str(colour), expected)
+
+
+def describe_frames(path: str, system: NeRF3D, cameras: CameraPath, style: Style) -> dict[str, Any]:
+    """Everything that frames depend on, as plain values."""
+    digest = hashlib.sha256()
+    for tensor in (*system.state_dict().values(), cameras.cameras.K, cameras.cameras.c2w):
+        digest.update(tensor.cpu().contiguous().numpy().tobytes())
+    return {
+        "what": digest.hexdigest(),
+        "path": path,
+        "views": cameras.views,
+        "size": cameras.cameras.sizes.tolist(),
+        "channels": list(style.channels),
+        "background": None if style.background is None else list(style.background),
+    }
+
+
+def draw_frame(system: NeRF3D, path: CameraPath, index: int, style: Style) -> Image:
+    """The channels of a view side by side; where there is a photo: photo, render, their difference, and other channels."""
+    if path.photos is None:
+        return np.concatenate(list(draw(system, path.cameras, index, style).values()), axis=1)
+    assert style.background is not None  # the command sees to it
+    photo = path.photos.image(index).numpy()
+    if photo.shape[-1] == 4:
+        alpha = photo[..., 3:] / 255.0
+        photo = np.rint(photo[..., :3] * alpha + 255 * (1 - alpha) * np.array(style.background)).astype(np.uint8)
+    others = [name for name in style.channels if name != "rgb"]
+    drawn = draw(system, path.cameras, index, replace(style, channels=("rgb", *others)))
+    error, psnr = error_picture(drawn["rgb"], photo)
+    names = ["truth", "render", f"{ERROR_TIMES} x error", *others]
+    caption = f"{' | '.join(names)}    view {path.views[index]}, {psnr:.2f} dB"
+    return panel([photo, drawn["rgb"], error, *(drawn[name] for name in others)], caption)

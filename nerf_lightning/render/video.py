@@ -1,0 +1,133 @@
+"""Videos: frames are kept on disk until the video is written, so that an interrupted one can be continued."""
+
+import shutil
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from nerf_lightning.dataset.formats.decode import image_header
+from nerf_lightning.drawing.panels import write_animation
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.extras import require
+from nerf_lightning.utils.files import atomic, write_json
+from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.untrusted import read_json
+
+Image = UInt8[ndarray, "H W C"]
+PLAN = "frames.json"
+"""Beside the frames: what they show, so that frames of something else are never reused."""
+SUFFIXES = (".gif", ".mp4", ".webp")
+OPAQUE = (".gif", ".mp4")
+"""Formats without partial transparency."""
+WEBP_BYTES_PER_PIXEL = 4
+"""Of all frames, which its writer keeps in memory."""
+CRF = 18
+"""Of H.264: smaller is better, 18 looks like the original."""
+
+
+def check_output(output: Path, transparent: bool) -> None:
+    """Raises InputError where no video can be written to a place, before any work is done."""
+    if output.suffix not in ("", *SUFFIXES):
+        raise InputError("render", "output", output.name, f"a name ending in {', '.join(SUFFIXES)}, or a folder of PNGs")
+    if output.exists() and output.is_dir() == bool(output.suffix):
+        found, expected = ("a folder", "a file to write") if output.suffix else ("a file", "a folder for PNGs")
+        raise InputError(output, "", found, expected, "give --output another name")
+    if transparent and output.suffix in OPAQUE:
+        raise InputError("render", "background", f"transparent for {output.suffix}", "a colour", "or -o FILE.webp")
+    if output.suffix == ".mp4":
+        require("video", "av", purpose="the optional extra that writes .mp4", otherwise=", or -o FILE.webp")
+
+
+def write_video(plan: dict[str, Any], draw: Callable[[int], Image], count: int, output: Path, fps: float) -> int:
+    """Draws all frames that are not there yet, and joins them.
+
+    Frames are in the folder itself, or beside a video in a folder of its own until it is written.
+
+    Args:
+        plan: all that the frames depend on, as plain values; its `size` holds their widths and heights.
+        draw: makes a frame.
+        count: how many.
+        output: a folder, or a file whose suffix says what kind of video.
+        fps: frames per second.
+
+    Returns:
+        How many frames were there already.
+
+    Raises:
+        InputError: where the folder holds something else.
+    """
+    if output.suffix == ".webp":
+        pixels = sum(width * height for width, height in plan.get("size", []))
+        todo = "give less of --scale or --frames, or -o FILE.mp4"
+        check_memory("render", "frames", f"{count:,} frames", WEBP_BYTES_PER_PIXEL * pixels, todo)
+    folder = output.with_name(f"{output.name}.frames") if output.suffix else output
+    files = [folder / f"{index:05d}.png" for index in range(count)]
+    prepare_folder(folder, plan, owned=bool(output.suffix))
+    missing = [index for index in range(count) if not files[index].exists()]
+    for index in tracked(missing, len(missing), "frames"):
+        image = draw(index)
+        if index == missing[0]:  # nothing is left of a video of which not even a frame can be drawn
+            write_json(folder / PLAN, plan)
+        with atomic(files[index]) as temporary:
+            imageio.imwrite(temporary, image, compress_level=1)
+    if output.suffix:
+        with atomic(output) as temporary:
+            join_frames(files, temporary, fps)
+        shutil.rmtree(folder)
+    return count - len(missing)
+
+
+def prepare_folder(folder: Path, plan: dict[str, Any], owned: bool) -> None:
+    """Makes way for the frames of a plan: those of another plan are deleted if the folder is `owned`.
+
+    Raises:
+        InputError: where it is not, and holds something else.
+    """
+    try:
+        found = read_json(folder / PLAN, "a plan of frames")
+    except InputError:  # none there, or none whole
+        found = None
+    if found != plan and folder.exists():
+        if owned:
+            shutil.rmtree(folder)
+        elif any(folder.iterdir()):
+            raise InputError(folder, "", "something else in it", "a folder for these frames alone", "give -o FOLDER")
+
+
+def read_frames(files: list[Path]) -> Iterator[Image]:
+    """Frames on disk, those of smaller photos in the middle of a black or transparent frame of the size of the largest."""
+    sizes = [image_header(file)[:2] for file in files]
+    width, height = (max(sides) for sides in zip(*sizes, strict=True))
+    for file, (w, h) in zip(files, sizes, strict=True):
+        left, top = (width - w) // 2, (height - h) // 2
+        yield np.pad(imageio.imread(file), ((top, height - h - top), (left, width - w - left), (0, 0)))
+
+
+def join_frames(files: list[Path], output: Path, fps: float) -> None:
+    """Frames on disk -> one video, of the kind that its suffix says.
+
+    H.264 has colours at half resolution, which every player knows; odd sizes get one more row or column, never a resize.
+    """
+    if output.suffix != ".mp4":
+        write_animation(output, read_frames(files), 1 / fps)
+        return
+    import av
+
+    with av.open(str(output), "w", options={"movflags": "faststart"}) as container:
+        rate = Fraction(fps).limit_denominator(1000)
+        stream: Any = container.add_stream("libx264", rate=rate, options={"crf": str(CRF)})
+        for index, frame in enumerate(read_frames(files)):
+            height, width, _ = frame.shape
+            image = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+            if not index:
+                stream.height, stream.width = image.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode(None))

@@ -1,0 +1,52 @@
+"""The command line as a whole: help, suggestions, exit codes."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from nerf_lightning.cli.app import app
+
+ROOT = Path(__file__).resolve().parents[2]
+COMMANDS = [name for name in app.resolved_commands() if not name.startswith("-")]
+
+
+def test_help_imports_nothing_heavy():
+    probe = "import sys; from nerf_lightning.cli.app import main\n"
+    probe += f"for name in {COMMANDS}: \n  main([name, '--help'])\n"
+    probe += "print(sorted({'torch', 'lightning', 'cv2', 'hydra', 'pandas', 'scipy', 'numpy'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", probe], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stdout.endswith("[]\n"), done.stdout[-200:] + done.stderr
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_a_command_fits_a_screen(name: str, inside, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    code, out, err = inside(name, "--help")
+    assert (code, err) == (0, "") and out.startswith(f"Usage: nerf_lightning {name}")
+    assert len(out.splitlines()) <= 45
+
+
+def test_without_arguments_lists_commands_in_the_order_of_the_work(inside):
+    code, out, _ = inside()
+    assert code == 0
+    places = [out.index(f" {name} ") for name in COMMANDS]
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["evalute"], 'Did you mean "evaluate"?'),
+        (["evaluate", "--worts", "3"], "Did you mean --worst?"),
+        (["evaluate", "--worst", "x"], "--worst"),
+        (["evaluate", "--worst", "0"], "worst: found 0, expected a whole number at least 1"),
+        (["evaluate", "--split", "all"], "val"),
+        (["evaluate", "nowhere (1), ü=2"], "nowhere (1), ü=2: found no run"),
+        (["evaluate"], "outputs: found no run"),
+    ],
+)
+def test_wrong_arguments_give_one_line_and_exit_code_2(arguments: list[str], words: str, inside):
+    code, _, err = inside(*arguments)
+    assert code == 2 and err.count("\n") == 1 and words in err
