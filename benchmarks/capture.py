@@ -13,10 +13,10 @@ from benchmarks.tables import Rows, named
 from nerf_lightning.cameras import look_at
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.pack import pack
+from nerf_lightning.capture.poses.flips import resolve_flips
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
 from nerf_lightning.capture.poses.pose import mark_poses
 from nerf_lightning.capture.poses.solve import Solved
-from nerf_lightning.capture.poses.walk import choose
 from nerf_lightning.capture.run import Capture, capture
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import TagLayout, flat_pose
@@ -166,7 +166,7 @@ def flips_of_walk(
     errors = [[angle_between(pose, h.pose) for h in found] for pose, found in zip(truth, options, strict=True)]
     return {
         way: sum(bool(e[i] > min(e) + FLIPPED) for e, i in zip(errors, chosen, strict=True))
-        for way, chosen in (("alone", [0] * count), ("in_order", choose(lens, options, seen)))
+        for way, chosen in (("alone", [0] * count), ("in_order", resolve_flips(lens, options, seen)))
     }
 
 

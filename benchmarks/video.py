@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from benchmarks.cameras import similarity
 from benchmarks.capture import SHEETS
 from benchmarks.synthetic.photos import Flaws, render_photo
-from benchmarks.synthetic.video import FPS, with_blurs, write_video
+from benchmarks.synthetic.video import FPS, place_cameras, with_blurs, write_video
 from benchmarks.tables import Row, Rows
 from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.capture.poses.geometry import angle_between, inverse
