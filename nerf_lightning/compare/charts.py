@@ -17,7 +17,7 @@ WIDTH, HEIGHT, DPI = 4.8, 3.5, 172
 """Of a panel, in inches, and pixels per inch."""
 MAX_NAMED = 8
 """Points that are named each, and have a colour each; of more, those on the frontier are named, and methods have colours."""
-MAX_ROWS = 30
+MAX_ROWS = 12
 """Configurations in the panel of qualities, the best."""
 MAX_TIME_RATIO = 30.0
 """How many times the longest training of one's own the axis reaches, where publications took longer."""
@@ -33,29 +33,29 @@ def draw_panels(points: pd.DataFrame, references: pd.DataFrame) -> list[UInt8[np
     return [pixels_of(figure) for figure in figures]
 
 
-def make_panel(title: str, height: float = HEIGHT) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
+def make_panel(title: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(WIDTH, HEIGHT), dpi=DPI, layout="constrained")
     axes = figure.add_subplot(axisbelow=True)
     axes.set_title(title, loc="left")
     axes.grid(color="0.9", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.margins(x=0.12, y=0.12)
+    axes.margins(x=0.15, y=0.12)
     return figure, axes
 
 
 def draw_quality(points: pd.DataFrame) -> Figure:
     """A row for each configuration, the best on top: its median, and a stroke for each seed."""
     shown = points.head(MAX_ROWS)
-    figure, axes = make_panel("Quality", max(HEIGHT, 1 + 0.24 * len(shown)))
+    figure, axes = make_panel("Quality" if len(shown) == len(points) else f"Quality of the best {MAX_ROWS}")
     for row, point in enumerate(shown.itertuples()):
         colour, marker = point.style
         seeds = [run.psnr for run in point.runs if run.status != "collapsed"]
         axes.plot(seeds, [row] * len(seeds), "|", color=colour, markersize=12)
         axes.plot(point.psnr, row, marker, color=colour, markersize=8, markeredgecolor="white")
-        axes.annotate(
-            f"{point.psnr:.2f}", (point.psnr, row), (0, 8), textcoords="offset points", ha="center", fontsize=8
-        )
-    axes.set_yticks(range(len(shown)), [shortened(readable(name), 34) for name in shown["label"]], parse_math=False)
+        axes.annotate(f"{point.psnr:.2f}", (point.psnr_max, row), (8, -3), textcoords="offset points", fontsize=8)
+    axes.set_yticks(
+        range(len(shown)), [shortened(readable(name), 34) for name in shown["label"]], parse_math=False, fontsize=8.5
+    )
     for tick, collapsed in zip(axes.get_yticklabels(), shown["collapsed"], strict=True):
         tick.set_color(VERMILLION if collapsed else "black")
     axes.set(ylim=(len(shown) - 0.5, -0.7), xlabel="held-out PSNR, dB")
@@ -73,8 +73,9 @@ def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figu
     for point in placed.itertuples():
         colour, marker = point.style
         x = getattr(point, cost)
-        axes.plot([x, x], [max(point.psnr_min, point.psnr - 10), point.psnr_max], color=colour, linewidth=1.5)
-        axes.scatter([x], [point.psnr], 55, colour, marker=marker, edgecolor="white", linewidth=0.6, zorder=4)
+        edge, low = (VERMILLION, point.psnr) if point.collapsed else ("white", point.psnr_min)
+        axes.plot([x, x], [low, point.psnr_max], color=colour, linewidth=1.5)
+        axes.scatter([x], [point.psnr], 55, colour, marker=marker, edgecolor=edge, linewidth=0.6, zorder=4)
         if len(points) <= MAX_NAMED or point.Index in front.index:
             texts.append(add_name(axes, point.label, x, point.psnr, colour))
     reach, label = MAX_TIME_RATIO * placed[cost].max(), "published, other hardware"
@@ -99,7 +100,7 @@ def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figu
     axes.set(xlabel=COSTS[cost], ylabel="held-out PSNR, dB")
     scale_costs(axes, cost, xs)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=7, frameon=False)
+        axes.legend(fontsize=7, frameon=False, loc="lower right")
     adjust_text(texts, ax=axes, expand=(1.15, 1.5), arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.6})
     return figure
 
@@ -109,7 +110,7 @@ def scale_costs(axes: Axes, cost: str, values: list[float]) -> None:
     ratio = max(values) / min(values)
     if ratio > 8:
         axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if ratio < 300 else (1.0,)))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if ratio < 50 else (1.0,)))
         axes.xaxis.set_minor_formatter(NullFormatter())
     else:
         axes.xaxis.set_major_locator(MaxNLocator(5))
@@ -119,6 +120,6 @@ def scale_costs(axes: Axes, cost: str, values: list[float]) -> None:
 
 
 def add_name(axes: Axes, name: str, x: float, y: float, colour: str) -> Text:
-    text = axes.text(x, y, shortened(readable(name), 34), color=colour, fontsize=8.5, zorder=6, parse_math=False)
+    text = axes.text(x, y, shortened(readable(name), 34), color=colour, fontsize=8, zorder=6, parse_math=False)
     text.set_path_effects([withStroke(linewidth=2, foreground="white")])
     return text

@@ -13,7 +13,7 @@ from nerf_lightning.drawing.contact_sheet import fit_into
 from nerf_lightning.drawing.ink import VERMILLION, rgb
 from nerf_lightning.errors import InputError
 
-MAX_IMAGES = 24
+MAX_IMAGES = 11
 LONGEST_PX = 480
 GAP = ((0, 4), (0, 0), (0, 0))
 """White between an image and its crop."""

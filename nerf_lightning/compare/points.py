@@ -144,4 +144,4 @@ def typical_run(point: Any) -> Run:
 
 
 def format_bytes(size: float) -> str:
-    return f"{size / 1e6:.2g} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"
+    return f"{size / 1e6:.3g} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"

@@ -103,6 +103,6 @@ def test_compute_points_frontiers_take_seconds_that_differ_by_noise_as_equal(mak
     assert fronts == {"b": "train_seconds render_seconds bytes", "c": "", "a": ""}
 
 
-@pytest.mark.parametrize(("size", "words"), [(1.25e6, "1.2 MB"), (340_400, "340 kB"), (20, "0 kB")])
+@pytest.mark.parametrize(("size", "words"), [(1.25e6, "1.25 MB"), (1e8, "100 MB"), (340_400, "340 kB"), (20, "0 kB")])
 def test_format_bytes(size: float, words: str):
     assert format_bytes(size) == words
