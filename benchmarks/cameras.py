@@ -1,25 +1,26 @@
 """Cameras and light that are not exact: what each method loses by them, and how much of it `refine` brings back."""
 
+import argparse
 import itertools
 import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from statistics import fmean, median
-from typing import Any
+from statistics import fmean
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 import nerf_lightning as nl
+from benchmarks.tables import Rows, medians
 from nerf_lightning.cameras import Cameras, in_other_frame
 from nerf_lightning.capture.poses.geometry import angle_between
 from nerf_lightning.dataset import Scene
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.runs.data import seen_by_corrected
 from nerf_lightning.runs.scene_file import load_scene as content_of
-from nerf_lightning.stability import damage
+from nerf_lightning.synthetic import corruptions
 
 RECIPES = ("tensorf_medium", "voxels_medium", "hashgrid_medium")
 STEPS = 2500
@@ -30,11 +31,11 @@ Damage = Callable[[Scene, int], Scene]
 
 
 def light(scene: Scene, seed: int) -> Scene:
-    return damage.with_exposure_drift(scene, seed, 0.3, 0.1)
+    return corruptions.vary_exposure(scene, seed, 0.3, 0.1)
 
 
 def poses(degrees: float, moved: float) -> Damage:
-    return lambda scene, seed: damage.with_pose_noise(scene, seed, degrees, moved)
+    return lambda scene, seed: corruptions.add_pose_noise(scene, seed, degrees, moved)
 
 
 def both(scene: Scene, seed: int) -> Scene:
@@ -46,11 +47,11 @@ def exact(scene: Scene, seed: int) -> Scene:
 
 
 def long_lens(scene: Scene, seed: int) -> Scene:
-    return damage.with_focal_length(scene, seed, 1.03)
+    return corruptions.scale_focal_length(scene, seed, 1.03)
 
 
 def dark_corners(scene: Scene, seed: int) -> Scene:
-    return damage.with_dark_corners(light(scene, seed), seed, 0.5)
+    return corruptions.add_vignetting(light(scene, seed), seed, 0.5)
 
 
 CONDITIONS: dict[str, tuple[int | None, Damage, list[str]]] = {
@@ -61,7 +62,7 @@ CONDITIONS: dict[str, tuple[int | None, Damage, list[str]]] = {
     "light": (None, light, []),
     "light, dark corners": (None, dark_corners, ["refine.vignetting=true"]),
     "focal length 3 % too long": (None, long_lens, ["refine.focal=true"]),
-    "both, 3 wrong": (None, lambda scene, seed: damage.with_wrong_poses(both(scene, seed), seed, WRONG), []),
+    "both, 3 wrong": (None, lambda scene, seed: corruptions.swap_poses(both(scene, seed), seed, WRONG), []),
     "exact, 12 photos": (FEW, exact, []),
     "both, 12 photos": (FEW, both, []),
 }
@@ -91,23 +92,21 @@ def errors(found: Cameras, truth: Cameras, centre: Float[Tensor, "3"]) -> dict[s
     return {"degrees": math.degrees(fmean(turned)), "moved_percent": 100 * float((apart / distance).mean())}
 
 
-def measure(
-    overrides: list[str], seeds: list[int], scenes: list[Path], recipes: list[str], output: Path
-) -> dict[str, Any]:
+def measure(args: argparse.Namespace) -> Rows:
     """One line for each scene, condition and recipe, without and with `refine=auto`: medians over seeds."""
-    rows = []
-    for whole in [nl.load_scene(path) for path in scenes] or [bricks()]:
-        for condition, recipe, refine in itertools.product(CONDITIONS, recipes, ("none", "auto")):
+    rows: Rows = []
+    for whole in [nl.load_scene(path) for path in args.scenes] or [bricks()]:
+        for condition, recipe, refine in itertools.product(CONDITIONS, args.recipes or RECIPES, ("none", "auto")):
             views, spoil, besides = CONDITIONS[condition]
-            truth = whole if views is None else damage.with_views(whole, 0, views)
+            truth = whole if views is None else corruptions.drop_views(whole, 0, views)
             found = []
-            for seed in seeds:
+            for seed in args.seeds:
                 print(f"cameras: {whole.name}, {condition}, {recipe}, refine={refine}, seed {seed}", flush=True)
-                options = [*([] if refine == "none" else [f"refine={refine}", *besides]), *overrides]
-                found.append(one(truth, spoil(truth, seed), recipe, options, seed, output / "cameras"))
+                options = [*([] if refine == "none" else [f"refine={refine}", *besides]), *args.overrides]
+                found.append(one(truth, spoil(truth, seed), recipe, options, seed, args.output / "cameras"))
             about = {"scene": whole.name, "condition": condition, "recipe": recipe, "refine": refine}
-            rows.append(about | {key: median(row[key] for row in found) for key in found[0]})
-    return {"cameras": rows}
+            rows.append(about | medians(found))
+    return rows
 
 
 def one(truth: Scene, spoilt: Scene, recipe: str, options: list[str], seed: int, folder: Path) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """How well a capture finds the known cameras of synthetic photos, and what its errors cost a field."""
 
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +9,14 @@ import torch
 
 from benchmarks.methods import train
 from benchmarks.synthetic.photos import Flaws, Truth, write_capture
+from benchmarks.tables import Rows, named
 from nerf_lightning.cameras import look_at
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.pack import pack
+from nerf_lightning.capture.poses.flips import resolve_flips
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
 from nerf_lightning.capture.poses.pose import mark_poses
 from nerf_lightning.capture.poses.solve import Solved
-from nerf_lightning.capture.poses.walk import choose
 from nerf_lightning.capture.run import Capture, capture
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import TagLayout, flat_pose
@@ -164,7 +166,7 @@ def flips_of_walk(
     errors = [[angle_between(pose, h.pose) for h in found] for pose, found in zip(truth, options, strict=True)]
     return {
         way: sum(bool(e[i] > min(e) + FLIPPED) for e, i in zip(errors, chosen, strict=True))
-        for way, chosen in (("alone", [0] * count), ("in_order", choose(lens, options, seen)))
+        for way, chosen in (("alone", [0] * count), ("in_order", resolve_flips(lens, options, seen)))
     }
 
 
@@ -188,12 +190,14 @@ def fields(folder: Path, found: Capture, truth: Truth, seed: int) -> list[dict[s
     return rows
 
 
-def measure(seeds: list[int], folder: Path) -> dict[str, list[dict[str, Any]]]:
+def measure(args: argparse.Namespace) -> Rows:
     """All tables."""
+    seeds, folder = args.seeds, args.output
     rows, done = accuracy(folder / "capture", seeds[0])
-    return {
+    tables = {
         "capture": rows,
         "flips": flips(seeds),
         "hidden tags": hidden_tags(folder / "hidden_tags", seeds[0]),
         "capture fields": fields(folder / "capture", *done["six tags"], seeds[0]),
     }
+    return named(tables)

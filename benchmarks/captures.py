@@ -1,8 +1,7 @@
 """Photos with a background: what each method gives in its time, and where it leaves fog; made rooms know their true depth."""
 
+import argparse
 from pathlib import Path
-from statistics import median
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -11,9 +10,10 @@ from torch import Tensor
 import nerf_lightning as nl
 from benchmarks.methods import train
 from benchmarks.synthetic.rooms import photos_that_show, true_view, write_room
+from benchmarks.tables import Rows, medians
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import Scene
-from nerf_lightning.stability.rooms import ROOMS, Room
+from nerf_lightning.synthetic.rooms import ROOMS, Room
 from nerf_lightning.system import NeRF3D
 
 RECIPES = ("hashgrid_capture", "tensorf_medium", "voxels_medium")
@@ -60,21 +60,20 @@ def against_truth(run: nl.Run, scene: Scene, room: Room) -> dict[str, float]:
     }
 
 
-def measure(
-    overrides: list[str], budget: float, seeds: list[int], scenes: list[Path], recipes: list[str], output: Path
-) -> dict[str, Any]:
+def measure(args: argparse.Namespace) -> Rows:
     """One line for each scene and recipe: medians over seeds."""
-    folders: dict[str, tuple[Path, Room | None]] = {path.name: (path, None) for path in scenes}
+    overrides, budget, output = args.overrides, args.budgets[0], args.output
+    folders: dict[str, tuple[Path, Room | None]] = {path.name: (path, None) for path in args.scenes}
     for name, made in ROOMS.items():
         folder = output / "rooms" / name.replace(" ", "_")
         if not folder.exists():
             write_room(made, folder)
         folders[name] = folder, made
-    rows = []
+    rows: Rows = []
     for name, (path, room) in folders.items():
-        for recipe in recipes:
+        for recipe in args.recipes or RECIPES:
             found = []
-            for seed in seeds:
+            for seed in args.seeds:
                 print(f"captures: {name}, {recipe}, seed {seed}", flush=True)
                 place = output / "captures" / f"{name}_{recipe}_{seed}".replace(" ", "_")
                 given = [f"dataset.path='{path}'", f"recipe={recipe}", f"budget.seconds={budget}", *overrides]
@@ -84,6 +83,5 @@ def measure(
                 if room is not None:
                     row |= against_truth(nl.load_run(place, "cpu"), nl.load_scene(path), room)
                 found.append(row)
-            middle = {key: median(row[key] for row in found) for key in found[0]}
-            rows.append({"capture": name, "recipe": recipe, **middle})
-    return {"captures": rows}
+            rows.append({"capture": name, "recipe": recipe, **medians(found)})
+    return rows

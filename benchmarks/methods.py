@@ -1,5 +1,7 @@
 """Methods side by side: each is trained as a user would train it, in a process of its own, one after the other."""
 
+import argparse
+import itertools
 import json
 import subprocess
 import sys
@@ -7,6 +9,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from benchmarks.tables import Row, Rows
+
+METHODS = ("tensorf", "hashgrid", "voxels", "mlp")
+"""In 3D; the recipe of each in its usual size ends in _medium."""
 TARGETS_DB = (24, 27, 30)
 MOMENTS = (10, 30, 60, 300)
 CHECKS = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 180, 240)
@@ -42,13 +48,13 @@ def middle(values: list[float | None]) -> float | None:
     return None if known == float("inf") else known
 
 
-def summary(method: str, by_budget: dict[float, list[Run]]) -> dict[str, Any]:
+def summary(method: str, by_budget: dict[float, list[Run]]) -> Row:
     """One line of the table: medians over seeds.
 
     Seconds to a quality come from the budget that gets there first; dB at a moment from the shortest budget that lasts so
     long, since a run anneals its learning rate toward the end of its budget.
     """
-    row: dict[str, Any] = {"method": method, "seeds": min(len(runs) for runs in by_budget.values())}
+    row: Row = {"method": method, "seeds": min(len(runs) for runs in by_budget.values())}
     for target in TARGETS_DB:
         times = [middle([seconds_to(run["curve"], target) for run in runs]) for runs in by_budget.values()]
         row[f"seconds_to_{target}_db"] = min((t for t in times if t is not None), default=None)
@@ -69,20 +75,21 @@ def summary(method: str, by_budget: dict[float, list[Run]]) -> dict[str, Any]:
     return row
 
 
-def measure(
-    experiments: list[str], overrides: list[str], budgets: list[float], seeds: list[int], folder: Path
-) -> tuple[list[dict[str, Any]], list[Run]]:
-    """Trains every experiment with every budget and seed. Returns the table's lines and all runs."""
-    rows, everything = [], []
-    for experiment in experiments:
+def measure(args: argparse.Namespace) -> Rows:
+    """A line an experiment, trained with every budget and seed."""
+    rows: Rows = []
+    for experiment in args.experiments:
         by_budget: dict[float, list[Run]] = {}
-        for seconds in budgets:
-            for seed in seeds:
-                given = [*overrides, f"budget.seconds={seconds}"]
-                place = folder / f"{experiment}_{seconds:g}s_seed{seed}"
+        for seconds, seed in itertools.product(args.budgets, args.seeds):
+            given = [*args.overrides, f"device={args.device.type}", f"budget.seconds={seconds}"]
+            place = args.output / f"{experiment}_{seconds:g}s_seed{seed}"
+            try:
                 run = train(experiment, given, seed, place, marks(seconds))
-                print(f"{experiment}, {seconds:g} s, seed {seed}: {run['psnr']:.2f} dB", flush=True)
-                by_budget.setdefault(seconds, []).append(run)
-                everything.append({"experiment": experiment, "budget_seconds": seconds, **run})
-        rows.append(summary(experiment, by_budget))
-    return rows, everything
+            except SystemExit as failure:
+                rows.append({"method": experiment, "differs": str(failure)})
+                break
+            print(f"methods: {experiment}, {seconds:g} s, seed {seed}: {run['psnr']:.2f} dB", flush=True)
+            by_budget.setdefault(seconds, []).append(run)
+        else:
+            rows.append(summary(experiment, by_budget))
+    return rows

@@ -9,8 +9,7 @@ from typing import Any
 import lightning as L
 import torch
 
-from benchmarks.bare import bare_step
-from benchmarks.setup import built
+from benchmarks.speed import build, take_step
 from nerf_lightning.config.build import build_trainer, device_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.system import NeRF3D
@@ -22,7 +21,7 @@ BLOCKS, FIRST = 50, 10
 
 
 class Alternation(L.Callback):
-    """After each block of the Trainer's steps, takes as many without it: same field, same optimiser, same data.
+    """After each block of the Trainer's steps, takes as many without it: same field, same optimiser, same photos.
 
     Of every block the last step is left out, because in the Trainer's it ends in this callback's own work.
     """
@@ -41,13 +40,13 @@ class Alternation(L.Callback):
             optimizer = pl_module.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Optimizer)
             steps = range(step - BLOCK, step)
-            times = [bare_step(pl_module, self.data, optimizer, past, pl_module.progress) for past in steps]
+            times = [take_step(pl_module, self.data, optimizer, past, pl_module.progress) for past in steps]
             self.bare_blocks.append(fmean(times[:-1]))
             self._starts = []
         self._starts.append(time.perf_counter())
 
 
-def measure(overrides: list[str]) -> dict[str, float]:
+def measure_overhead(overrides: list[str]) -> dict[str, float]:
     """Milliseconds of a step, bare and under a Trainer with all callbacks and the logger, in alternating blocks of one run.
 
     Measurements and pictures, whose time is no training time, are moved out of the way; the share is the median over pairs of
@@ -55,9 +54,12 @@ def measure(overrides: list[str]) -> dict[str, float]:
     """
     steps = BLOCKS * BLOCK + 1
     settings = [*overrides, f"budget.steps={steps}", "callbacks.heldout.at=[]", "callbacks.snapshots.steps=[]"]
+    cfg, data, system = build(settings)
+    own = RayDataModule(
+        data.scene, rays=data.rays, samples=data.samples, seed=cfg.seed
+    )  # the Trainer has drawn its batch
     with tempfile.TemporaryDirectory() as folder:
-        cfg, data, system = built(settings, Path(folder))
-        trainer, alternation = build_trainer(cfg, Path(folder), device_of(cfg)), Alternation(data)
+        trainer, alternation = build_trainer(cfg, Path(folder), device_of(cfg)), Alternation(own)
         trainer.callbacks.insert(0, alternation)  # type: ignore[attr-defined]
         trainer.fit(system, data)
     full, bare = alternation.trainer_blocks[FIRST:], alternation.bare_blocks[FIRST:]

@@ -1,22 +1,21 @@
 """Photos as people have them: several sizes, passers-by with and without masks, a fisheye; against plain ones."""
 
+import argparse
 import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from statistics import fmean, median
-from typing import Any
 
 import torch
 
 import nerf_lightning as nl
+from benchmarks.tables import Rows
 from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 from nerf_lightning.dataset import Scene, Views, draw_rays
 from nerf_lightning.dataset.views import Runs
-from nerf_lightning.stability.toys import PILE, around, enclosing, photograph, toy
+from nerf_lightning.synthetic.objects import PILE, bound_bodies, make_scene, place_cameras, render_photos
 
-Rows = list[dict[str, Any]]
 SIZE, VIEWS, HELD_OUT = 128, 48, 6
 STEPS = 1500
 GREY = (0.5, 0.5, 0.5)
@@ -49,7 +48,7 @@ def of_several_sizes(scene: Scene) -> Scene:
     train = scene.train
     thirds = [train[torch.arange(first, len(train), 3)] for first in range(3)]
     small = thirds[2].cameras.scaled(0.5)
-    halved = Views.of(photograph(PILE, small, scene.background), small)
+    halved = Views.of(render_photos(PILE, small, scene.background), small)
     margin = SIZE // 8
     return replace(scene, train=joined([cropped(thirds[0], 0, margin), cropped(thirds[1], margin, 0), halved]))
 
@@ -73,14 +72,14 @@ def with_boxes(scene: Scene, seed: int) -> tuple[Scene, Scene]:
 
 def through_fisheye(views: int, phase: float) -> Views:
     """Photos of the same field of view as those of `around`, through a fisheye."""
-    straight = around(views, SIZE, phase)
+    straight = place_cameras(views, SIZE, phase)
     K = straight.K.clone()
     half = math.atan(float(0.5 * SIZE / K[0, 0, 0]))
     focal = 0.5 * SIZE / (half * (1 + FISHEYE.k1 * half**2 + FISHEYE.k2 * half**4))
     K[:, 0, 0] = K[:, 1, 1] = focal
     lenses = Lenses(torch.tensor([FISHEYE]).repeat(views, 1), torch.full((views,), Projection.FISHEYE))
     cameras = Cameras(K, straight.c2w, straight.sizes, lenses)
-    return Views.of(photograph(PILE, cameras, GREY), cameras)
+    return Views.of(render_photos(PILE, cameras, GREY), cameras)
 
 
 def batch_seconds(scene: Scene) -> float:
@@ -91,10 +90,10 @@ def batch_seconds(scene: Scene) -> float:
     return (time.perf_counter() - start) / DRAWS
 
 
-def measure(seeds: list[int], output: Path) -> dict[str, Rows]:
+def measure(args: argparse.Namespace) -> Rows:
     """The table, a line a kind of photos."""
-    plain = replace(toy(PILE, GREY, SIZE, VIEWS, HELD_OUT), bounds=enclosing(PILE))
-    boxes, masks = with_boxes(plain, seeds[0])
+    plain = replace(make_scene(PILE, GREY, SIZE, VIEWS, HELD_OUT), bounds=bound_bodies(PILE))
+    boxes, masks = with_boxes(plain, args.seeds[0])
     fisheye = replace(plain, train=through_fisheye(VIEWS, 0.0), val=through_fisheye(HELD_OUT, 0.7))
     scenes = {
         "one size": plain,
@@ -107,12 +106,12 @@ def measure(seeds: list[int], output: Path) -> dict[str, Rows]:
         batch_seconds(scene)  # caches
     # In turn: other work on the machine comes and goes.
     rounds = [{name: batch_seconds(scene) for name, scene in scenes.items()} for _ in range(ROUNDS)]
-    rows = []
+    rows: Rows = []
     for name, scene in scenes.items():
         found = []
-        for seed in seeds:
+        for seed in args.seeds:
             print(f"photos: {name}, seed {seed}", flush=True)
-            folder = output / "photos" / f"{name}_{seed}".replace(" ", "_")
+            folder = args.output / "photos" / f"{name}_{seed}".replace(" ", "_")
             found.append(nl.train(scene, steps=STEPS, seed=seed, device="cpu", folder=folder, options=QUIET).psnr)
         held = scene.train
         runs = 0 if held.known is None else held.known.starts.nbytes + held.known.ends.nbytes
@@ -125,4 +124,4 @@ def measure(seeds: list[int], output: Path) -> dict[str, Rows]:
                 "batch": median(one[name] / one["one size"] for one in rounds),
             }
         )
-    return {"photos": rows}
+    return rows

@@ -1,12 +1,13 @@
 """2D fields: how long the default takes to where the course's network ends, what each of them reaches, and what the default
 reaches on pictures of other kinds, and on a large one."""
 
+import argparse
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from benchmarks.drawn import KINDS, leaves, write_picture
 from benchmarks.methods import Run, middle, seconds_to, train
+from benchmarks.tables import Row, Rows, named
 
 COURSE, FAST = "picture_mlp", "picture"
 CHECKS = tuple(round(0.005 * 1.25**i, 4) for i in range(24))
@@ -17,12 +18,11 @@ SIZE = 512
 LARGE, LARGE_SECONDS = 4096, 60
 """The same of a picture as a camera makes it, of leaves; and its training."""
 
-Rows = list[dict[str, Any]]
 
-
-def measure(overrides: list[str], seeds: list[int], output: Path) -> dict[str, Rows]:
-    """Tables by name: the race against the course's own recipe, all fields after the same few seconds, and the default on
+def measure(args: argparse.Namespace) -> Rows:
+    """Three tables: the race against the course's own recipe, all fields after the same few seconds, and the default on
     pictures of each kind. A picture that the overrides name is that of the first two tables alone."""
+    overrides, seeds, output = args.overrides, args.seeds, args.output
     often = ",".join(str(check) for check in CHECKS if check < 1)
     course = train(COURSE, overrides, seeds[0], output / "pictures" / COURSE)
     runs: dict[str, list[Run]] = {name: [] for name in FIELDS}
@@ -56,10 +56,10 @@ def measure(overrides: list[str], seeds: list[int], output: Path) -> dict[str, R
     others = [part for part in overrides if not part.startswith("dataset.path=")]
     kinds = [kind_row(kind, SIZE, others, seeds, output) for kind in KINDS]
     kinds.append(kind_row(leaves.__name__, LARGE, [*others, f"budget.seconds={LARGE_SECONDS}"], seeds[:1], output))
-    return {"pictures": [race], "2D fields": fields, "kinds of pictures": kinds}
+    return named({"pictures": [race], "2D fields": fields, "kinds of pictures": kinds})
 
 
-def kind_row(kind: str, size: int, overrides: list[str], seeds: list[int], output: Path) -> dict[str, Any]:
+def kind_row(kind: str, size: int, overrides: list[str], seeds: list[int], output: Path) -> Row:
     """What the default recipe makes of a picture that is drawn for it."""
     path = write_picture(kind, size, 0, output / "pictures" / "drawn")
     found: list[Run] = []

@@ -1,5 +1,6 @@
 """Shapes: meshes of trained fields against the surfaces that were photographed."""
 
+import argparse
 import io
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from benchmarks.capture import FLAWS, LENS, SHEETS, SIZE, home
 from benchmarks.methods import train
 from benchmarks.synthetic.photos import write_capture
 from benchmarks.synthetic.tabletop import Tabletop
+from benchmarks.tables import Rows, named
 from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.run import capture
@@ -23,7 +25,6 @@ from nerf_lightning.export.volume import volume_of
 from nerf_lightning.runs.open import SceneRun, open_scene_run
 from nerf_lightning.utils.device import the_device
 
-Rows = list[dict[str, Any]]
 PHOTOS, VIEWS = 20, 40
 """Of the sheet, and of the object."""
 ABOVE = 0.005
@@ -122,6 +123,7 @@ def of_capture(seconds: float, output: Path) -> Rows:
     return [{**row, "psnr": trained["psnr"]} for row in rows]
 
 
-def measure(seconds: float, output: Path) -> dict[str, Rows]:
+def measure(args: argparse.Namespace) -> Rows:
     """Both tables."""
-    return {"shapes": of_bricks(seconds, output), "capture shapes": of_capture(seconds, output)}
+    seconds, output = args.budgets[0], args.output
+    return named({"shapes": of_bricks(seconds, output), "capture shapes": of_capture(seconds, output)})

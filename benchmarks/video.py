@@ -1,18 +1,22 @@
 """How well the frames of a video are chosen, a third of which are blurred, and how well COLMAP places them."""
 
+import argparse
 import os
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 
+from benchmarks.cameras import similarity
 from benchmarks.capture import SHEETS
 from benchmarks.synthetic.photos import Flaws, render_photo
-from benchmarks.synthetic.video import FPS, around, with_blurs, write_video
+from benchmarks.synthetic.video import FPS, place_cameras, with_blurs, write_video
+from benchmarks.tables import Row, Rows
+from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.capture.poses.geometry import angle_between, inverse
 from nerf_lightning.dataset.bricks.trace import shadow
 from nerf_lightning.dataset.lens import Lens
@@ -27,21 +31,21 @@ COUNTS = (20, 40)
 """Frames to choose: the chance of a blurred one is highest where the stretches are short."""
 
 
-def measure(seed: int, folder: Path) -> dict[str, list[dict[str, Any]]]:
+def measure(args: argparse.Namespace) -> Rows:
     """A turn around the bulldozer with a pause, by the number of chosen frames; the largest number is placed as well."""
-    layout = SHEETS["six tags"]
-    c2w = around(layout, LENS, TURN)
+    layout, seed, folder = SHEETS["six tags"], args.seeds[0], args.output
+    c2w = place_cameras(layout, LENS, TURN)
     c2w = np.concatenate([c2w[: TURN // 3], np.repeat(c2w[TURN // 3 : TURN // 3 + 1], PAUSE, axis=0), c2w[TURN // 3 :]])
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "turn.mp4"
     write_video(file, with_blurs(_pictures(c2w, seed), seed))
-    rows = []
+    rows: Rows = []
     for count in COUNTS:
         started = time.perf_counter()
         photos = frames_of(file, folder / f"frames_{count}", count)
         taken = [round(float(photo.stem.removesuffix("s")) * FPS) for photo in photos]
         blurred = range(1, len(c2w), 3)
-        row = {
+        row: Row = {
             "frames": len(c2w),
             "chosen": len(taken),
             "blurred_percent_rejected": 100 - 100 * len(set(taken) & set(blurred)) / len(blurred),
@@ -54,7 +58,7 @@ def measure(seed: int, folder: Path) -> dict[str, list[dict[str, Any]]]:
             row |= _errors(place(photos[0].parent), c2w, len(taken))
             row["placing_seconds"] = time.perf_counter() - started
         rows.append(row)
-    return {"video": rows}
+    return rows
 
 
 def moving(index: int) -> int:
@@ -73,7 +77,7 @@ def _pictures(c2w: Float[np.ndarray, "N 4 4"], seed: int) -> Iterator[UInt8[np.n
         yield from pool.map(render, range(len(c2w)))
 
 
-def _errors(folder: Path, c2w: Float[np.ndarray, "N 4 4"], chosen: int) -> dict[str, Any]:
+def _errors(folder: Path, c2w: Float[np.ndarray, "N 4 4"], chosen: int) -> Row:
     """Of the placed frames, once the model is moved onto the truth: centres in percent of their distance from the middle."""
     import pycolmap
 
@@ -94,13 +98,6 @@ def _errors(folder: Path, c2w: Float[np.ndarray, "N 4 4"], chosen: int) -> dict[
 
 
 def aligned(found: Float[np.ndarray, "N 4 4"], truth: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
-    """Camera poses turned, shifted and scaled so that their centres fit the truth best (Umeyama 1991)."""
-    a, b = found[:, :3, 3], truth[:, :3, 3]
-    u, s, v = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
-    flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    turn = u * flip @ v
-    scale = (s * flip).sum() / ((a - a.mean(0)) ** 2).sum()
-    out = found.copy()
-    out[:, :3, :3] = turn @ found[:, :3, :3]
-    out[:, :3, 3] = scale * (a - a.mean(0)) @ turn.T + b.mean(0)
-    return out
+    """Camera poses turned, shifted and scaled so that their centres fit the truth best."""
+    onto = similarity(*(torch.from_numpy(poses[:, :3, 3]) for poses in (found, truth)))
+    return in_other_frame(torch.from_numpy(found), onto).numpy()

@@ -19,7 +19,7 @@ The tree is the data flow, seven stages in order:
     runs/       run folders and compact files: found, read without trusting them, opened
 
 The verbs, each a folder with `__main__.py` (its options) and `verb.py` (its work): capture/, render/, evaluate/, export/,
-view/, gallery/, chart/ (speed against accuracy), rightsize/ (the smallest model that is good enough), stability/ (methods
+view/, compare/ (speed against accuracy), rightsize/ (the smallest model that is good enough), stability/ (methods
 where they are known to fail). What they all paint with is in drawing/; what knows nothing of fields is in utils/.
 
 Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples

@@ -24,6 +24,8 @@ import scipy.signal  # noqa: F401
 import torch.utils.tensorboard
 from jaxtyping import install_import_hook
 
+import tests.helpers.typechecker  # noqa: F401  (the hook below imports the first package of its name alone)
+
 # As training sets it, and before any thread starts: threads inherit it. A test that trains would otherwise leave it set for its
 # own thread alone, and what several threads compute after it would depend on which of them computed what.
 torch.set_flush_denormal(True)
@@ -43,21 +45,28 @@ def checked_modules() -> list[str]:
 
 
 # Before anything imports the package: from here on a wrong shape fails the test that met it.
-install_import_hook(checked_modules(), "typechecker.check")
+install_import_hook(checked_modules(), "tests.helpers.typechecker.check")
 
 # ruff: noqa: E402
 import pytest
 import yaml
 from filelock import FileLock
+from hypothesis import HealthCheck, settings
 from numba.core.dispatcher import Dispatcher
-from once import once, shared_folder
-from pretend import device, without_doubles  # noqa: F401  (fixtures)
 from torch.nn.functional import normalize
 
 from benchmarks.synthetic.photos import Flaws, Truth, write_capture
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.kernels.cpu import apart
+from tests.helpers.fake_device import device, without_doubles  # noqa: F401  (fixtures)
+from tests.helpers.shared_fixtures import make_once, shared_folder
+
+# The same examples on every machine, none kept: a failure is found again by running the test again.
+settings.register_profile(
+    "tests", derandomize=True, deadline=None, database=None, max_examples=30, suppress_health_check=list(HealthCheck)
+)
+settings.load_profile("tests")
 
 
 @pytest.fixture(scope="session")
@@ -165,9 +174,12 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path
     from nerf_lightning.config.compose import composed
     from nerf_lightning.training.train import train
 
-    folder = tmp_path_factory.mktemp("run")
-    train(composed(["+experiment=smoke_3d", "dataset.size=16", "budget.steps=10", "callbacks.orbit.frames=0"], folder))
-    return folder
+    def make(folder: Path) -> Path:
+        options = ["+experiment=smoke_3d", "dataset.size=16", "budget.steps=10", "callbacks.orbit.frames=0"]
+        train(composed(options, folder))
+        return folder
+
+    return make_once(tmp_path_factory, "small_run", make)
 
 
 @pytest.fixture(scope="session")
@@ -179,7 +191,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Truth]:
     def make(folder: Path) -> tuple[Path, Truth]:
         return folder, write_capture(folder, SIX, SMALL, 8, 8, Flaws(), seed=3, steps=24, samples=2)
 
-    return once(tmp_path_factory, "capture", make)
+    return make_once(tmp_path_factory, "capture", make)
 
 
 LOW, HIGH = torch.tensor([-1.0, -1.5, -0.5]), torch.tensor([1.0, 0.5, 1.5])

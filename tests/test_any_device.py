@@ -1,5 +1,6 @@
 """Everything on a device that is not the CPU: training and all that belongs to it, pictures, files and every verb."""
 
+import itertools
 import json
 import math
 from pathlib import Path
@@ -11,25 +12,20 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from every_model import MODELS
-from nerf_lightning.evaluate.__main__ import task as evaluate
-from nerf_lightning.export.__main__ import task as export
-from nerf_lightning.render.__main__ import task as render
-from on_device import ON_IT, SCENES, options
-from once import once
-from pretend import NAME, Module
 
-from nerf_lightning.config import cli
 from nerf_lightning.config.build import build_data, build_system, build_trainer, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.rightsize.__main__ import task as rightsize
 from nerf_lightning.runs.open import open_scene_run
-from nerf_lightning.stability.toys import PILE, toy
+from nerf_lightning.synthetic.objects import PILE, make_scene
 from nerf_lightning.system import System
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.view.painter import Painter, Wish
+from tests.helpers.device_runs import ON_IT, SCENES, options
+from tests.helpers.fake_device import NAME, Module
+from tests.helpers.shared_fixtures import make_once
+from tests.helpers.train_models import MODELS
 
 
 @pytest.fixture(autouse=True)
@@ -51,10 +47,10 @@ def run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
         train(composed([*options("tensorf"), "budget.steps=60", "~logger", "callbacks.orbit=null"], folder))
         return folder
 
-    return once(tmp_path_factory, "any_device", make)
+    return make_once(tmp_path_factory, "any_device", make)
 
 
-def test_the_device_keeps_to_itself(device: torch.device):
+def test_fake_device_tensor_beside_cpu_tensor_is_refused(device: torch.device):
     there, here = torch.ones(3, device=device), torch.ones(3)
     with pytest.raises(RuntimeError, match="some tensors are on the device, some on the CPU"):
         there + here
@@ -64,7 +60,7 @@ def test_the_device_keeps_to_itself(device: torch.device):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_run_ends_as_it_should(name: str, without_doubles: torch.device, tmp_path: Path):
+def test_run_on_device_of_each_model_finishes(name: str, without_doubles: torch.device, tmp_path: Path):
     found = trained(name, tmp_path)
     assert found["device"] == NAME and found["machine"]["accelerator"] == NAME and found["steps"] == 12
     assert math.isfinite(found["psnr"]) and not found["recoveries"]
@@ -75,16 +71,17 @@ def test_a_run_ends_as_it_should(name: str, without_doubles: torch.device, tmp_p
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["tensorf", "voxels", "hashgrid2d"])
-def test_a_run_goes_on_where_it_stopped(name: str, device: torch.device, tmp_path: Path):
+def test_run_on_device_resumes(name: str, device: torch.device, tmp_path: Path):
     trained(name, tmp_path)
     cfg = composed([*options(name), *ON_IT, "budget.steps=20"], tmp_path)
     train(cfg, tmp_path / "checkpoints" / "last.ckpt")
     assert json.loads((tmp_path / "results.json").read_text())["steps"] == 20
 
 
-@pytest.mark.parametrize("precision", ["bf16-mixed", "16-mixed"])
-@pytest.mark.parametrize("name", MODELS)
-def test_halves_train_every_method(name: str, precision: str, device: torch.device, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("name", "precision"), list(zip(MODELS, itertools.cycle(["bf16-mixed", "16-mixed"]), strict=False))
+)
+def test_mixed_precision_trains_each_model(name: str, precision: str, device: torch.device, tmp_path: Path):
     quick = ["callbacks.snapshots=null", "callbacks.heldout=null", "callbacks.orbit=null", "budget.steps=2"]
     cfg = composed([*options(name), *ON_IT, *quick, f"trainer.precision={precision}"], tmp_path)
     data = build_data(cfg)
@@ -115,13 +112,12 @@ class Spoil(L.Callback):
     ("name", "how", "more", "action"),
     [
         ("tensorf", "nan", ["callbacks.guard.keep_every=5"], "last good weights"),
-        ("voxels", "nan", ["callbacks.guard.keep_every=500"], "started again"),
         ("mlp", "dead", ["model.density=relu"], "softplus"),
         ("hashgrid2d", "nan", ["callbacks.guard.keep_every=500"], "started again"),
         ("mlp", "", ["optimizer.lr=0.5"], "times the learning rate"),
     ],
 )
-def test_the_guard_sets_training_going_again(
+def test_guard_on_device_restarts_training(
     name: str, how: str, more: list[str], action: str, device: torch.device, tmp_path: Path
 ):
     quick = ["callbacks.snapshots=null", "callbacks.heldout=null", "callbacks.orbit=null"]
@@ -137,38 +133,38 @@ def test_the_guard_sets_training_going_again(
     assert all(bool(weights.isfinite().all()) for weights in system.parameters())
 
 
-def test_a_run_is_looked_at(device: torch.device, run: Path, tmp_path: Path, verb):
-    def done(name: str, task: Any, *given: str) -> str:
-        code, out, err = verb(
-            lambda: cli.run(name, task, ("run", "output", "channels")), f"run={run}", "device=pretend", *given
-        )
-        assert code == 0, err
-        return out
+def test_evaluate_on_device_finds_quality_of_training(device: torch.device, run: Path, tmp_path: Path):
+    from nerf_lightning.cli.evaluate import evaluate
 
-    told = json.loads((run / "results.json").read_text())["psnr"]
-    done("evaluate", evaluate, f"output={tmp_path}/evaluation", "worst=1")
-    judged = json.loads((tmp_path / "evaluation" / "views.json").read_text())
-    assert judged["device"].startswith(NAME) and fmean(view["psnr"] for view in judged["views"]) == pytest.approx(
-        told, abs=0.01
-    )
-    done("render", render, "frames=2", "channels=rgb,depth,opacity", f"output={tmp_path}/film.webp")
-    done("render", render, "path=test", f"output={tmp_path}/beside")
-    done("render", render, "frames=1", "background=transparent", f"output={tmp_path}/frames")
+    judged = evaluate(run, output=tmp_path / "evaluation", worst=1, device=NAME)
+    expected = json.loads((run / "results.json").read_text())["psnr"]
+    assert judged["device"].startswith(NAME)
+    assert fmean(view["psnr"] for view in judged["views"]) == pytest.approx(expected, abs=0.01)
+
+
+def test_render_on_device_writes_videos_and_images(device: torch.device, run: Path, tmp_path: Path):
+    from nerf_lightning.cli.render import render
+
+    render(run, frames=2, channels="rgb,depth,opacity", output=tmp_path / "film.webp", device=NAME)
+    render(run, path="test", output=tmp_path / "beside", device=NAME)
+    render(run, frames=1, background="transparent", output=tmp_path / "frames", device=NAME)
     assert (tmp_path / "film.webp").exists() and len(list((tmp_path / "beside").glob("*.png"))) == 1
-    assert "dB lost" in done("export", export, f"output={tmp_path}/compact.npz", "loss=3")
-    for output, *given in (
-        ("mesh.ply", "format=ply"),
-        ("mesh.glb", "format=glb", "box=[-0.9,-0.9,-0.9,0.9,0.9,0.9]"),
-        ("mesh.obj", "format=obj"),
-        ("mesh.stl", "format=stl"),
-        ("points.ply", "format=ply", "content=points"),
-        ("voxels.npz", "format=npz"),
-    ):
-        done("export", export, f"output={tmp_path}/{output}", "resolution=24", *given)
-        assert (tmp_path / output).stat().st_size > 100
 
 
-def test_the_viewer_paints(device: torch.device, run: Path):
+def test_export_on_device_writes_each_kind(device: torch.device, run: Path, tmp_path: Path):
+    from nerf_lightning.cli import export
+
+    box = (-0.9, -0.9, -0.9, 0.9, 0.9, 0.9)
+    written = [
+        export.export_compact(run, output=tmp_path / "compact.npz", loss_db=3.0, device=NAME),
+        export.export_mesh(run, output=tmp_path / "mesh.glb", resolution=24, box=box, device=NAME),
+        export.export_points(run, output=tmp_path / "points.ply", resolution=24, device=NAME),
+        export.export_voxels(run, output=tmp_path / "voxels.npz", resolution=24, device=NAME),
+    ]
+    assert all(file.stat().st_size > 100 for file in written)
+
+
+def test_viewer_on_device_paints_each_channel(device: torch.device, run: Path):
     found = open_scene_run(run, device)
     eye = found.orbit.c2w[0].numpy()
     for channel in ("rgb", "depth", "opacity"):
@@ -178,18 +174,19 @@ def test_the_viewer_paints(device: torch.device, run: Path):
 
 
 @pytest.mark.long
-def test_a_search_finds_the_smallest_that_is_enough(device: torch.device, tmp_path: Path):
-    save_npz(toy(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
+def test_rightsize_on_device_finds_smallest(device: torch.device, tmp_path: Path):
+    rightsize = pytest.importorskip("nerf_lightning.cli.rightsize").rightsize
+    save_npz(make_scene(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
     rungs = [{"density_components": 8, "colour_components": 8, "coarsest": 4, "finest": side} for side in (4, 8)]
     ladder = {"rungs": rungs, "samplers": [{"samples": 32, "resolution": 8}]}
     (tmp_path / "ladder.yaml").write_text(yaml.safe_dump(ladder))
-    given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "budget.steps=6"]
-    where = ["device=pretend", "+trainer.inference_mode=false", "callbacks.orbit=null", "callbacks.snapshots=null"]
-    cfg = composed(
-        [*given, *where, f"ladder={tmp_path}/ladder.yaml", f"output={tmp_path}/found", "target.psnr=8"],
-        tmp_path,
-        "rightsize",
-    )
-    rightsize(cfg)
-    found = json.loads((tmp_path / "found" / "rightsize.json").read_text())
+    options = [
+        "recipe=tensorf_medium",
+        "budget.steps=6",
+        *ON_IT[:2],
+        "callbacks.orbit=null",
+        "callbacks.snapshots=null",
+    ]
+    where = {"ladder": str(tmp_path / "ladder.yaml"), "output": tmp_path / "found"}
+    found = rightsize(str(tmp_path / "scene.npz"), options, psnr=8.0, **where)
     assert found["device"].startswith(NAME) and found["reached"]

@@ -1,19 +1,20 @@
 """Training steps on a device that is not the CPU: what they come to, and what they ask of it."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from every_model import SCENE
-from on_device import SAMPLERS, SCENES, options, stepped, system_of
-from pretend import NAME
 
 from benchmarks.count import Count
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.seeding import Stream, step_generator
+from tests.helpers.device_runs import SAMPLERS, SCENES, options, stepped, system_of
+from tests.helpers.fake_device import NAME
+from tests.helpers.train_models import SCENE
 
 VARIANTS = {
     **{name: options(name) for name in SCENES},
@@ -30,11 +31,10 @@ VARIANTS = {
 }
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("kind", ["alpha", "unbounded"])
-def test_steps_come_to_what_they_come_to_on_the_cpu(
-    variant: str, kind: str, without_doubles: torch.device, tmp_path: Path
-):
+@pytest.mark.parametrize(
+    ("variant", "kind"), list(zip(VARIANTS, itertools.cycle(["alpha", "unbounded"]), strict=False))
+)
+def test_steps_on_device_match_steps_on_cpu(variant: str, kind: str, without_doubles: torch.device, tmp_path: Path):
     device = without_doubles
     use_kernels("reference")
     found = {}
@@ -62,7 +62,7 @@ MOST = {"tensorf": 255, "hashgrid": 255, "voxels": 255, "mlp": 225}
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name == "hashgrid" else pytest.mark.long) for name in MOST]
 )
-def test_a_step_asks_little_of_the_device(name: str, device: torch.device, tmp_path: Path):
+def test_step_on_device_needs_few_operations_and_no_wait(name: str, device: torch.device, tmp_path: Path):
     """As shipped, of a field that has its size; reading a result, or its size, makes the host wait."""
     small = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1"]
     system, data = system_of([f"recipe={name}_medium", *small, "sampler.warmup=0"], tmp_path)
@@ -88,7 +88,7 @@ def test_a_step_asks_little_of_the_device(name: str, device: torch.device, tmp_p
 
 
 @pytest.mark.parametrize("name", ["hashgrid2d", "picture_mlp", "fourier", "siren"])
-def test_a_step_of_a_picture_waits_for_nothing(name: str, device: torch.device, tmp_path: Path):
+def test_picture_step_on_device_needs_no_wait(name: str, device: torch.device, tmp_path: Path):
     system, data = system_of(options(name), tmp_path)
     optimizer, batch = system.to(device).configure_optimizers(), data.draw(0).to(device)
     for _ in range(2):
@@ -99,7 +99,7 @@ def test_a_step_of_a_picture_waits_for_nothing(name: str, device: torch.device, 
     assert count.waits == 0 and count.operations <= 100, count.names.most_common()
 
 
-def test_rays_that_room_was_too_small_for_teach_nothing(device: torch.device, tmp_path: Path):
+def test_rays_beyond_room_do_not_train(device: torch.device, tmp_path: Path):
     system, data = system_of(options("hashgrid"), tmp_path)
     assert isinstance(system, NeRF3D)
     stepped(system.to(device), data, 2, device)

@@ -1,6 +1,5 @@
 """Photos of several sizes through a fisheye, some masked: trained on, judged, filmed, exported and looked at."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from nerf_lightning.cli.render import render
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.renderer import Rendered
-from nerf_lightning.stability.toys import PILE, around, photograph
+from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.view.drawing import frusta
 from tests.dataset.colmap_files import cameras_of, photos, write_colmap
@@ -32,7 +31,7 @@ K1, STEPS = 0.02, 12
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """16 photos on grey: every second is twice as wide as high; a box is masked in every third."""
     root = tmp_path_factory.mktemp("capture")
-    cameras = around(16, 24)
+    cameras = place_cameras(16, 24)
     lenses = Lenses(torch.tensor([Distortion(K1)]).repeat(16, 1), torch.full((16,), Projection.FISHEYE))
     square = Cameras(cameras.K, cameras.c2w, cameras.sizes, lenses)
     K = cameras.K.clone()
@@ -41,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     names, sizes = [], {}
     for i in range(16):
         camera = (wide if i % 2 else square)[i]
-        some = Views.of(photograph(PILE, camera, (0.5, 0.5, 0.5)), camera)
+        some = Views.of(render_photos(PILE, camera, (0.5, 0.5, 0.5)), camera)
         names += photos(root / "images", some, first=i)
         sizes[i + 1] = cameras_of(some, "SIMPLE_RADIAL_FISHEYE", (K1,))[1]
         mask = np.full((24, camera.width), 255, np.uint8)
@@ -66,15 +65,16 @@ def test_a_run_on_any_photos(folder: Path, tmp_path: Path, capsys: pytest.Captur
     run = nl.train(scene, steps=STEPS, seed=1, device="cpu", folder=tmp_path / "run", options=options)
     assert np.isfinite(run.psnr) and run.psnr > 10
 
-    evaluate(tmp_path / "run", device="cpu")
-    judged = json.loads((tmp_path / "run/evaluation/views.json").read_text())
+    judged = evaluate(run.path, device="cpu")
     assert np.mean([view["psnr"] for view in judged["views"]]) == pytest.approx(run.psnr, abs=0.02)
     assert imageio.imread(tmp_path / "run/evaluation/worst.png").ndim == 3
 
-    film = render(tmp_path / "run", path="train", frames=4, output=tmp_path / "film.webp", device="cpu")
+    film = tmp_path / "film.webp"
+    render(run.path, path="train", frames=4, output=film, device="cpu")
     assert imageio.improps(film, plugin="pillow", index=...).n_images == 4, "frames of two sizes make one film"
 
-    assert export_compact(tmp_path / "run", loss_db=20.0, device="cpu") == tmp_path / "run/compact.npz"
+    export_compact(run.path, loss_db=20.0, device="cpu")
+    assert (tmp_path / "run/compact.npz").exists()
     assert len(list(frusta(scene.train, "train", 16))) == len(scene.train)
 
 

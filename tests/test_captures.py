@@ -11,10 +11,11 @@ from benchmarks.synthetic import rooms
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.dataset import open_scene
 from nerf_lightning.sampler import UniformSampler
-from nerf_lightning.stability.rooms import ROOMS
+from nerf_lightning.synthetic.objects import trace_rays
+from nerf_lightning.synthetic.rooms import ROOMS
 
 
-def test_a_scene_of_a_room_knows_what_its_rays_meet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_true_view_of_room_gives_distance_and_body(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name, value in (("WIDTH", 48), ("HEIGHT", 36), ("VIEWS", 16)):
         monkeypatch.setattr(rooms, name, value)
     room = ROOMS["filling subject"]
@@ -29,7 +30,7 @@ def test_a_scene_of_a_room_knows_what_its_rays_meet(tmp_path: Path, monkeypatch:
     places = rays.origins + distance[:, None] * rays.directions
     floor = places[body == room.floor]
     assert len(floor) > 50 and float(floor[:, 2].std()) < 0.15 * float(places.std())
-    seen = room.see(Rays(*(x.float() for x in (rays_in_the_room(rays, scene)))))[0]
+    seen = trace_rays(room.bodies, Rays(*(x.float() for x in (rays_in_the_room(rays, scene)))))[0]
     off = (seen - scene.val.image(0).view(-1, 3) / 255).abs()
     assert float(off.median()) < 0.05
     own = scene.train.cameras.view_rays(3)
@@ -49,7 +50,7 @@ def rays_in_the_room(rays: Rays, scene) -> tuple[torch.Tensor, torch.Tensor]:
     return rays.origins @ turn.mT + scene.to_source[:3, 3], torch.nn.functional.normalize(directions, dim=1)
 
 
-def test_fog_is_measured_up_to_the_surface():
+def test_opacity_before_surface_measures_fog():
     """Rays along x meet thin fog between 1 and 2, and a wall at 4. One interval may span the surface."""
 
     def density(places: torch.Tensor) -> torch.Tensor:

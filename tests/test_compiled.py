@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from once import once
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.model import SirenField
-from nerf_lightning.system.compiled import BACKEND, check_compiler, part
+from nerf_lightning.system.compiled import BACKEND, check_compiler
 from nerf_lightning.utils.device import CPU
+from tests.helpers.shared_fixtures import make_once
 
 ROOT = Path(__file__).resolve().parents[1]
 SOME, OTHERS = ("mlp", "voxels"), ("hashgrid", "tensorf")
@@ -22,8 +21,8 @@ RUN = ("+experiment=smoke_2d", "device=cpu")
 
 
 def compiling(cache: Path, *what: str) -> dict:
-    """What compiling.py found."""
-    line = [sys.executable, str(ROOT / "tests" / "compiling.py"), *what]
+    """What compile_models.py found."""
+    line = [sys.executable, str(ROOT / "tests" / "helpers" / "compile_models.py"), *what]
     paths = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(cache)}
     done = subprocess.run(line, env={**os.environ, **paths}, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -32,7 +31,7 @@ def compiling(cache: Path, *what: str) -> dict:
 
 @pytest.fixture(scope="session")
 def found(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> dict:
-    return once(tmp_path_factory, "compiled", lambda folder: compiling(folder / "kernels", *SOME, str(folder)))
+    return make_once(tmp_path_factory, "compiled", lambda folder: compiling(folder / "kernels", *SOME, str(folder)))
 
 
 def same(field: dict) -> None:
@@ -41,12 +40,12 @@ def same(field: dict) -> None:
 
 
 @pytest.mark.parametrize("name", SOME)
-def test_a_compiled_field_gives_the_same_values_and_gradients_also_after_growing(name: str, found: dict):
+def test_compiled_field_matches_plain_one(name: str, found: dict):
     same(found[name])
 
 
 @pytest.mark.long
-def test_all_other_fields_do(tmp_path: Path):
+def test_compiled_other_fields_match_plain_ones(tmp_path: Path):
     found = compiling(tmp_path, *OTHERS)
     assert set(found) == set(OTHERS)
     for field in found.values():
@@ -54,18 +53,13 @@ def test_all_other_fields_do(tmp_path: Path):
 
 
 @pytest.mark.long
-def test_the_compilers_kernels_give_the_same_values_and_gradients(tmp_path: Path):
+def test_compiled_inductor_kernels_match_plain_field(tmp_path: Path):
     same(compiling(tmp_path, "whole"))
 
 
-def test_a_compiled_training_is_as_good(found: dict):
+def test_compiled_training_is_as_good(found: dict):
     compiled, plain = found["trained"]
     assert compiled == pytest.approx(plain, abs=0.05)
-
-
-def test_without_a_backend_nothing_is_compiled():
-    field = SirenField((8, 8), width=8)
-    assert part(field.forward, None) == field.forward
 
 
 @pytest.fixture
@@ -73,14 +67,9 @@ def no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch._inductor.config.cpp, "cxx", ("no_such_compiler",))
 
 
-def test_a_missing_compiler_is_one_line_and_nothing_is_written(no_compiler: None, inside, tmp_path: Path):
+def test_missing_compiler_is_one_line_and_writes_nothing(no_compiler: None, inside, tmp_path: Path):
     with pytest.raises(InputError, match="config: compile: found true, but .*expected a C.. compiler.*compile=false"):
         check_compiler(CPU, BACKEND)
     code, _, err = inside(*RUN, "compile=true")
     assert code == 2 and err.count("\n") == 1 and "compile: found true, but" in err, err
     assert not list(tmp_path.rglob("*"))
-
-
-def test_another_value_is_refused(inside, tmp_path: Path):
-    code, _, err = inside(*RUN, "compile=fast")
-    assert code == 2 and "compile: found 'fast', expected true or false" in err, err

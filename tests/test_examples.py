@@ -14,11 +14,10 @@ from nbclient import NotebookClient
 
 from benchmarks.synthetic.photos import Truth
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.stability.toys import PILE, toy
+from nerf_lightning.synthetic.objects import PILE, make_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
-SCRIPTS = sorted(EXAMPLES.glob("*.py"))
 
 
 @pytest.fixture
@@ -36,31 +35,28 @@ def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., No
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
     path = tmp_path / "pile.npz"
-    save_npz(toy(PILE, size=16, views=8, held_out=2), path)
+    save_npz(make_scene(PILE, size=16, views=8, held_out=2), path)
     return path
 
 
-def test_scripts_are_short():
-    assert len(SCRIPTS) == 3, "each is run below"
-    for script in SCRIPTS:
-        lines = [line for line in script.read_text(encoding="utf-8").splitlines() if line.strip()]
-        assert len(lines) <= 30, script.name
-
-
-def test_train_and_render(example: Callable[..., None], scene: Path, tmp_path: Path):
+def test_example_train_and_render_writes_view_and_field(example: Callable[..., None], scene: Path, tmp_path: Path):
     example("train_and_render.py", str(scene), "0.5")
     assert imageio.imread(tmp_path / "view.png").shape == (16, 32, 3)
     assert (tmp_path / "field.npz").is_file()
 
 
 @pytest.mark.filterwarnings("ignore:.*LeafSpec.*:FutureWarning")  # Lightning's progress bar, with PyTorch as it is now
-def test_own_field(example: Callable[..., None], scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_example_own_field_learns(
+    example: Callable[..., None], scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
     example("own_field.py", str(scene), "10")
     assert float(capfd.readouterr().out.split(" dB on")[0].split()[-1]) > 12, "it learns: a black picture has less"
     assert imageio.imread(tmp_path / "own_field.png").shape == (16, 32, 3)
 
 
-def test_own_photos(example: Callable[..., None], made: tuple[Path, Truth], tmp_path: Path):
+def test_example_own_photos_writes_orbit_and_field(
+    example: Callable[..., None], made: tuple[Path, Truth], tmp_path: Path
+):
     folder, _ = made
     given = [str(folder / "calibration"), str(folder / "photos"), "--tag", str(SIZE)]
     example("own_photos.py", *given, "--seconds", "0.5", "--pixels", "16")
@@ -69,7 +65,7 @@ def test_own_photos(example: Callable[..., None], made: tuple[Path, Truth], tmp_
 
 
 @pytest.mark.long
-def test_tour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_example_tour_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     notebook = nbformat.read(EXAMPLES / "tour.ipynb", as_version=4)
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook.cells), (
         "kept without outputs"

@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 import nerf_lightning as nl
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
-from nerf_lightning.stability.toys import PILE, toy
+from nerf_lightning.synthetic.objects import PILE, make_scene
 
 STEPS = 12
 FEW = ("callbacks.snapshots=null", "callbacks.orbit=null", "~logger")
@@ -21,7 +21,7 @@ FEW = ("callbacks.snapshots=null", "callbacks.orbit=null", "~logger")
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("scene") / "pile, of three.npz"
-    save_npz(toy(PILE, size=16, views=8, held_out=2), place)
+    save_npz(make_scene(PILE, size=16, views=8, held_out=2), place)
     return place
 
 

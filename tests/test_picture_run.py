@@ -29,6 +29,7 @@ def test_a_run_leaves_its_pictures_and_figures(run: Path):
     assert {path.name for path in run.iterdir()} >= {
         "baselines.json", "checkpoints", "config.yaml", "curve.png", "enlarged.json", "enlarged.png",
         "enlarged_panel.png", "error.png", "final.png", "results.json", "snapshots", "spectrum.png", "training.gif",
+        "truth.png",
     }  # fmt: skip
     assert sorted(path.name for path in (run / "snapshots").iterdir()) == [f"step_{step:07d}.png" for step in STEPS]
     assert not list(run.glob("**/.*")), "no temporary file stays behind"

@@ -131,14 +131,14 @@ def limited() -> Iterator[None]:
         raise TimeoutError(f"longer than {MAX_SECONDS} s")
 
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    handler = signal.signal(signal.SIGALRM, expire)
+    handler = signal.signal(signal.SIGPROF, expire)
     resource.setrlimit(resource.RLIMIT_AS, (psutil.Process().memory_info().vms + MAX_BYTES, hard))
-    signal.alarm(MAX_SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)  # of work, not of waiting for a core
     try:
         yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, handler)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, handler)
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 

@@ -9,6 +9,7 @@ ORDER = (
     ("utils", "cameras"),
     ("kernels",),
     ("dataset", "model", "refine"),
+    ("synthetic",),
     ("sampler",),  # some have a small field of their own
     ("renderer",),
     ("system",),
@@ -16,12 +17,11 @@ ORDER = (
     ("callbacks",),
     ("config",),
     ("runs",),
-    ("gallery",),
-    ("capture", "chart", "check", "compare", "evaluate", "export", "inspect", "render", "view"),
+    ("capture", "check", "compare", "evaluate", "export", "render", "view"),
     ("training",),
-    ("stability", "rightsize", "api"),
+    ("stability", "rightsize"),
     ("cli",),
-    ("__main__",),
+    ("api", "__main__"),
     ("__init__",),
 )
 """Each room may import from those above it."""

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import Scene
-from nerf_lightning.stability.rooms import Room, handheld, photograph
+from nerf_lightning.synthetic.objects import trace_rays
+from nerf_lightning.synthetic.rooms import Room, photograph_room, place_handheld
 
 WIDTH, HEIGHT, VIEWS = 240, 180, 56
 HIDDEN = 0.99
@@ -20,10 +21,11 @@ HIDDEN = 0.99
 def write_room(room: Room, folder: Path, seed: int = 0) -> None:
     """Writes photos and a transforms.json."""
     (folder / "images").mkdir(parents=True)
-    cameras, frames = handheld(VIEWS, WIDTH, HEIGHT, seed), []
+    cameras, frames = place_handheld(VIEWS, WIDTH, HEIGHT, seed), []
+    photos = photograph_room(room, cameras).images.numpy()
     for view in range(VIEWS):
         name = f"images/{view:03d}.png"
-        imageio.imwrite(folder / name, photograph(room, cameras, view).numpy())
+        imageio.imwrite(folder / name, photos[view])
         pose = cameras.c2w[view] * torch.tensor([1.0, -1.0, -1.0, 1.0])  # OpenGL: y up, looking along -z
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
     K = cameras.K[0]
@@ -52,5 +54,5 @@ def meet(room: Room, scene: Scene, rays: Rays) -> tuple[Float[Tensor, "R"], Int[
     scale = float(torch.linalg.det(scene.to_source[:3, :3])) ** (1 / 3)
     turn, shift = scene.to_source[:3, :3].to(rays.origins), scene.to_source[:3, 3].to(rays.origins)
     there = Rays(rays.origins @ turn.mT + shift, rays.directions @ turn.mT / scale)
-    _, distance, which = room.see(there)
+    _, distance, which = trace_rays(room.bodies, there)
     return distance / scale, which

@@ -20,7 +20,7 @@ CRF = 20
 FPS = 30
 
 
-def around(layout: TagLayout, lens: Lens, count: int) -> Float[np.ndarray, "count 4 4"]:
+def place_cameras(layout: TagLayout, lens: Lens, count: int) -> Float[np.ndarray, "count 4 4"]:
     """Camera to world: one smooth turn around the bulldozer, whose height and distance swing."""
     top = Tabletop(layout)
     centre = top.box.mean(0)

@@ -10,6 +10,7 @@ from nerf_lightning.callbacks.attached import agreed, data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.render_plan import Need, Renders
 from nerf_lightning.callbacks.rendering import share_of
+from nerf_lightning.callbacks.throughput import TRAIN_SECONDS
 from nerf_lightning.dataset.subset import STRIP_ROWS, WHOLE, PixelSubset, thin
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
@@ -73,9 +74,9 @@ class HeldOut(Renders):
         quality = fmean(counted) if counted else math.nan
         self.curve.append([round(Budget.of(trainer).seconds, 3), trainer.global_step, round(quality, 4)])
         if trainer.logger is not None:
-            figures = {"heldout/psnr": quality}
+            figures = {"val/psnr": quality, TRAIN_SECONDS: Budget.of(trainer).seconds}
             if all("ssim" in view for view in views):
-                figures["heldout/ssim"] = fmean(view["ssim"] for view in views)
+                figures["val/ssim"] = fmean(view["ssim"] for view in views)
             trainer.logger.log_metrics(figures, trainer.global_step)
 
     def on_train_batch_end(

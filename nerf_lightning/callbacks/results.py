@@ -22,7 +22,7 @@ from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.render_plan import Need, Renders
 from nerf_lightning.callbacks.rendering import share_of
-from nerf_lightning.callbacks.throughput import Throughput
+from nerf_lightning.callbacks.throughput import TRAIN_SECONDS, Throughput
 from nerf_lightning.dataset import Picture, Scene, Views
 from nerf_lightning.dataset.rays import view_batch
 from nerf_lightning.errors import NoRoom
@@ -163,8 +163,9 @@ class Results(Renders):
             diagnosis = gap(trainer, pl_module, quality) or wild_between(trainer, pl_module, nothing)
             self.write(trainer, pl_module, stopped, diagnosis)
         if trainer.logger is not None:
-            scores = {"test/psnr": quality, "test/ssim": self.summary["ssim"] or 0.0}
-            trainer.logger.log_metrics(scores, trainer.global_step)
+            scores = {"val/psnr": quality, "val/ssim": self.summary["ssim"] or 0.0}
+            seconds = {TRAIN_SECONDS: self.summary["train_seconds"]}
+            trainer.logger.log_metrics(scores | seconds, trainer.global_step)
 
     def on_exception(self, trainer: L.Trainer, pl_module: System, exception: BaseException) -> None:
         if isinstance(exception, Interrupted | KeyboardInterrupt):

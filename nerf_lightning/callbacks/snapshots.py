@@ -19,6 +19,8 @@ from nerf_lightning.system import System
 
 LOGGED_WIDTH = 640
 """Widest picture for TensorBoard, in pixels: it takes 0.1 s for each megabyte."""
+TRUTH = "truth.png"
+"""What the view should look like, below the run folder: written once."""
 MIN_PIXELS, MAX_PIXELS = 1 << 13, 800 * 800
 """Of a snapshot of a scene, which is for looking at."""
 
@@ -94,9 +96,12 @@ class Snapshots(ChecksData, Renders):
             picture = result_panel(result, caption)
             write_png(self.path(trainer), picture)
             write_png(Path(trainer.default_root_dir) / self.final, to_bytes(result.rgb))
+            truth = Path(trainer.default_root_dir) / TRUTH
+            if not truth.exists():
+                write_png(truth, to_bytes(result.truth))
             if isinstance(trainer.logger, L.pytorch.loggers.TensorBoardLogger):
                 trainer.logger.experiment.add_image(
-                    "snapshot", narrowed(picture, LOGGED_WIDTH), step, dataformats="HWC"
+                    "images/view", narrowed(picture, LOGGED_WIDTH), step, dataformats="HWC"
                 )
                 trainer.logger.experiment.flush()  # while paused: TensorBoard's thread would take time from training
 

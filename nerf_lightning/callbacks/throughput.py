@@ -8,9 +8,12 @@ from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System, mse_to_psnr
 
+TRAIN_SECONDS = "speed/train_seconds"
+"""The time that a step's figures belong to, logged with them."""
+
 
 class Throughput(L.Callback):
-    """Logs loss, PSNR of the batch, learning rate, rays a second and samples a ray, every `every` steps.
+    """Logs the terms of the loss, PSNR of the batch, learning rates, rays a second and samples a ray, every `every` steps.
 
     Args:
         every: steps between log entries; the speeds are averages over them.
@@ -44,12 +47,12 @@ class Throughput(L.Callback):
         if trainer.logger is not None:
             mse = float(stats.mse)
             scalars = {
-                "train/loss": mse,
+                **{f"loss/{name}": float(term) for name, term in stats.terms.items()},
                 "train/psnr": mse_to_psnr(mse),
-                "train/learning_rate": pl_module.parameter_groups[0]["lr"],
+                **{f"lr/{n}": group["lr"] for n, group in enumerate(pl_module.parameter_groups)},
                 "speed/rays_per_second": rays / max(seconds - self._mark[0], 1e-9),
                 "speed/samples_per_ray": self._samples / max(rays, 1),
-                "speed/training_seconds": seconds,
+                TRAIN_SECONDS: seconds,
             }
             trainer.logger.log_metrics(scalars, step)
         self._mark, self._samples = (seconds, self.rays), 0

@@ -12,9 +12,12 @@ from cyclopts.exceptions import CycloptsError
 
 from nerf_lightning import __version__
 from nerf_lightning.cli.check import check
+from nerf_lightning.cli.compare import compare
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.cli.export import export
 from nerf_lightning.cli.render import render
+from nerf_lightning.cli.rightsize import rightsize
+from nerf_lightning.cli.stability import stability
 from nerf_lightning.cli.train import describe_groups, is_override, train
 from nerf_lightning.cli.view import view
 from nerf_lightning.errors import InputError
@@ -37,7 +40,7 @@ app = App(
 )
 _help = f"{inspect.cleandoc(train.__doc__ or '')}\n{describe_groups()}"
 app.command(train, help=_help, help_format="plaintext", usage="Usage: nerf_lightning train KEY=VALUE...\n")
-for _command in (check, view, render, evaluate, export):
+for _command in (check, view, render, evaluate, export, compare, rightsize, stability):
     app.command(_command)
 for _number, _name in enumerate(app.resolved_commands()):
     app[_name].sort_key = _number

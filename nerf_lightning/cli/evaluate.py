@@ -40,7 +40,8 @@ def evaluate(
     from rich.console import Console
 
     from nerf_lightning.dataset import RayDataModule
-    from nerf_lightning.drawing.panels import result_panel, stacked, write_png
+    from nerf_lightning.drawing.contact_sheet import contact_sheet
+    from nerf_lightning.drawing.panels import result_panel, write_png
     from nerf_lightning.evaluate.metrics import ViewMetrics, format_table, to_json
     from nerf_lightning.evaluate.perceptual import SMALLEST, TOO_SMALL, perceptual_distance
     from nerf_lightning.runs.data import data_again
@@ -70,11 +71,10 @@ def evaluate(
             del results[max(results, key=lambda one: results[one].psnr)]
     evaluation = to_json(metrics, source, data.scene.describe(), where)
     write_json(folder / "views.json", evaluation)
-    panels = []
-    for view in sorted(results, key=lambda one: results[one].psnr):
-        caption = f"view {view}, {metrics[view].psnr:.2f} dB, SSIM {metrics[view].ssim:.3f}"
-        panels.append(result_panel(results[view], caption))
-    write_png(folder / "worst.png", stacked(panels))
+    order = sorted(results, key=lambda view: results[view].psnr)
+    captions = [f"view {view}, {metrics[view].psnr:.2f} dB, SSIM {metrics[view].ssim:.3f}" for view in order]
+    panels = [result_panel(results[view], "") for view in order]
+    write_png(folder / "worst.png", contact_sheet(panels, captions, columns=1))
     Console(highlight=False, soft_wrap=True).print(format_table(metrics))
     mean = fmean(one.psnr for one in metrics)
     views_of_split = f"{len(metrics)} {'test' if split == 'test' else 'held-out'} views"

@@ -9,7 +9,8 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.drawing.panels import near_bright, to_bytes
+from nerf_lightning.drawing.depth import colorize_depth, depth_limits
+from nerf_lightning.drawing.panels import to_bytes
 from nerf_lightning.renderer import Rendered
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.system.metrics import mse_to_psnr
@@ -41,11 +42,7 @@ def depth_range(system: NeRF3D, cameras: Cameras) -> tuple[float, float]:
     for view in subsample(len(small), LOOKS):
         rendered = system.render(small.view_rays(view).to(system.device))
         seen.append(rendered.depth[rendered.opacity > 0.5])
-    covered = torch.cat(seen).cpu().numpy()
-    if not len(covered):
-        return 0.0, 1.0
-    low, high = np.percentile(covered, [2, 98]).tolist()
-    return low, max(high, low + 1e-6)
+    return depth_limits(torch.cat(seen).cpu().numpy())
 
 
 def draw(system: NeRF3D, cameras: Cameras, view: int, style: Style) -> dict[str, UInt8[ndarray, "H W C"]]:
@@ -66,18 +63,13 @@ def colours(rendered: Rendered, channel: str, style: Style) -> Float[Tensor, "R 
     if channel == "rgb":
         covered = rendered.rgb  # on black: premultiplied
     else:
-        covered = depth_colours(rendered.depth, style.depths) * opacity
+        painted = colorize_depth(rendered.depth.cpu().numpy(), *style.depths)
+        covered = torch.from_numpy(painted).to(opacity.device) / 255 * opacity
         if style.background is not None:
             covered = covered + (1 - opacity) * torch.tensor(style.background, device=opacity.device)
     if style.background is not None:
         return covered
     return torch.cat([covered / opacity.clamp_min(1e-6), opacity], dim=1)
-
-
-def depth_colours(depth: Float[Tensor, "R"], depths: tuple[float, float]) -> Float[Tensor, "R 3"]:
-    """Near bright, far dark, on a perceptually uniform scale."""
-    painted = near_bright(depth.cpu().numpy()[:, None], *depths)[:, 0]
-    return torch.from_numpy(painted.copy()).to(depth.device).float() / 255
 
 
 def error_picture(

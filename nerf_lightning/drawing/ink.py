@@ -1,6 +1,8 @@
 """Colours, letters and scales that all figures share."""
 
 import functools
+import itertools
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -13,6 +15,8 @@ BLUE, ORANGE, GREEN, SKY, VERMILLION, MAUVE, GREY = (
     "#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#6E6E6E",
 )  # fmt: skip
 """Safe for colour-blind readers (Okabe and Ito 2008); what was left out is vermillion."""
+PALETTE = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (MAUVE, "D"), (SKY, "v"), ("#000000", "P"), ("#B8A000", "X"))
+"""Colour and marker of the first, second ... category of any chart."""
 FONT = "DejaVu Sans"
 """Comes with matplotlib."""
 DPI = 100
@@ -27,6 +31,11 @@ def rgb(colour: str) -> tuple[int, int, int]:
 @functools.lru_cache(maxsize=1)
 def _letters() -> frozenset[int]:
     return frozenset(get_font(findfont(FONT)).get_charmap())
+
+
+def assign_styles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Colour and marker by category; more than `PALETTE` holds begin again."""
+    return dict(zip(dict.fromkeys(names), itertools.cycle(PALETTE), strict=False))
 
 
 def readable(text: str) -> str:

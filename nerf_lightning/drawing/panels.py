@@ -14,6 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from nerf_lightning.dataset.resize import area_resize, fit_size
+from nerf_lightning.drawing.depth import colorize_depth, depth_limits
 from nerf_lightning.system import ViewResult
 from nerf_lightning.utils.files import atomic
 
@@ -34,22 +35,6 @@ def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[ndarray, "*shape"]:
     return image.clamp(0, 1).mul_(255).round_().byte().cpu().numpy()
 
 
-def near_bright(depth: Float[ndarray, "H W"], low: float, high: float) -> UInt8[ndarray, "H W 3"]:
-    """Depths on a perceptually uniform scale: bright at `low` and nearer, dark at `high` and farther."""
-    nearness = 1 - (depth - low) / max(high - low, 1e-9)
-    return cv2.applyColorMap((nearness.clip(0, 1) * 255).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1]
-
-
-def depth_colours(depth: Float[Tensor, "H W"], opacity: Float[Tensor, "H W"]) -> UInt8[ndarray, "H W 3"]:
-    """Near bright, far dark, empty black; the range is that of the covered pixels (2nd to 98th percentile)."""
-    covered = opacity > 0.5
-    if not covered.any():
-        return np.zeros((*depth.shape, 3), np.uint8)
-    low, high = np.percentile(depth[covered].numpy(), [2, 98])
-    colours = near_bright(depth.numpy(), float(low), float(high))
-    return (colours * opacity.clamp(0, 1).numpy()[..., None]).astype(np.uint8)
-
-
 def panel(images: list[UInt8[ndarray, "H W 3"]], caption: str) -> UInt8[ndarray, "H2 W2 3"]:
     """Images of one size side by side, the caption on a strip below."""
     magnify = max(1, -(-SMALLEST_SIDE // images[0].shape[0]))
@@ -63,16 +48,12 @@ def panel(images: list[UInt8[ndarray, "H W 3"]], caption: str) -> UInt8[ndarray,
     return np.concatenate([row, strip])
 
 
-def stacked(panels: list[UInt8[ndarray, "H W 3"]]) -> UInt8[ndarray, "H2 W2 3"]:
-    """One below the other; narrow ones with a dark margin."""
-    widest = max(one.shape[1] for one in panels)
-    return np.concatenate([np.pad(one, ((0, 0), (0, widest - one.shape[1]), (0, 0))) for one in panels])
-
-
 def result_panel(result: ViewResult, caption: str) -> UInt8[ndarray, "H2 W2 3"]:
     """Truth, render, and depth (3D) or error times four (2D), each at most `PANEL_PX` pixels across."""
     if result.depth is not None and result.opacity is not None:
-        third = depth_colours(result.depth, result.opacity)
+        depth, opacity = result.depth.numpy(), result.opacity.numpy()
+        colours = colorize_depth(depth, *depth_limits(depth[opacity > 0.5]))
+        third = (colours * opacity.clip(0, 1)[..., None]).astype(np.uint8)
         names = "truth | render | depth"
     else:
         third = to_bytes(result.errors * 4)

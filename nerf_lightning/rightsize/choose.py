@@ -1,147 +1,90 @@
-"""When to stop climbing, and which rung is enough: decisions on figures alone."""
+"""Decisions of the search, on figures alone: when to stop growing, what to train in full, and which rung is enough."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from nerf_lightning.errors import InputError
-
-SHARE = 3.0
-"""A rung is worth climbing to where it gains a `SHARE`th of what the choice may be below the best, for twice the bytes."""
-IDLE = 2
-"""Rungs in a row that are not worth it, after which climbing stops: one may be random."""
-
-MORE = 1.0
-"""dB that a full training is assumed to gain over the climb's shorter one: 2 to 15 were measured, in runs of 10 to 140 s."""
-CLOSE = 0.5
-"""dB that an expectation may be wrong by."""
+GAIN_SHARE = 3.0
+"""A rung is worth its bytes where it gains a `GAIN_SHARE`th of what the choice may be below the best, for twice the bytes."""
+MAX_IDLE = 2
+"""Rungs in a row that are not worth their bytes, after which growing stops: one may be chance."""
+FULL_GAIN_DB = 1.0
+"""What a full training is assumed to gain over a rung's shorter one: 2 to 15 were measured, in runs of 10 to 140 s."""
+TOLERANCE_DB = 0.5
+"""By which an expectation may be wrong."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """What is good enough: a figure, or a distance from the best that can be reached. Exactly one of the two."""
+    """What is good enough: a figure, or without one a distance from the best that can be reached."""
 
     psnr: float | None = None
-    within_db: float | None = None
-
-    def __post_init__(self) -> None:
-        if (self.psnr is None) == (self.within_db is None):
-            raise InputError("config", "target", f"psnr={self.psnr} and within_db={self.within_db}", "one of the two")
-        if self.within_db is not None and not self.within_db >= 0:
-            raise InputError("config", "target.within_db", str(self.within_db), "at least 0")
+    within_db: float = 0.3
 
 
 @dataclass(frozen=True)
 class Measured:
-    """How good a rung is, and how large."""
+    """A trained rung: how good it is, and how large."""
 
     psnr: float
-    """dB held out."""
+    """Held-out dB."""
     size: int
     """Bytes of the compact file."""
+    parameters: int = 0
+    seconds: float = 0.0
+    """Of training."""
 
 
-def worth(before: Measured, after: Measured, slack: float, noise: float) -> bool:
-    """Whether the step from one rung to the next gains enough for its bytes, and more than seeds differ.
-
-    Args:
-        slack: dB that the choice may be below the best.
-        noise: dB by which seeds differ.
-    """
-    doublings = max(math.log2(after.size / before.size), 1.0)
-    return after.psnr - before.psnr > max(noise, slack / SHARE * doublings)
-
-
-def climbed_enough(rungs: Sequence[Measured], target: Target, noise: float) -> str:
-    """Why there is no point in climbing further; "" where there is one."""
+def stop_growing(rungs: Sequence[Measured], target: Target, noise: float) -> str:
+    """Why there is no point in growing further; "" where there is one. `noise` is the dB by which seeds differ."""
     if target.psnr is not None:
-        return "the target is near" if rungs[-1].psnr >= target.psnr - MORE else ""
-    assert target.within_db is not None  # exactly one of the two
-    if len(rungs) <= IDLE:
+        return "the target is near" if rungs[-1].psnr >= target.psnr - FULL_GAIN_DB else ""
+    if len(rungs) <= MAX_IDLE:
         return ""
     # The best before counts, not the last: two rungs that fall and rise again have gained nothing.
-    base = max(rungs[:-IDLE], key=lambda one: one.psnr)
-    if any(worth(base, one, target.within_db, noise) for one in rungs[-IDLE:]):
-        return ""
-    return f"the last {IDLE} rungs gained less than they cost"
+    base = max(rungs[:-MAX_IDLE], key=lambda one: one.psnr)
+    for one in rungs[-MAX_IDLE:]:
+        doublings = max(math.log2(one.size / base.size), 1.0)
+        if one.psnr - base.psnr > max(noise, target.within_db / GAIN_SHARE * doublings):
+            return ""
+    return f"the last {MAX_IDLE} rungs gained less than they cost"
 
 
-def candidate(rungs: Sequence[Measured], target: Target) -> int:
-    """The smallest rung that seems good enough; the best one where none does."""
-    best = max(one.psnr for one in rungs)
-    enough = target.psnr - MORE if target.psnr is not None else best - (target.within_db or 0.0)
-    return next((index for index, one in enumerate(rungs) if one.psnr >= enough), best_of(rungs))
-
-
-def best_of(rungs: Sequence[Measured]) -> int:
+def find_best(rungs: Sequence[Measured]) -> int:
     """The rung with the highest PSNR, the smallest of equals."""
-    return max(range(len(rungs)), key=lambda index: rungs[index].psnr)
+    return max(range(len(rungs)), key=lambda rung: rungs[rung].psnr)
 
 
-def knee(rungs: Sequence[Measured]) -> int:
-    """Where more bytes begin to bring less: the rung farthest above the line from the smallest to the best one, dB over the
-    logarithm of bytes, each from 0 to 1 (Satopaa et al. 2011)."""
-    first, best = rungs[0], rungs[best_of(rungs)]
-    bytes_up, gain = math.log(best.size / first.size), best.psnr - first.psnr
-    if not bytes_up > 0 or not gain > 0:
-        return 0
-
-    def above(index: int) -> float:
-        one = rungs[index]
-        return (one.psnr - first.psnr) / gain - math.log(one.size / first.size) / bytes_up
-
-    return max(range(len(rungs)), key=above)
+def choose_first(rungs: Sequence[Measured], target: Target) -> int:
+    """The rung to train in full first: the smallest that seems good enough, or the best where none does."""
+    best = find_best(rungs)
+    enough = rungs[best].psnr - target.within_db if target.psnr is None else target.psnr - FULL_GAIN_DB
+    return next((rung for rung, one in enumerate(rungs) if one.psnr >= enough), best)
 
 
-def expected(index: int, tried: dict[int, float], rungs: Sequence[Measured]) -> float:
-    """dB that a rung would reach trained in full: as much more than while growing as the nearest one that was.
+def choose_second(first: int, psnr: float, rungs: Sequence[Measured], target: Target, last: int) -> int | None:
+    """The rung to train in full beside the first, to be sure of the choice; None where that is sure.
 
     Args:
-        tried: dB by rung of those trained in full, one at least of those climbed to.
+        first: see `choose_first`.
+        psnr: dB that it reaches trained in full.
+        rungs: as they were while growing.
+        last: the largest rung of the ladder.
     """
-    near = min((one for one in tried if one < len(rungs)), key=lambda one: abs(one - index))
-    return rungs[index].psnr + tried[near] - rungs[near].psnr
-
-
-def next_to_train(
-    tried: dict[int, float], rungs: Sequence[Measured], target: Target, last: int, most: int
-) -> int | None:
-    """Which rung to train in full next, to be sure of the choice; None where it is sure, or `most` are trained.
-
-    Args:
-        tried: dB by rung of those trained in full.
-        rungs: those climbed to.
-        target: see `Target`.
-        last: the highest rung there is.
-        most: trainings there may be.
-    """
-    first, best = candidate(rungs, target), best_of(rungs)
-    if first not in tried:
-        return first
-    if len(tried) >= most:
-        return None
     if target.psnr is None:
-        wanted = [best, *range(first + 1, best)]
-        return (
-            next((rung for rung in wanted if rung not in tried), None) if chosen(tried, best, target) != first else None
-        )
-    met = [rung for rung, psnr in tried.items() if psnr >= target.psnr]
-    if not met:
-        return max(tried) + 1 if max(tried) < last else None
-    failed = max((rung for rung in tried if rung < min(met)), default=-1)
-    smaller = range(failed + 1, min(min(met), len(rungs)))
-    # The first whole training tells how much more it brings than the climb: several rungs may turn out to be needless.
-    likely = [rung for rung in smaller if expected(rung, tried, rungs) >= target.psnr]
-    close = [rung for rung in smaller[-1:] if expected(rung, tried, rungs) >= target.psnr - CLOSE]
+        best = find_best(rungs)
+        return None if best == first else best
+    if psnr < target.psnr:
+        return first + 1 if first < last else None
+    expected = [one.psnr + psnr - rungs[first].psnr for one in rungs[:first]]
+    likely = [rung for rung, figure in enumerate(expected) if figure >= target.psnr]
+    close = [first - 1] if first and expected[-1] >= target.psnr - TOLERANCE_DB else []
     return next(iter(likely + close), None)
 
 
-def chosen(tried: dict[int, float], best: int, target: Target) -> int | None:
-    """The smallest rung that full trainings have shown to be good enough; None where none was."""
-    if target.psnr is not None:
-        enough = target.psnr
-    elif best not in tried:
-        return None
-    else:
-        enough = max(tried.values()) - (target.within_db or 0.0)
-    return min((rung for rung, psnr in tried.items() if psnr >= enough), default=None)
+def choose_final(full: Mapping[int, Measured], target: Target) -> tuple[int, bool]:
+    """The smallest of the rungs trained in full that is good enough, or the best; and whether it is good enough."""
+    best = max(full, key=lambda rung: full[rung].psnr)
+    enough = full[best].psnr - target.within_db if target.psnr is None else target.psnr
+    found = [rung for rung, one in full.items() if one.psnr >= enough]
+    return (min(found), True) if found else (best, False)

@@ -1,180 +1,253 @@
-"""The whole search: climb, choose, confirm, and write down why."""
+"""The search: one training climbs the ladder, growing; the rung that seems enough and a neighbour are trained in full."""
 
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+import copy
+import inspect
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from statistics import stdev
 from typing import Any
 
-import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.config.build import build_data, build_system, build_trainer, corrects_poses, device_of, frame_of
+from nerf_lightning.callbacks import Budget
+from nerf_lightning.config import build
 from nerf_lightning.config.limits import limits_of
-from nerf_lightning.dataset import RayDataModule
-from nerf_lightning.dataset.plausible import check_scene
-from nerf_lightning.export.smallest import Compact, smallest
-from nerf_lightning.rightsize.choose import (
-    Measured,
-    Target,
-    best_of,
-    candidate,
-    chosen,
-    climbed_enough,
-    expected,
-    next_to_train,
-)
-from nerf_lightning.rightsize.climb import Rung, climb, coarsest_sampler, compact_bytes, set_options, spread
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.errors import InputError
+from nerf_lightning.export.reach import confined_to, seen_cells
+from nerf_lightning.export.smallest import held_out_psnr, smallest, some_cameras
+from nerf_lightning.model import as_wide
+from nerf_lightning.rightsize.choose import Measured, Target, choose_final, choose_first, choose_second, stop_growing
 from nerf_lightning.rightsize.ladder import Ladder, Options
-from nerf_lightning.rightsize.start import begin
+from nerf_lightning.runs.compact import encode
 from nerf_lightning.runs.folder import load_run, plain_config
 from nerf_lightning.runs.index import read_run
+from nerf_lightning.runs.owner import LOCK
+from nerf_lightning.runs.scene_file import scene_content
+from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.before import left_of
-from nerf_lightning.training.train import prepare, train
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.training.train import prepare, train, warm_up
+from nerf_lightning.utils.files import atomic, write_json
 from nerf_lightning.utils.libraries import silence_lightning
+from nerf_lightning.utils.parsing import read_json
+from nerf_lightning.utils.seeding import Stream, step_generator
+from nerf_lightning.utils.text import subsample
 
-MOST_FULL = 2
-"""Trainings in full: the candidate, and the one it is compared with."""
-COMPACT_LOSS = 0.1
-"""dB that the compact file may lose."""
-
-
-@dataclass(frozen=True)
-class Full(Measured):
-    """A rung trained with the whole budget, measured on all held-out views."""
-
-    folder: Path
-    seconds: float
-    """Of training."""
-    parameters: int
-
-
-@dataclass(frozen=True)
-class Found:
-    """The result of a search."""
-
-    target: Target
-    ladder: Ladder
-    rungs: Sequence[Rung]
-    full: dict[int, Full]
-    """By rung."""
-    choice: int
-    reached: bool
-    reason: str
-    noise: float
-    sampler: Options
-    seconds: float
-    """Of training, climbing and all."""
-    wall_seconds: float
-    compact: Compact
-    device: torch.device
-    """Where all of it was computed."""
+Data = RayDataModule | PixelDataModule
+LADDER_SHARE = 0.75
+"""Share of a budget in steps that climbing the whole ladder takes."""
+RUNG_STEPS = 300
+"""Steps on each rung where the budget is in seconds: what is chosen must not depend on what else the machine does."""
+VIEWS = 8
+"""Held-out views that measure a rung, and training views that decide what its file must hold."""
+EXTRA_SEEDS = 2
+"""Further trainings of the smallest rung, to measure the spread over seeds."""
+MAX_SAMPLER_LOSS_DB = 0.05
+"""By which a sampler may be worse than the best, on the same field."""
+GRID_UPDATES = 4
+"""After which a sampler knows a field."""
+MAX_COMPACT_LOSS_DB = 0.1
+PLAN = "search.json"
+"""File that says what is searched for."""
 
 
-def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> Found:
-    """Finds the smallest rung that is good enough, and leaves it trained in full, with its compact file.
+def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> dict[str, Any]:
+    """Finds the smallest rung that is good enough, and leaves it trained in full in `rung_N`, and compact.npz.
 
-    A search that was interrupted climbs again, for as long and to where it did before; what was trained in full
-    is not trained again.
+    A search that was interrupted climbs again, to where it did before; what was trained in full is kept.
+
+    Returns:
+        The content of rightsize.json: `target`; `growing`, the rungs as they were while growing; `full`, those trained with the
+        whole budget, by number; `rung`, the chosen one, with its options of `model` and `sampler`, and the `psnr` and
+        `artifact_bytes` of its compact file; whether it `reached` the target; the `device`; `noise_db`, by which seeds differ;
+        and the `search_seconds` of training in all.
 
     Raises:
-        InputError: where the device is not there, or the data, or an option of the ladder, is no good; or the folder holds
-            something else.
+        InputError: where the device, the data or an option of the ladder is no good; or the folder holds something else.
     """
-    began = time.perf_counter()
-    device = device_of(cfg)
+    device = build.device_of(cfg)
     silence_lightning()
     prepare(cfg)
-    data = build_data(cfg)
+    data = build.build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)
-    build_system(set_options(cfg, "model", ladder.rungs[0]), frame_of(data), device)
-    build_trainer(cfg, output, device)  # what is wrong with an option is told before anything is written
+    build.build_system(set_options(cfg, "model", ladder.rungs[0]), build.frame_of(data), device)
+    build.build_trainer(cfg, output, device)  # wrong options raise before anything is written
     begin(output, cfg, target, ladder)
-    for doubt in check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []:
-        print(f"{data.scene.name}: {doubt.text}", flush=True)
-    rungs: list[Rung] = []
+    rungs: list[Measured] = []
+    systems: list[System] = []
     noise = seconds = 0.0
-    why = "the ladder ends there"
-    for rung in climb(cfg, data, ladder.rungs, output):
+    stop = "the ladder ends there"
+    for system, rung in climb(cfg, data, ladder.rungs, output):
+        options = ", ".join(f"{key}={value}" for key, value in ladder.rungs[len(rungs)].items())
+        print(f"rung {len(rungs)}: {options}: {format_figures(rung.psnr, rung.size)}", flush=True)
         rungs.append(rung)
-        seconds += rung.seconds
-        print(f"rung {len(rungs) - 1}: {told(rung.options)}: {figures(rung.psnr, rung.size)}", flush=True)
+        systems.append(system)
         if len(rungs) == 1:
-            noise, spent = spread(cfg, data, ladder.rungs, rung, output)
-            seconds += spent
-            print(f"seeds differ by {noise:.2f} dB", flush=True)
-        stop = climbed_enough(rungs, target, noise)
-        if stop:
-            why = stop
+            seeds = [set_options(cfg, "", {"seed": cfg.seed + extra}) for extra in range(1, EXTRA_SEEDS + 1)]
+            others = [next(climb(one, data, ladder.rungs, output))[1] for one in seeds]
+            noise, seconds = stdev(one.psnr for one in (rung, *others)), sum(one.seconds for one in others)
+        if reason := stop_growing(rungs, target, noise):
+            stop = reason
             break
-    first, best = candidate(rungs, target), best_of(rungs)
-    print(f"climbed to rung {len(rungs) - 1}: {why}; rung {first} seems enough", flush=True)
-    model = set_options(cfg, "model", rungs[first].options)
-    sampler = coarsest_sampler(model, data, rungs[first].system, ladder.samplers)
-    full: dict[int, Full] = {}
-    while True:
-        tried = {index: one.psnr for index, one in full.items()}
-        following = next_to_train(tried, rungs, target, len(ladder.rungs) - 1, MOST_FULL)
-        if following is None:
-            break
-        print(f"rung {following} in full", flush=True)
-        full[following] = train_in_full(cfg, ladder.rungs[following], sampler, data, output / f"rung_{following}")
-        seconds += full[following].seconds
-    tried = {index: one.psnr for index, one in full.items()}
-    found = chosen(tried, best, target)
-    choice = found if found is not None else max(tried, key=lambda index: tried[index])
-    run = load_run(full[choice].folder, device=device)
-    compact = smallest(run.system, data, plain_config(run.cfg), COMPACT_LOSS)
+    first = choose_first(rungs, target)
+    print(f"climbed to rung {len(rungs) - 1}: {stop}; rung {first} seems enough", flush=True)
+    sampler = find_sampler(set_options(cfg, "model", ladder.rungs[first]), data, systems[first], ladder.samplers)
+    full = {first: train_in_full(cfg, ladder.rungs[first], sampler, data, output / f"rung_{first}")}
+    second = choose_second(first, full[first].psnr, rungs, target, len(ladder.rungs) - 1)
+    if second is not None:
+        full[second] = train_in_full(cfg, ladder.rungs[second], sampler, data, output / f"rung_{second}")
+    choice, reached = choose_final(full, target)
+    run = load_run(output / f"rung_{choice}", device=device)
+    compact = smallest(run.system, data, plain_config(run.cfg), MAX_COMPACT_LOSS_DB)
     with atomic(output / "compact.npz") as temporary:
         temporary.write_bytes(compact.content)
-    reason = in_words(target, tried, choice, found is not None, why, noise)
-    if target.psnr is not None and 0 < choice < len(rungs) and choice - 1 not in tried:
-        reason += f"; rung {choice - 1} would be expected at {expected(choice - 1, tried, rungs):.1f} dB"
-    wall = time.perf_counter() - began
-    return Found(
-        target, ladder, rungs, full, choice, found is not None, reason, noise, sampler, seconds, wall, compact, device
-    )
+    return {
+        "target": asdict(target),
+        "reached": reached,
+        "device": str(device),
+        "rung": choice,
+        "model": ladder.rungs[choice],
+        "sampler": sampler,
+        "psnr": compact.psnr,
+        "artifact_bytes": len(compact.content),
+        "noise_db": noise,
+        "search_seconds": seconds + sum(one.seconds for one in (*rungs, *full.values())),
+        "growing": [asdict(one) for one in rungs],
+        "full": {str(rung): asdict(one) for rung, one in full.items()},
+    }
 
 
-def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Any, folder: Path) -> Full:
-    """A run of its own, with the whole budget, as if nothing else ran beside it. One that is there is not trained again, one
-    that was interrupted goes on."""
+def begin(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None:
+    """Writes down what is searched for, unless the same search began here before.
+
+    Raises:
+        InputError: where the folder holds anything else.
+    """
+    plan = {"target": asdict(target), "ladder": asdict(ladder), "config": plain_config(cfg)}
+    if not output.is_dir() or not any(file.name != LOCK for file in output.iterdir()):
+        write_json(output / PLAN, plan)
+    elif not (output / PLAN).is_file() or read_json(output / PLAN, "a plan") != json.loads(json.dumps(plan)):
+        found, expected = "something else in it", "a folder for this search alone"
+        raise InputError(output, "", found, expected, "give another --output, or the same options to continue")
+
+
+def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
+    """A copy of a configuration with other options in a group, "" for the top; unknown ones raise when the group is built."""
+    changed = copy.deepcopy(cfg)
+    for key, value in options.items():
+        OmegaConf.update(changed, f"{group}.{key}".lstrip("."), value, force_add=True)
+    return changed
+
+
+def configure_rung(cfg: DictConfig, ladder: Sequence[Options], rung: int) -> DictConfig:
+    """The configuration of a rung's training: in steps, however the budget was given, without images, files and curves."""
+    steps = build.budget_options(cfg).get("steps")
+    wanted = RUNG_STEPS if steps is None else max(1, round(steps * LADDER_SHARE / len(ladder)))
+    changed = set_options(cfg, "budget", {"steps": wanted, "seconds": None, "patience": None})
+    OmegaConf.update(changed, "callbacks", {"guard": (cfg.callbacks or {}).get("guard")}, merge=False)
+    OmegaConf.update(changed, "logger", None)
+    return set_options(changed, "model", ladder[rung])
+
+
+def train_rung(cfg: DictConfig, data: Data, folder: Path, smaller: System | None = None) -> tuple[System, float]:
+    """Trains a system, from what a smaller one has learned if there is room for it.
+
+    Returns:
+        The system, on the device that trained it, and the seconds it took.
+    """
+    prepare(cfg)
+    if isinstance(data, RayDataModule):
+        data.start_again()
+    device = build.device_of(cfg)
+    system = build.build_system(cfg, build.frame_of(data), device)
+    if smaller is not None and as_wide(system.field, smaller.field):
+        system.warm_start_from(smaller.cpu())  # where a new system is
+        smaller.to(device)
+    trainer = build.build_trainer(cfg, folder, device)
+    warm_up(system, data, device)
+    trainer.fit(system, data)
+    return system.to(device).eval(), Budget.of(trainer).seconds
+
+
+def climb(cfg: DictConfig, data: Data, ladder: Sequence[Options], folder: Path) -> Iterator[tuple[System, Measured]]:
+    """Trains the smallest rung, then continues with each larger one, for as many steps each.
+
+    A rung that is smaller than the last in something starts anew.
+    """
+    smaller: System | None = None
+    before = Options()
+    for rung in range(len(ladder)):
+        part = configure_rung(cfg, ladder, rung)
+        model = build.resolved(part.model)
+        system, seconds = train_rung(part, data, folder, smaller if has_room(model, before) else None)
+        parameters = sum(p.numel() for p in system.parameters() if p.requires_grad)
+        yield system, Measured(measure_psnr(system, data), compact_bytes(part, system, data), parameters, seconds)
+        smaller, before = system, model
+
+
+def has_room(model: Options, before: Options) -> bool:
+    """Whether no number among a model's options is less than before: only then what that learned fits in."""
+    both = ((value, model.get(key)) for key, value in before.items())
+    return all(b >= a for a, b in both if isinstance(a, int | float) and isinstance(b, int | float))
+
+
+def measure_psnr(system: System, data: Data) -> float:
+    """Mean dB over a few held-out views.
+
+    Raises:
+        InputError: where what it shows is not finite.
+    """
+    found = held_out_psnr(system, data, subsample(data.held_out_views, VIEWS))
+    if not math.isfinite(found):
+        raise InputError("rightsize", "", "images that are not finite", "a field that learns", "lower optimizer.lr")
+    return found
+
+
+def compact_bytes(cfg: DictConfig, system: System, data: Data) -> int:
+    """Approximate size of a system's compact file: only a few views decide what it must hold."""
+    seen = seen_cells(system, some_cameras(data, VIEWS)) if isinstance(data, RayDataModule) else None
+    return len(encode(confined_to(system, seen), "byte", plain_config(cfg), scene_content(data)))
+
+
+def find_sampler(cfg: DictConfig, data: Data, system: System, samplers: Sequence[Options]) -> Options:
+    """The coarsest of some samplers with which a trained field renders as well as with the best; options that its kind of
+    sampler does not have are left out."""
+    if not isinstance(system, NeRF3D) or not isinstance(data, RayDataModule):
+        return {}
+    known = inspect.signature(build.target_of(cfg, "sampler")).parameters
+    scores: list[tuple[Options, float]] = []
+    for options in (one for one in samplers if one.keys() <= known.keys()):
+        probe = build.build_system(set_options(cfg, "sampler", options), build.frame_of(data), system.device)
+        assert isinstance(probe, NeRF3D)  # of the same data
+        probe.field = system.field
+        probe.to(system.device)
+        probe.sampler.look_through(data.scene.train.cameras)
+        for number in range(GRID_UPDATES):
+            step = number * getattr(probe.sampler, "update_every", 1)
+            generator = step_generator(probe.seed, Stream.STUDY, number, probe.device)
+            probe.sampler.update(step, probe.field.density, generator)
+        scores.append((options, measure_psnr(probe.eval(), data)))
+    enough = max((psnr for _, psnr in scores), default=0.0) - MAX_SAMPLER_LOSS_DB
+    return next((options for options, psnr in scores if psnr >= enough), {})
+
+
+def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Data, folder: Path) -> Measured:
+    """Trains a run of its own, with the whole budget, as if nothing else ran beside it. One that is finished is kept, one that
+    was interrupted continues."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
     whole = set_options(whole, "budget", {"alone": True})
+    print(f"{folder}: {', '.join(f'{key}={value}' for key, value in model.items())}, in full", flush=True)
     done, checkpoint = left_of(read_run(folder), whole)
     if done is None:
         train(whole, checkpoint, folder)
-    results = read_run(folder).results
-    run = load_run(folder, device=device_of(cfg))
+    results, run = read_run(folder).results, load_run(folder, device=build.device_of(cfg))
     size = compact_bytes(run.cfg, run.system, data)
-    return Full(results["psnr"], size, folder, results["train_seconds"], results["parameters"])
+    return Measured(results["psnr"], size, results["parameters"], results["train_seconds"])
 
 
-def told(options: Options) -> str:
-    """Options in one line."""
-    return ", ".join(f"{key}={value}" for key, value in options.items())
-
-
-def figures(psnr: float, size: int) -> str:
-    """A rung's figures in one line."""
+def format_figures(psnr: float, size: int) -> str:
+    """dB and bytes in words."""
     return f"{psnr:.2f} dB in {size / 1000:,.1f} kB"
-
-
-def in_words(target: Target, tried: dict[int, float], choice: int, reached: bool, why: str, noise: float) -> str:
-    """Why this rung."""
-    mine = f"rung {choice} reaches {tried[choice]:.2f} dB trained in full"
-    others = {index: psnr for index, psnr in tried.items() if index != choice}
-    if target.psnr is not None:
-        if not reached:
-            return f"{mine}, the most of those tried: the target of {target.psnr:g} dB was not reached"
-        smaller = [f"rung {index} only {psnr:.2f} dB" for index, psnr in others.items() if index < choice]
-        return "; ".join(
-            [f"{mine}, the target is {target.psnr:g} dB", *smaller, *(["it is the smallest"] if not choice else [])]
-        )
-    largest = [
-        f"rung {index}, the best while growing, {psnr:.2f} dB" for index, psnr in others.items() if index > choice
-    ]
-    smaller = [f"rung {index} only {psnr:.2f} dB" for index, psnr in others.items() if index < choice]
-    held = "; ".join([*largest, *smaller]) or "no larger one was better while growing"
-    return f"{mine}; {held}; {target.within_db:g} dB below the best are allowed, and seeds differ by {noise:.2f} dB ({why})"

@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.owner import LOCK
+from nerf_lightning.runs.owner import MARKER
 from nerf_lightning.utils.files import user_path
 
 OUTPUTS = Path("outputs")
@@ -49,7 +49,7 @@ def _modified(folder: Path) -> float:
 def link_latest(folder: Path) -> None:
     """Points `outputs/NAME/latest` to the run folder `outputs/NAME/TIME`; does nothing for other folders."""
     folder = folder.absolute()
-    if folder.parent.parent.name != OUTPUTS.name or not (folder / LOCK).exists():
+    if folder.parent.parent.name != OUTPUTS.name or not (folder / MARKER).exists():
         return
     link = folder.with_name(LATEST)
     temporary = link.with_name(f".{LATEST}-{os.getpid()}")

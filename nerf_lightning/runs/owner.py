@@ -11,8 +11,8 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import remove, remove_empty
 
-LOCK = ".nerf_lightning"
-"""Marks a folder as made by this package; the process that writes into the folder locks it."""
+LOCK, MARKER = ".lock", ".nerf_lightning"
+"""In a folder that is or was written; and in one that was new or empty then, so that all in it is this package's own."""
 RUN = ("config.yaml", "results.json", "checkpoints")
 """Any of these says that a folder holds a run."""
 
@@ -27,26 +27,24 @@ def leads() -> bool:
 
 
 @contextmanager
-def owned(folder: Path, resumed: bool = False) -> Iterator[None]:
+def owned(folder: Path) -> Iterator[None]:
     """Locks a folder, which is made if it is missing, and removed again if nothing was written.
-
-    Args:
-        folder: a new or empty one, or one that was owned before.
-        resumed: whether any other will do too, as a run in it was moved there without its lock.
 
     Raises:
         Taken: while another process writes into it.
-        InputError: where it cannot be written, or holds files of others.
+        InputError: where it cannot be written, or holds files of others and no run.
     """
     if not leads():
         yield
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if not resumed and not (folder / LOCK).exists() and any(folder.iterdir()):
-            raise InputError(folder, "", "other files in it", "a new or empty folder, or one of an earlier run")
+        if not (is_empty(folder) or holds_run(folder) or (folder / MARKER).exists()):
+            raise InputError(folder, "", "other files in it", "a new or empty folder, or that of an earlier run")
         lock = FileLock(folder / LOCK, timeout=0)
         lock.acquire()
+        if is_empty(folder):
+            (folder / MARKER).touch()
     except Timeout as error:
         todo = "wait for its end, or give another folder"
         raise Taken(folder, "", "a run that is in progress", "a folder that no other process uses", todo) from error
@@ -57,8 +55,9 @@ def owned(folder: Path, resumed: bool = False) -> Iterator[None]:
         yield
     finally:
         lock.release()
-        if [file.name for file in folder.iterdir()] == [LOCK]:
-            remove(folder / LOCK)
+        if is_empty(folder):
+            for name in (LOCK, MARKER):
+                remove(folder / name)
             remove_empty(folder)
 
 
@@ -100,11 +99,16 @@ def holds_run(folder: Path) -> bool:
     return any((folder / name).exists() for name in RUN)
 
 
+def is_empty(folder: Path) -> bool:
+    """Whether there is nothing but a lock and a marker."""
+    return all(file.name in (LOCK, MARKER) for file in folder.iterdir())
+
+
 def clear(folder: Path) -> None:
-    """Removes an earlier run, so that none of its files is mistaken for a later one's: all files of a folder that this package
-    made, else only those that say that there is a run."""
+    """Removes an earlier run, so that none of its files is mistaken for a later one's: all files of a marked folder, elsewhere
+    only those that say that there is a run."""
     if not holds_run(folder):
         return
-    own = (folder / LOCK).exists()
-    for path in [path for path in folder.iterdir() if path.name != LOCK and (own or path.name in RUN)]:
+    marked = (folder / MARKER).exists()
+    for path in [path for path in folder.iterdir() if path.name not in (LOCK, MARKER) and (marked or path.name in RUN)]:
         remove(path)

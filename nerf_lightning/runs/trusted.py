@@ -30,7 +30,7 @@ TARGETS = {
         "suited_sampler",
     ),
     "nerf_lightning.system": ("constant", "cosine", "exponential"),
-    "nerf_lightning.training.loggers": ("mlflow", "wandb"),
+    "nerf_lightning.training.loggers": ("TensorBoard", "mlflow", "wandb"),
     "torch.optim": ("Adam", "AdamW"),
 }
 """What a run folder may name, by module. Anything else could be called with a stranger's arguments."""

@@ -1,81 +1,126 @@
-"""The files of a suite: stability.json, a heat map, a table in Markdown, and the worst renders."""
+"""The files of a suite: stability.json, a table in Markdown, heat maps, and the worst renders."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from nerf_lightning.drawing.ink import pixels_of
+import imageio.v3 as imageio
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from nerf_lightning.drawing.contact_sheet import contact_sheet
+from nerf_lightning.drawing.ink import BLUE, DPI, GREY, VERMILLION, pixels_of
 from nerf_lightning.drawing.panels import write_png
-from nerf_lightning.stability.cell import Outcome, folder_of
-from nerf_lightning.stability.heatmap import heatmap
-from nerf_lightning.stability.verdict import NEAR, Rescue, Square, rescues, squares
-from nerf_lightning.stability.worst import worst_page
+from nerf_lightning.stability.trial import Outcome, trial_folder
+from nerf_lightning.stability.verdict import RESCUED_DB, Verdict, find_rescues, is_rescued, judge
 from nerf_lightning.utils.files import atomic, write_json
 
+SCALE_DB = Normalize(8.0, 40.0, clip=True)
+"""Ends of the colours."""
+MAX_WORST = 30
 
-def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> None:
-    """Writes all files into the suite's folder and prints a summary."""
-    found = squares(outcomes)
-    saved = rescues(outcomes)
-    whole = {"suite": suite, "cells": [asdict(one) for one in outcomes], "rescues": [asdict(one) for one in saved]}
-    write_json(root / "stability.json", whole)
-    seeds = max((len(square.outcomes) for square in found), default=0)
-    title = f"worst of {seeds} seeds, dB held out; failed/all; suite={suite}"
+
+def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> dict[str, Any]:
+    """Writes all files into the suite's folder, prints a summary, and returns what stability.json holds."""
+    verdicts, rescues = judge(outcomes), find_rescues(outcomes)
+    lines = summarize(verdicts, rescues)
     for name, flat in (("heatmap.png", False), ("heatmap_2d.png", True)):
-        part = [square for square in found if square.condition.flat == flat]
+        part = [one for one in verdicts if one.condition.flat == flat]
         if part:
-            write_png(root / name, pixels_of(heatmap(part, title)))
-    page = worst_page(found, lambda one: folder_of(root, one.condition, one.method, one.seed))
-    write_png(root / "worst.png", pixels_of(page))
+            write_png(root / name, pixels_of(draw_heatmap(part, suite)))
+    write_worst(verdicts, root)
     with atomic(root / "stability.md") as temporary:
-        temporary.write_text("\n".join([markdown(found), *summary(found, saved)]) + "\n", encoding="utf-8")
-    for square in found:
-        if square.failed and not square.control:
-            first = square.failed[0]
+        temporary.write_text("\n".join([format_table(verdicts), *lines]) + "\n", encoding="utf-8")
+    content = {"suite": suite, "cells": [asdict(one) for one in outcomes], "rescues": rescues}
+    write_json(root / "stability.json", content)
+    for one in verdicts:
+        if one.failed and not one.must_fail:
+            first = one.failed[0]
             print(
-                f"{square.condition.name}, {square.method}: {len(square.failed)} of {len(square.outcomes)} failed"
-                f" ({square.condition.check}); seed {first.seed}: {first.status}: {first.diagnosis}"
+                f"{one.condition.name}, {one.method}: {one.describe()[-1]} ({one.condition.check});"
+                f" seed {first.seed}: {first.status}: {first.diagnosis}"
             )
-    print("\n".join(summary(found, saved)))
-    print(f"{len(outcomes)} cells: {root}/heatmap.png, worst.png, stability.md, stability.json")
+    print("\n".join(lines))
+    print(f"{len(outcomes)} trials: {root}/heatmap.png, worst.png, stability.md, stability.json")
+    return content
 
 
-def summary(found: Sequence[Square], saved: Sequence[Rescue]) -> list[str]:
+def summarize(verdicts: Sequence[Verdict], rescues: Sequence[dict]) -> list[str]:
     """The result in sentences."""
-    shipped = [square for square in found if square.shipped]
-    lost, tried = (sum(len(getattr(square, part)) for square in shipped) for part in ("failed", "outcomes"))
-    controls = [square for square in found if square.control]
-    lines = [f"shipped recipes: {lost} of {tried} cells failed"] if shipped else []
+    shipped = [one for one in verdicts if one.shipped]
+    controls = [one for one in verdicts if one.must_fail]
+    lines = []
+    if shipped:
+        lost, tried = sum(len(one.failed) for one in shipped), sum(len(one.outcomes) for one in shipped)
+        lines.append(f"shipped recipes: {lost} of {tried} trials failed")
     if controls:
-        failing = [
-            f"{s.condition.name}, {s.method} ({len(s.failed)} of {len(s.outcomes)})" for s in controls if s.failed
-        ]
+        failing = [f"{one.condition.name}, {one.method} ({one.describe()[-1]})" for one in controls if one.failed]
         listed = "; ".join(failing) or "none, so this suite proves nothing"
         lines.append(f"controls that failed, as they should: {listed}")
-    if saved:
-        back = sum(one.back for one in saved)
-        lines.append(f"guard: {back} of {len(saved)} broken control runs brought back to within {NEAR:g} dB")
+    if rescues:
+        back = sum(map(is_rescued, rescues))
+        lines.append(f"guard: {back} of {len(rescues)} broken control runs brought back to within {RESCUED_DB:g} dB")
     return lines
 
 
-def markdown(found: Sequence[Square]) -> str:
-    """A row for each condition, a column for each method."""
-    methods = list(dict.fromkeys(square.method for square in found))
-    rows: dict[str, dict[str, str]] = {}
-    checks = {}
-    for square in found:
-        worst = square.worst
-        told = "refused" if worst is None and not square.failed else "-" if worst is None else f"{worst:.1f} dB"
-        if square.condition.hopeless and worst is not None and not square.failed:
-            told += ", alarm"
-        if square.failed:
-            told += f", {len(square.failed)} of {len(square.outcomes)} failed"
-        if square.recovered:
-            told += f", {square.recovered} recovered"
-        rows.setdefault(square.condition.name, {})[square.method] = told
-        checks[square.condition.name] = square.condition.check
+def format_table(verdicts: Sequence[Verdict]) -> str:
+    """Markdown: a row for each condition, a column for each method."""
+    methods = list(dict.fromkeys(one.method for one in verdicts))
     lines = [f"| condition | must be | {' | '.join(methods)} |", "|---" * (len(methods) + 2) + "|"]
-    for name, by_method in rows.items():
-        cells = " | ".join(by_method.get(method, "") for method in methods)
-        lines.append(f"| {name} | {checks[name]} | {cells} |")
+    for condition in {one.condition.name: one.condition for one in verdicts}.values():
+        cells = dict.fromkeys(methods, "")
+        for one in verdicts:
+            if one.condition is condition:
+                recovered = sum(outcome.recoveries > 0 for outcome in one.outcomes)
+                cells[one.method] = ", ".join([*one.describe(), *([f"{recovered} recovered"] if recovered else [])])
+        lines.append(f"| {condition.name} | {condition.check} | {' | '.join(cells.values())} |")
     return "\n".join(lines) + "\n"
+
+
+def draw_heatmap(verdicts: Sequence[Verdict], suite: str) -> Figure:
+    """A row for each condition, a column for each method: the bluer the better, vermillion where seeds failed."""
+    conditions = list(dict.fromkeys(one.condition.name for one in verdicts))
+    methods = list(dict.fromkeys(one.method for one in verdicts))
+    figure = Figure(figsize=(3.2 + 1.35 * len(methods), 1.4 + 0.34 * len(conditions)), dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    blues = LinearSegmentedColormap.from_list("blues", ["white", BLUE])
+    cells = {(one.condition.name, one.method): one for one in verdicts}
+    for row, condition in enumerate(conditions):
+        for column, method in enumerate(methods):
+            one = cells.get((condition, method))
+            shade = 0.0 if one is None or one.worst is None else float(SCALE_DB(one.worst))
+            colour = "#eeeeee" if one is None else VERMILLION if one.failed else blues(shade) if shade else "#d8d8d8"
+            ink = GREY if one is None else "white" if one.failed or shade > 0.6 else "black"
+            axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
+            words = "–" if one is None else ", ".join(one.describe())
+            axes.text(column, row, words, ha="center", va="center", fontsize=8.5, color=ink)
+    axes.set(xlim=(-0.5, len(methods) - 0.5), ylim=(len(conditions) - 0.5, -0.5))
+    axes.set_xticks(range(len(methods)), methods, fontsize=9)
+    axes.xaxis.tick_top()
+    axes.set_yticks(range(len(conditions)), conditions, fontsize=9)
+    axes.tick_params(length=0)
+    seeds = max(len(one.outcomes) for one in verdicts)
+    note = "" if len(cells) == len(conditions) * len(methods) else "; –: does not apply"
+    axes.set_xlabel(f"worst seed of {seeds}, held out; suite {suite}{note}", color=GREY, fontsize=9)
+    axes.spines[:].set_visible(False)
+    return figure
+
+
+def write_worst(verdicts: Sequence[Verdict], root: Path) -> None:
+    """Writes worst.png: the last render of the worst seed of each condition and method, the worst first."""
+    shown = []
+    for verdict in verdicts:
+        one = min(verdict.outcomes, key=lambda outcome: (outcome.psnr is not None, outcome.psnr))
+        folder = trial_folder(root, one.condition, one.method, one.seed)
+        files = [folder / name for name in ("enlarged.png", "final.png") if (folder / name).exists()]
+        if files:
+            figure = "no figure" if one.psnr is None else f"{one.psnr:.1f} dB"
+            caption = f"{one.condition}\n{one.method}\nseed {one.seed}: {figure}"
+            shown.append((one.psnr or 0.0, caption, imageio.imread(files[0]), one in verdict.failed))
+    shown = sorted(shown, key=lambda entry: entry[0])[:MAX_WORST]
+    if shown:
+        _, captions, images, failed = zip(*shown, strict=True)
+        sheet = contact_sheet(images, captions, 6, 1200, {i for i, flag in enumerate(failed) if flag})
+        write_png(root / "worst.png", sheet)

@@ -1,20 +1,19 @@
-"""Which cells failed, and the verdict on a condition and a method over all seeds."""
+"""Which trials failed: the verdict on a condition and a method over all seeds, and what the guard rescued."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from nerf_lightning.stability.cell import Outcome
-from nerf_lightning.stability.conditions import CONDITIONS, Condition
-from nerf_lightning.stability.methods import METHODS
+from nerf_lightning.stability.conditions import CONDITIONS, METHODS, Condition
+from nerf_lightning.stability.trial import Outcome
 
 CLEAN = ("clean", "2D: clean")
-NEAR = 2.0
-"""A run counts as rescued within this many dB of an undisturbed one."""
+RESCUED_DB = 2.0
+"""A run counts as rescued within so many dB of an undisturbed one."""
 
 
 @dataclass(frozen=True)
-class Square:
+class Verdict:
     """All seeds of one condition and one method."""
 
     condition: Condition
@@ -26,35 +25,38 @@ class Square:
     @property
     def worst(self) -> float | None:
         """dB of the worst seed; None if any seed has none."""
-        figures = [one.psnr for one in self.outcomes]
-        return None if None in figures else min(figure for figure in figures if figure is not None)
+        known = [one.psnr for one in self.outcomes if one.psnr is not None]
+        return min(known) if len(known) == len(self.outcomes) else None
 
     @property
-    def control(self) -> bool:
-        """Whether it must fail."""
-        method = METHODS[self.method]
-        return self.condition.control or (method.control and not method.guard)
+    def must_fail(self) -> bool:
+        return self.condition.control or METHODS[self.method].guarded is not None
 
     @property
     def shipped(self) -> bool:
         """Whether it is a recipe as it is shipped, which must not fail."""
         return not self.condition.control and not METHODS[self.method].control
 
-    @property
-    def recovered(self) -> int:
-        return sum(one.recoveries > 0 for one in self.outcomes)
+    def describe(self) -> list[str]:
+        """Figure and failures in words."""
+        refused = all(one.status == "refused" for one in self.outcomes)
+        parts = ["refused" if refused else "no figure" if self.worst is None else f"{self.worst:.1f} dB"]
+        if self.failed:
+            parts.append(f"{len(self.failed)}/{len(self.outcomes)} failed")
+        elif self.condition.hopeless and not refused:
+            parts.append("alarm")
+        return parts
 
 
-def squares(outcomes: Sequence[Outcome]) -> list[Square]:
+def judge(outcomes: Sequence[Outcome]) -> list[Verdict]:
     """By condition and method, in the order of the conditions."""
     found = []
-    methods = list(dict.fromkeys(one.method for one in outcomes))
-    for condition in CONDITIONS:
-        for method in methods:
+    for condition in CONDITIONS.values():
+        for method in dict.fromkeys(one.method for one in outcomes):
             seeds = tuple(one for one in outcomes if (one.condition, one.method) == (condition.name, method))
+            failed = [one for one in seeds if not passes(one, condition, clean_psnr(outcomes, method, one.seed))]
             if seeds:
-                failed = tuple(one for one in seeds if not passes(one, condition, _clean(outcomes, method, one.seed)))
-                found.append(Square(condition, method, seeds, failed))
+                found.append(Verdict(condition, method, seeds, tuple(failed)))
     return found
 
 
@@ -64,48 +66,41 @@ def passes(outcome: Outcome, condition: Condition, clean: float | None) -> bool:
         return outcome.status == "refused" or bool(outcome.alarm)
     if outcome.status != "finished" or outcome.psnr is None:
         return False
-    return condition.loses is None or clean is None or outcome.psnr >= clean - condition.loses
+    return condition.max_loss_db is None or clean is None or outcome.psnr >= clean - condition.max_loss_db
 
 
-@dataclass(frozen=True)
-class Rescue:
-    """A run that breaks down without the guard, repeated with it."""
+def find_rescues(outcomes: Sequence[Outcome]) -> list[dict[str, str | int | float | None]]:
+    """The guarded twin of each control run that broke down without the guard, and what it should reach.
 
-    condition: str
-    method: str
-    """With the guard."""
-    seed: int
-    psnr: float | None
-    undisturbed: float | None
-    """Median dB of the seeds that do not break down under the same condition, or of the clean runs where all do."""
-
-    @property
-    def back(self) -> bool:
-        return self.psnr is not None and self.undisturbed is not None and self.psnr >= self.undisturbed - NEAR
-
-
-def rescues(outcomes: Sequence[Outcome]) -> list[Rescue]:
-    """Every control run that broke down without the guard, with the same run guarded."""
-    by_cell = {(one.condition, one.method, one.seed): one for one in outcomes}
+    That is `undisturbed`, the median dB of the seeds that did not break down under the same condition, or of the clean runs
+    where all did.
+    """
     found = []
     for lost in outcomes:
-        guarded = METHODS[lost.method].guarded
-        saved = by_cell.get((lost.condition, guarded, lost.seed)) if guarded else None
-        if saved is None or lost.status not in ("collapsed", "failed"):
+        twins = [one for one in outcomes if (one.condition, one.seed) == (lost.condition, lost.seed)]
+        twin = next((one for one in twins if one.method == METHODS[lost.method].guarded), None)
+        if twin is None or lost.status not in ("collapsed", "failed"):
             continue
-        undisturbed = _undisturbed(outcomes, (lost.condition,), lost.method) or _clean(outcomes, lost.method)
-        found.append(Rescue(lost.condition, saved.method, lost.seed, saved.psnr, undisturbed))
+        alike = [one for one in outcomes if one.condition == lost.condition and one.method == lost.method]
+        reference = median_psnr(alike) or clean_psnr(outcomes, lost.method)
+        rescue = {key: getattr(twin, key) for key in ("condition", "method", "seed", "psnr")}
+        found.append({**rescue, "undisturbed": reference})
     return found
 
 
-def _clean(outcomes: Sequence[Outcome], method: str, seed: int | None = None) -> float | None:
+def is_rescued(rescue: dict) -> bool:
+    """Whether the guarded run came near an undisturbed one."""
+    psnr, reference = rescue["psnr"], rescue["undisturbed"]
+    return psnr is not None and reference is not None and psnr >= reference - RESCUED_DB
+
+
+def clean_psnr(outcomes: Sequence[Outcome], method: str, seed: int | None = None) -> float | None:
     """dB of the same seed's clean run, as seeds differ; the median of all seeds if there is none."""
-    alike = [one for one in outcomes if one.seed == seed]
-    return _undisturbed(alike, CLEAN, method) or _undisturbed(outcomes, CLEAN, method)
+    clean = [one for one in outcomes if one.method == method and one.condition in CLEAN]
+    return median_psnr([one for one in clean if one.seed == seed]) or median_psnr(clean)
 
 
-def _undisturbed(outcomes: Sequence[Outcome], conditions: Sequence[str], method: str) -> float | None:
+def median_psnr(outcomes: Sequence[Outcome]) -> float | None:
     """Median dB of the runs that did not break down."""
-    mine = [one for one in outcomes if one.condition in conditions and one.method == method]
-    figures = [one.psnr for one in mine if one.psnr is not None and one.status == "finished"]
+    figures = [one.psnr for one in outcomes if one.psnr is not None and one.status == "finished"]
     return median(figures) if figures else None

@@ -48,7 +48,7 @@ class NeRF2D(System):
 
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
         loss = self.loss(batch)
-        self.stats = StepStats(loss.detach(), len(batch.uv), len(batch.uv))
+        self.stats = StepStats(loss.detach(), len(batch.uv), len(batch.uv), terms={"rgb": loss.detach()})
         return loss
 
     def truth(self, batch: PixelBatch) -> Tensor:

@@ -198,6 +198,9 @@ class NeRF3D(System):
         rgb = rgb if samples.whole is None else torch.where(samples.whole[:, None], rgb, truth)
         squares = (rgb - truth).square().mean(1)
         loss = (squares if batch.weights is None else squares * batch.weights).mean()
+        learned = None if rendered.weights is None else self.sampler.loss(samples, rendered.weights)
+        added = {"field": self.field.penalty(), "rays": rendered.penalty, "sampler": learned}
+        terms = {"rgb": loss, **{name: term for name, term in added.items() if term is not None}}
         stats = StepStats(
             loss.detach(),
             len(batch.rays),
@@ -205,10 +208,10 @@ class NeRF3D(System):
             rendered.opacity.detach(),
             squares.detach(),
             samples.whole,
+            {name: term.detach() for name, term in terms.items()},
         )
-        learned = None if rendered.weights is None else self.sampler.loss(samples, rendered.weights)
-        for penalty in (self.field.penalty(), rendered.penalty, learned):
-            loss = loss if penalty is None else loss + penalty
+        for name, term in terms.items():
+            loss = loss if name == "rgb" else loss + term
         return loss, stats
 
     def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:

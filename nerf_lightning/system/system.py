@@ -2,9 +2,9 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -42,6 +42,8 @@ class StepStats:
     """Squared error of each ray, on the device."""
     whole: Bool[Tensor, "R"] | None = None
     """Which rays have all their samples; None for all."""
+    terms: Mapping[str, Tensor] = field(default_factory=dict)
+    """What the loss is the sum of, by name, on the device."""
 
     @property
     def counted(self) -> bool:

@@ -23,7 +23,7 @@ def run(cfg: DictConfig) -> float:
     hydra: Any = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
     if cfg.resume is not None:
-        with owned(folder, resumed=True):
+        with owned(folder):
             return train(cfg)
     timed = "${now:" in str(OmegaConf.to_container(hydra.run, resolve=False))
     with own_folder(folder, cfg.overwrite, renamed=timed) as place:

@@ -1,14 +1,78 @@
-"""Where curves go besides TensorBoard and CSV files: services whose packages are extras."""
+"""Where curves go: TensorBoard, and services whose packages are extras."""
 
+import functools
 import os
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from lightning.pytorch.loggers import MLFlowLogger, WandbLogger
+from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.utilities import rank_zero_only
 
+from nerf_lightning.callbacks.throughput import TRAIN_SECONDS
 from nerf_lightning.utils.libraries import require
+
+OPTIONS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget", "method", "recipe", "seed")
+"""What services are told of the configuration."""
+FIGURES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
+"""And of the results."""
+
+
+class TensorBoard(TensorBoardLogger):
+    """TensorBoard with one event file a run, and times that are seconds of training.
+
+    Figures logged with `TRAIN_SECONDS` are dated by it: on TensorBoard's axis RELATIVE they run over training time.
+    """
+
+    @functools.cached_property
+    def began(self) -> float:
+        return time.time()
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        seconds = metrics.get(TRAIN_SECONDS)
+        date = None if seconds is None else self.began + seconds
+        for name, value in metrics.items():
+            self.experiment.add_scalar(name, value, step, walltime=date)
+
+    @rank_zero_only
+    def log_config(self, file: Path) -> None:
+        """Shows a run's configuration among the texts."""
+        lines = file.read_text(encoding="utf-8").splitlines()
+        self.experiment.add_text("config", "\n".join(f"    {line}" for line in lines))  # indented: Markdown's code
+
+    @rank_zero_only
+    def log_summary(self, options: Mapping[str, Any], results: Mapping[str, Any]) -> None:
+        """Fills the tab HParams and closes the file. PSNR and seconds are there as curves, whose last values it shows."""
+        from torch.utils.tensorboard.summary import hparams
+
+        told = {key: options.get(key) or "" for key in ("method", "recipe")}
+        told |= {"seed": options["seed"], "bytes": results["artifact_bytes"]}
+        for summary in hparams(told, dict.fromkeys(("val/psnr", TRAIN_SECONDS), 0.0)):
+            self.experiment.file_writer.add_summary(summary)
+        self.experiment.close()
+
+    def save(self) -> None:
+        """Writes no hparams.yaml: a run's config.yaml has all."""
+
+    @rank_zero_only
+    def finalize(self, status: str) -> None:
+        """Closes the file of a run that failed; testing goes on writing after training."""
+        if status != "success":
+            self.experiment.close()
+
+
+def log_summary(logger: Logger, options: Mapping[str, Any], results: Mapping[str, Any]) -> None:
+    """Writes a run's options and final figures, and closes the logger."""
+    if isinstance(logger, TensorBoard):
+        logger.log_summary(options, results)
+        return
+    logger.log_hyperparams({key: options[key] for key in OPTIONS if options.get(key) is not None})
+    logger.log_metrics({f"final/{key}": results[key] or 0.0 for key in FIGURES}, results["steps"])
+    logger.finalize("success")
 
 
 def wandb(

@@ -84,7 +84,7 @@ def trained(cfg: "DictConfig", folder: Path) -> float | None:
         told = "without a figure" if done.psnr is None else f"{done.psnr:.2f} dB"
         print(f"{folder.name}: done before ({done.status}, {told})", flush=True)
         return done.psnr
-    print(f"{folder.name}: {'starts' if checkpoint is None else 'goes on from its last checkpoint'}", flush=True)
+    print(f"{folder.name}: {'starts' if checkpoint is None else 'continues from its last checkpoint'}", flush=True)
     return train(cfg, checkpoint)
 
 
@@ -119,30 +119,6 @@ def write_table(root: Path, runs: Sequence[Run]) -> None:
             writer.writerow([run.folder.relative_to(root), run.status, *values, *figures, run.diagnosis])
 
 
-def print_table(root: Path, runs: Sequence[Run]) -> None:
-    """Prints the same table, best first."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=str(root))
-    for heading in ("job", "status", "dB", "seconds", "steps", "parameters"):
-        table.add_column(heading, overflow="fold", justify="left" if heading in ("job", "status") else "right")
-
-    def cell(value: Any, digits: int = 0) -> str:
-        return f"{value:,.{digits}f}" if isinstance(value, int | float) else "-"
-
-    for run in sorted(runs, key=lambda run: float("-inf") if run.psnr is None else run.psnr, reverse=True):
-        name = str(run.folder.relative_to(root))
-        seconds, steps, parameters = (run.results.get(key) for key in ("train_seconds", "steps", "parameters"))
-        figures = [cell(run.psnr, 2), cell(seconds, 1), cell(steps), cell(parameters)]
-        table.add_row(name, run.status, *figures)
-    console = Console()
-    console.print(table)
-    for run in runs:
-        if run.diagnosis:
-            console.print(f"{run.folder.relative_to(root)}: {run.diagnosis}", style="dim", markup=False, soft_wrap=True)
-
-
 def count_jobs(config: "DictConfig") -> int | None:
     """Number of jobs of a sweep over a grid; None where the sweeper chooses them as it goes."""
     if not config.hydra.sweeper._target_.endswith("BasicSweeper"):
@@ -154,7 +130,7 @@ def count_jobs(config: "DictConfig") -> int | None:
 
 
 class SweepReport(Callback):
-    """Hydra's hooks around the jobs: progress, then table, figure, and exit code 1 if a job failed."""
+    """Hydra's hooks around the jobs: progress, then their comparison, and exit code 1 if a job failed."""
 
     def __init__(self) -> None:
         self.jobs: int | None = None
@@ -173,19 +149,19 @@ class SweepReport(Callback):
             print(f"job {number + 1} of {self.jobs}{words}", flush=True)
 
     def on_multirun_end(self, config: "DictConfig", **kwargs: Any) -> None:
-        from nerf_lightning.gallery.figure import write_contact_figure
+        from nerf_lightning.compare.references import PUBLISHED, read_references
+        from nerf_lightning.compare.report import write_comparison
 
         root = Path(config.hydra.sweep.dir)
         runs = find_runs(root)
         write_table(root, runs)
-        print_table(root, runs)
         done = [run for run in runs if run.status in (*FINISHED, "stopped_early") and not (run.folder / ERROR).exists()]
         going = [run for run in runs if run.status == "unfinished"]
         stopped = [run for run in runs if run.status == "interrupted"]
         failed = [run for run in runs if run not in (*done, *going, *stopped)]
         try:
-            print(f"table: {root / TABLE}; figure: {write_contact_figure(root, runs)}")
-            print(f"speed against accuracy: nerf_lightning compare {root}")
+            write_comparison(runs, root, read_references(PUBLISHED))
+            print(f"{root / TABLE}: a line for each job")
         finally:
             ended = ((failed, "failed"), (going, "have not ended"), (stopped, f"were interrupted ({CONTINUE})"))
             for some, what in ended:

@@ -43,7 +43,7 @@ from nerf_lightning.runs.owner import clear
 from nerf_lightning.runs.scene_file import load_scene, save_scene
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND, check_compiler
-from nerf_lightning.training.loggers import finishing_wandb
+from nerf_lightning.training.loggers import TensorBoard, finishing_wandb, log_summary
 from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.machine import CROWDED, crowding
 from nerf_lightning.utils.memory import check_memory, keep_freed_memory, out_of_memory
@@ -52,14 +52,11 @@ from nerf_lightning.utils.progress import animates
 from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.utils.text import join_truncated
 
-SCORES = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
-"""Figures logged beside the options, as in TensorBoard's HParams tab."""
 MAX_NAMED = 10
 """Photos that do not fit which are printed; all stand in results.json."""
 log = logging.getLogger(__name__)
 Threads = Annotated[Count, AtMost(1024)]
 """Threads of one process; beyond, starting them fails on common systems, and ends the process."""
-GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
 
 
 class Described(L.Callback):
@@ -72,6 +69,8 @@ class Described(L.Callback):
         save_config(self.cfg, self.folder)
         save_scene(self.data, self.folder)
         link_latest(self.folder)
+        if isinstance(trainer.logger, TensorBoard):
+            trainer.logger.log_config(self.folder / "config.yaml")
 
 
 @finishing_wandb()
@@ -123,7 +122,7 @@ def train(
     if trainer.is_global_zero:
         report_photos(system, data, results, folder)
         if trainer.logger is not None:
-            log_hyperparameters(trainer.logger, cfg, results.summary)
+            log_summary(trainer.logger, resolved(cfg), results.summary)
         report(results.summary, folder, trainer.logger)
     live = attached(trainer, Live)
     if live is not None:
@@ -147,8 +146,7 @@ def prepare_system(
 ) -> System:
     """The system to train, if it fits into memory and the data."""
     system = build_system(cfg, frame_of(data), device)
-    what = "numbers, with their gradients and moments,"
-    check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
+    check_field_memory(system, device)
     if isinstance(system, NeRF3D) and system.corrections is not None and poses_are_off:
         system.corrections.begin_poses()
     system.backend = BACKEND if cfg.compile else None
@@ -156,6 +154,16 @@ def prepare_system(
         log.info("model: %s", system.field.sizing)
     check_background(cfg, data, system)
     return system
+
+
+def check_field_memory(system: System, device: torch.device) -> None:
+    """Refuses a field that, trained at its largest, needs more memory than is free.
+
+    Raises:
+        InputError: where it does.
+    """
+    what = "numbers, with their gradients and moments,"
+    check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
 
 
 def fit(
@@ -282,20 +290,6 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
         elif isinstance(trial, NeRF2D):
             uv, rgb = torch.rand(64, 5, generator=step_generator(0, Stream.BATCH, 0)).to(device).split([2, 3], dim=1)
             trial.loss(PixelBatch(uv, rgb)).backward()
-
-
-def log_hyperparameters(logger: L.pytorch.loggers.Logger, cfg: DictConfig, results: dict) -> None:
-    """Writes the run's options and final figures, for TensorBoard to its HParams tab."""
-    plain = resolved(cfg)
-    options = {group: plain[group] for group in GROUPS if plain.get(group) is not None}
-    params = {**options, "method": cfg.method, "scene": results["scene"]["name"], "seed": cfg.seed}
-    metrics = {f"final/{key}": results[key] or 0.0 for key in SCORES}
-    if isinstance(logger, L.pytorch.loggers.TensorBoardLogger):
-        logger.log_hyperparams(params, metrics)
-    else:
-        logger.log_hyperparams(params)
-        logger.log_metrics(metrics, results["steps"])
-    logger.finalize("success")
 
 
 def test_words(test: dict | None) -> str:

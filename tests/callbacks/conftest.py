@@ -50,7 +50,8 @@ class Scripted(NeRF2D):
         super().__init__(Grey(), functools.partial(torch.optim.SGD, lr=0.1), constant)
         self.psnrs = iter(range(10, 1000))
         self.asked: list[Any] = []
-        self.stats = StepStats(torch.tensor(0.01, dtype=torch.float64), 30, 90)
+        mse = torch.tensor(0.01, dtype=torch.float64)
+        self.stats = StepStats(mse, 30, 90, terms={"rgb": mse})
         self.groups = [{"lr": 0.1}]
 
     @property

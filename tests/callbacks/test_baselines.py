@@ -1,8 +1,6 @@
 import json
 import math
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -32,7 +30,7 @@ def all_jpegs(sunset: np.ndarray) -> list[dict]:
     return [{"quality": q, "bytes": size, "psnr": quality_of(image, sunset)} for q, size, image in coded]
 
 
-def test_quality_is_in_decibels_and_none_where_nothing_is_lost(sunset):
+def test_quality_of_lossless_is_none(sunset):
     assert quality_of(sunset, sunset.copy()) is None and words(None) == "without loss"
     assert quality_of(sunset, np.where(sunset > 127, sunset - 1, sunset + 1).astype(np.uint8)) == pytest.approx(
         20 * math.log10(255), abs=1e-4
@@ -40,53 +38,27 @@ def test_quality_is_in_decibels_and_none_where_nothing_is_lost(sunset):
     assert words(48.1308) == "48.13 dB"
 
 
-def test_a_jpeg_keeps_the_colours_and_its_bytes_are_counted(sunset):
-    orange = np.full((16, 16, 3), (230, 120, 20), np.uint8)
-    for sampling in SAMPLINGS:
-        size, decoded = jpeg(orange, 95, sampling)
-        assert np.abs(decoded.astype(int) - orange).max() < 6 and size < orange.nbytes + 700
-    sizes = [jpeg(sunset, quality, SAMPLINGS[0])[0] for quality in (10, 50, 90)]
-    assert sizes == sorted(set(sizes))
-    assert jpeg(sunset, 90, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)[0] > sizes[-1], "colours at half resolution are less"
-
-
-@pytest.mark.parametrize("limit", [800, 1000, 1500, 2500, 4000, 10**6])
-def test_the_best_jpeg_of_a_size_is_the_best_of_all(limit: int, sunset, all_jpegs):
+@pytest.mark.parametrize("limit", [1000, 2500, 10**6])
+def test_best_jpeg_of_size_is_best_of_all(limit: int, sunset, all_jpegs):
     found = best_jpeg(sunset, limit)
     assert found in all_jpegs and found["bytes"] <= limit
     assert found["psnr"] == max(one["psnr"] for one in all_jpegs if one["bytes"] <= limit)
 
 
-def test_more_bytes_make_a_better_jpeg(sunset):
-    qualities = [best_jpeg(sunset, limit)["psnr"] for limit in range(800, 4000, 400)]
-    assert qualities == sorted(qualities) and qualities[-1] > qualities[0] + 5
-
-
-def test_a_limit_below_every_jpeg_has_none(sunset, all_jpegs):
+def test_best_jpeg_below_smallest_is_none(sunset, all_jpegs):
     smallest = min(one["bytes"] for one in all_jpegs)
     assert best_jpeg(sunset, smallest - 1) is None and best_jpeg(sunset, smallest)["bytes"] == smallest
     assert best_jpeg(sunset, 0) is None
 
 
-@pytest.mark.parametrize("wanted", [5.0, 20.0, 27.0, 33.0])
-def test_a_jpeg_as_good_is_the_smallest_of_them(wanted: float, sunset, all_jpegs):
+@pytest.mark.parametrize("wanted", [20.0, 33.0])
+def test_jpeg_as_good_is_smallest_of_them(wanted: float, sunset, all_jpegs):
     found = jpeg_as_good(sunset, wanted)
     assert found in all_jpegs and found["psnr"] >= wanted
     assert found["bytes"] == min(one["bytes"] for one in all_jpegs if one["psnr"] >= wanted)
 
 
-def test_where_no_jpeg_is_as_good_there_is_none(sunset):
-    assert jpeg_as_good(sunset, 100.0) is None
-    grey = np.full((16, 16, 3), 128, np.uint8)
-    assert jpeg_as_good(grey, 100.0)["psnr"] is None, "one without loss is good enough for all"
-
-
-def test_a_picture_of_all_its_bytes_loses_nothing(sunset):
-    for limit in (sunset.nbytes, 10 * sunset.nbytes):
-        assert shrunk(sunset, limit) == {"width": 40, "height": 40, "bytes": 4800, "psnr": None}
-
-
-def test_a_picture_shrinks_to_the_bytes_in_its_proportions(sunset):
+def test_shrunk_picture_keeps_proportions_within_bytes(sunset):
     wide = sunset[:20]
     assert [shrunk(wide, 2400 // n**2)["width"] for n in (1, 2, 4, 5)] == [40, 20, 10, 8]
     found = [shrunk(wide, limit) for limit in (3, 30, 100, 700, 1500, 2399)]
@@ -94,18 +66,6 @@ def test_a_picture_shrinks_to_the_bytes_in_its_proportions(sunset):
         assert one["bytes"] == 3 * one["width"] * one["height"] <= limit
     qualities = [one["psnr"] for one in found]
     assert qualities == sorted(qualities) and qualities[-1] > qualities[0] + 3
-
-
-def test_a_shrunk_picture_is_averaged_and_enlarged_smoothly():
-    ramp = np.repeat(np.arange(0, 256, 4, dtype=np.uint8)[None, :, None], 64, axis=0).repeat(3, axis=2)
-    assert shrunk(ramp, ramp.nbytes // 4)["psnr"] > 50, "nothing of a ramp is lost but at the borders"
-    stripes = np.zeros((64, 64, 3), np.uint8)
-    stripes[:, ::2] = 200
-    assert shrunk(stripes, stripes.nbytes // 4)["psnr"] == pytest.approx(20 * math.log10(255 / 100), abs=0.1)
-
-
-def test_a_thin_picture_shrinks_to_the_bytes_too():
-    assert shrunk(np.zeros((1, 100, 3), np.uint8), 75)["bytes"] <= 75
 
 
 def results_with(size: int, quality: float | None) -> Results:
@@ -120,10 +80,9 @@ def results_with(size: int, quality: float | None) -> Results:
         (2000, 25.0, ["JPEG 3", "interpolation 2", "as good as the field"]),
         (2000, None, ["JPEG 3", "interpolation 2"]),
         (100, 25.0, ["JPEG none that small", "interpolation 1"]),
-        (10**6, 90.0, ["interpolation without loss"]),
     ],
 )
-def test_a_run_is_compared_with_the_same_bytes(size, quality, said, sunset, trainer_with, system, tmp_path, capsys):
+def test_baselines_after_test_compare_same_bytes(size, quality, said, sunset, trainer_with, system, tmp_path, capsys):
     trainer = trainer_with(results_with(size, quality))
     trainer.datamodule = from_picture(max_side=40)
     Baselines("same.json").on_test_end(trainer, system)
@@ -139,11 +98,3 @@ def test_a_run_is_compared_with_the_same_bytes(size, quality, said, sunset, trai
     told = capsys.readouterr().out
     assert all(part in told for part in said), told
     assert ("as good as" in told) == (found["jpeg_as_good"] is not None)
-
-
-def test_there_is_nothing_to_compare_without_results_or_in_a_second_process(trainer_with, system, tmp_path: Path):
-    Baselines().on_test_end(trainer_with(), system)
-    trainer = trainer_with(results_with(2000, 25.0))
-    trainer.is_global_zero = False
-    Baselines().on_test_end(trainer, system)
-    assert not list(tmp_path.iterdir())

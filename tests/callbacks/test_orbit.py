@@ -14,12 +14,12 @@ from nerf_lightning.training.train import train
     ("share", "expected"),
     [(1.0, (60, 1.0)), (0.5, (30, 1.0)), (0.2, (12, 1.0)), (0.05, (12, 0.5)), (1e-6, (12, 0.25))],
 )
-def test_frames_become_fewer_and_then_smaller(share: float, expected: tuple[int, float]):
+def test_fit_orbit_little_time_lowers_frames_then_size(share: float, expected: tuple[int, float]):
     assert fit_orbit(60, share) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("asked", "frames", "width"), [("null", 12, 8), ("3", 3, 32)])
-def test_a_slow_field_gets_a_small_orbit(asked: str, frames: int, width: int, tmp_path: Path, monkeypatch, capsys):
+def test_orbit_slow_field_is_small(asked: str, frames: int, width: int, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setattr("nerf_lightning.callbacks.budget.Budget.render_seconds", lambda self, step: 1e-9)
     off = ["callbacks.heldout=null", "callbacks.snapshots=null", "~logger"]
     train(composed(["+experiment=smoke_3d", "budget.steps=2", f"callbacks.orbit.frames={asked}", *off], tmp_path))

@@ -1,19 +1,14 @@
-import dataclasses
 from pathlib import Path
-from unittest.mock import Mock
 
 import imageio.v3 as imageio
-import lightning as L
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from nerf_lightning.callbacks import Budget, PictureCharts, Results, Snapshots, TrainingGif
+from nerf_lightning.callbacks import PictureCharts, Results, Snapshots, TrainingGif
 from nerf_lightning.callbacks.picture.charts import curve_chart, error_chart
-from nerf_lightning.callbacks.snapshots import LOGGED_WIDTH
-from nerf_lightning.drawing.panels import WIDEST, narrowed, to_bytes
-from nerf_lightning.errors import InputError
+from nerf_lightning.drawing.panels import narrowed
 
 CURVE = [[0.5, 10, 20.0], [1.5, 100, 25.0], [4.0, 300, 31.0]]
 
@@ -21,7 +16,7 @@ CURVE = [[0.5, 10, 20.0], [1.5, 100, 25.0], [4.0, 300, 31.0]]
 # error.png, spectrum.png, curve.png
 
 
-def test_the_error_map_shows_every_pixels_error_on_a_scale_in_bytes():
+def test_error_chart_shows_error_of_each_pixel():
     truth = torch.zeros(20, 30, 3)
     rgb = truth.clone()
     rgb[3, 7] = torch.tensor([0.1, -0.2, 0.3])
@@ -36,12 +31,7 @@ def test_the_error_map_shows_every_pixels_error_on_a_scale_in_bytes():
     assert figure.axes[0].get_title() == "sunset"
 
 
-def test_a_map_without_any_error_is_drawn():
-    low, high = error_chart(torch.ones(2, 3, 3), torch.ones(2, 3, 3), "").axes[0].images[0].get_clim()
-    assert low == 0 < high
-
-
-def test_the_curve_runs_over_seconds_and_over_steps():
+def test_curve_chart_runs_over_seconds_and_steps():
     figure = curve_chart(CURVE, "sunset")
     for axes, column in zip(figure.axes, (0, 1), strict=True):
         (line,) = axes.lines
@@ -64,7 +54,7 @@ def results_with(curve: list[list[float]]) -> Results:
         ([], {"error.png", "spectrum.png"}),
     ],
 )
-def test_charts_are_written_after_the_test(found, files, clock, system, trainer_with, tmp_path: Path):
+def test_picture_charts_after_test_are_written(found, files, clock, system, trainer_with, tmp_path: Path):
     charts = PictureCharts("charts")
     charts.on_test_end(trainer_with(*found, charts), system)
     assert {path.name for path in (tmp_path / "charts").iterdir()} == files
@@ -76,45 +66,12 @@ def test_charts_are_written_after_the_test(found, files, clock, system, trainer_
 # final.png, and what TensorBoard gets
 
 
-def test_the_latest_render_stands_alone(clock, system, trainer_with, tmp_path: Path):
-    snapshots, taken = Snapshots(steps=[1, 2], final="latest.png"), []
-    trainer, evaluate = trainer_with(Budget(steps=9), snapshots), system.evaluate
-
-    def noted(view: int):
-        taken.append(dataclasses.replace(evaluate(view), truth=torch.zeros(12, 16, 3)))
-        return taken[-1]
-
-    system.evaluate = noted
-    for trainer.global_step in (1, 2):
-        snapshots.on_train_batch_end(trainer, system, None, None, 0)
-        assert np.array_equal(imageio.imread(tmp_path / "latest.png"), to_bytes(taken[-1].rgb))
-    assert len(taken) == 3 and len(list((tmp_path / "snapshots").iterdir())) == 2
-
-
-def test_tensorboard_gets_a_narrower_snapshot(clock, system, trainer_with, tmp_path: Path):
-    trainer = trainer_with(Budget(steps=9), snapshots := Snapshots())
-    trainer.logger = Mock(spec=L.pytorch.loggers.TensorBoardLogger)
-    trainer.global_step = 10
-    snapshots.on_train_batch_end(trainer, system, None, None, 0)
-    written = imageio.imread(tmp_path / "snapshots" / "step_0000010.png")
-    (_, logged, step), _ = trainer.logger.experiment.add_image.call_args
-    assert step == 10 and logged.shape[1] == LOGGED_WIDTH < written.shape[1]
-    trainer.logger.experiment.flush.assert_called_once()
-
-
 @pytest.mark.parametrize(
     ("height", "width", "most", "size"),
     [(40, 60, 60, (40, 60)), (40, 60, 100, (40, 60)), (40, 60, 30, (20, 30)), (2, 60, 6, (1, 6)), (5, 3, 1, (2, 1))],
 )
-def test_pictures_are_narrowed_in_proportion(height: int, width: int, most: int, size: tuple[int, int]):
+def test_narrowed_keeps_proportion(height: int, width: int, most: int, size: tuple[int, int]):
     assert narrowed(np.zeros((height, width, 3), np.uint8), most).shape == (*size, 3)
-
-
-def test_narrowing_averages():
-    stripes = np.zeros((8, 8, 3), np.uint8)
-    stripes[:, ::2] = 200
-    assert (narrowed(stripes, 4) == 100).all()
-    assert narrowed(stripes, 8) is stripes
 
 
 # training.gif
@@ -137,9 +94,7 @@ def frames_of(path: Path) -> list[tuple[int, int, tuple[int, int]]]:
     return frames
 
 
-def test_a_gif_shows_the_snapshots_in_order_and_the_last_one_three_times_as_long(
-    trainer_with, system, tmp_path: Path, monkeypatch
-):
+def test_training_gif_shows_snapshots_in_order(trainer_with, system, tmp_path: Path, monkeypatch):
     levels, glob = [10, 200, 60, 120], Path.glob
     write_snapshots(tmp_path / "shots", levels)
     # Folders list their files in any order.
@@ -155,54 +110,9 @@ def test_a_gif_shows_the_snapshots_in_order_and_the_last_one_three_times_as_long
         assert made.info["loop"] == 0, "for ever"
 
 
-def test_a_gif_is_narrower_than_the_snapshots(trainer_with, system, tmp_path: Path):
-    write_snapshots(tmp_path / "snapshots", [10, 200], height=20, width=60)
-    TrainingGif(width=30).on_test_end(trainer_with(Snapshots()), system)
-    assert [size for _, _, size in frames_of(tmp_path / "training.gif")] == [(30, 10)] * 2
-
-
 @pytest.mark.parametrize("levels", [None, []])
-def test_without_snapshots_there_is_no_gif(levels, trainer_with, system, tmp_path: Path):
+def test_training_gif_without_snapshots_is_not_written(levels, trainer_with, system, tmp_path: Path):
     if levels is not None:
         write_snapshots(tmp_path / "snapshots", levels)
     TrainingGif().on_test_end(trainer_with(*([] if levels is None else [Snapshots()])), system)
     assert not list(tmp_path.rglob("*.gif"))
-
-
-@pytest.mark.parametrize(("options", "key"), [({"fps": 0}, "fps"), ({"fps": -1.0}, "fps"), ({"width": 0}, "width")])
-def test_a_gif_that_cannot_be_is_refused(options: dict, key: str):
-    with pytest.raises(InputError, match=f"callbacks.training_gif.{key}"):
-        TrainingGif(**options)
-
-
-@pytest.mark.parametrize("make", [PictureCharts, TrainingGif])
-def test_only_the_first_process_writes(make, trainer_with, system, tmp_path: Path):
-    write_snapshots(tmp_path / "snapshots", [10, 20])
-    before = sorted(tmp_path.rglob("*"))
-    trainer = trainer_with(Snapshots())
-    trainer.is_global_zero = False
-    make().on_test_end(trainer, system)
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize(("height", "width"), [(3000, 5), (5, 3000)])
-def test_charts_of_thin_pictures_stay_of_a_size_to_look_at(height: int, width: int):
-    figure = error_chart(torch.zeros(height, width, 3), torch.ones(height, width, 3), "")
-    assert all(2 <= side <= 25 for side in figure.get_size_inches())
-
-
-def test_the_error_of_a_large_picture_is_averaged_at_its_place():
-    rgb = torch.zeros(8, 2 * WIDEST, 3)
-    rgb[:, WIDEST:] = 10 / 255
-    axes = error_chart(rgb, torch.zeros_like(rgb), "").axes[0]
-    (shown,) = axes.images
-    assert shown.get_array().shape == (4, WIDEST)
-    assert shown.get_array()[:, : WIDEST // 2].max() == 0
-    np.testing.assert_allclose(shown.get_array()[:, WIDEST // 2 :], 10, rtol=1e-5)
-    assert axes.get_xlim() == (-0.5, 2 * WIDEST - 0.5) and axes.get_ylim() == (7.5, -0.5), "in the picture's pixels"
-
-
-def test_a_curve_that_took_no_time_is_drawn_all_the_same():
-    figure = curve_chart([[0.0, 0, 10.0], [0.0, 1, 12.0]], "")
-    seconds, steps = figure.axes
-    assert not seconds.lines and list(steps.lines[0].get_xdata()) == [1]

@@ -7,18 +7,14 @@ from nerf_lightning.utils.progress import clock as in_words
 @pytest.mark.parametrize(
     ("seconds", "expected"),
     [
-        (0, "0:00"),
-        (0.4, "0:00"),
         (9, "0:09"),
         (59.4, "0:59"),
         (59.6, "1:00"),
-        (123, "2:03"),
         (3599.6, "1:00:00"),
         (3723, "1:02:03"),
-        (360_000, "100:00:00"),
     ],
 )
-def test_clock(seconds, expected):
+def test_clock_formats_seconds(seconds, expected):
     assert in_words(seconds) == expected
 
 

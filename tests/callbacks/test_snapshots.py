@@ -7,19 +7,17 @@ from nerf_lightning.callbacks.snapshots import log_spaced
 from nerf_lightning.errors import InputError
 
 
-def test_log_spaced():
+def test_log_spaced_steps_are_1_2_5():
     assert list(islice(log_spaced(), 8)) == [10, 20, 50, 100, 200, 500, 1000, 2000]
 
 
 @pytest.mark.parametrize(("steps", "expected"), [(None, [10, 20, 50, 100]), ([1, 7], [1, 7]), ([], [])])
-def test_due(steps, expected):
+def test_snapshots_due_at_given_steps(steps, expected):
     snapshots = Snapshots(steps=steps)
     assert [step for step in range(150) if snapshots.due(step)] == expected
 
 
-def test_pictures_are_written_when_due_and_at_the_end_without_costing_training_time(
-    clock, system, trainer_with, tmp_path
-):
+def test_snapshots_are_written_when_due_with_clock_stopped(clock, system, trainer_with, tmp_path):
     budget, snapshots = Budget(steps=9), Snapshots("pictures", steps=[2, 4], view=3)
     trainer = trainer_with(budget, snapshots)
     budget.on_train_start(trainer, system)
@@ -36,6 +34,6 @@ def test_pictures_are_written_when_due_and_at_the_end_without_costing_training_t
 
 
 @pytest.mark.parametrize("view", [-1, 10])
-def test_a_view_that_is_not_there_is_refused(view, trainer_with):
+def test_snapshots_missing_view_is_refused(view, trainer_with):
     with pytest.raises(InputError, match="callbacks.snapshots.view"):
         Snapshots(view=view).check(trainer_with().datamodule)

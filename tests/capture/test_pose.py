@@ -4,6 +4,7 @@ import numpy as np
 from capture.views import LENS, SIX, SIZE, camera, cameras, sightings
 
 from benchmarks.capture import flips_of_walk
+from nerf_lightning.capture.poses.flips import resolve_flips
 from nerf_lightning.capture.poses.geometry import (
     angle_between,
     folds,
@@ -14,9 +15,6 @@ from nerf_lightning.capture.poses.geometry import (
     to_vector,
 )
 from nerf_lightning.capture.poses.pose import mark_poses, photo_poses
-from nerf_lightning.capture.poses.smooth import Walk, Windows
-from nerf_lightning.capture.poses.swing import places_around
-from nerf_lightning.capture.poses.walk import choose
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import SQUARE
 
@@ -76,44 +74,13 @@ def test_photos_in_random_order_say_nothing_of_each_other():
     assert found["in_order"] <= found["alone"]
 
 
-def test_a_swing_around_a_tag_passes_both_solutions():
-    pose = camera([0.1, 0.06, 0.5], [0.01, 0, 0], roll=0.4)
-    points = SIZE * SQUARE
-    pixels = project(LENS, inverse(pose), points) + 0.5 * np.random.default_rng(0).standard_normal((4, 2))
-    options = mark_poses(LENS, Mark(points, pixels))
-    assert len(options) == 2
-    found = places_around(LENS, np.stack([h.pose for h in options]), points, pixels, 0.25)
-    assert found.squares.min() < options[0].squares + 0.1
-    for option in options:
-        off = np.linalg.norm(found.centres - inverse(option.pose)[:3, 3], axis=1)
-        nearest = off.argmin()
-        assert off[nearest] < 0.02  # of half a metre: two degrees
-        assert abs(found.squares[nearest] - option.squares) < 0.5
-
-
 def test_photos_without_order_keep_their_best():
     c2w, rng = cameras(15, 5, tilt=45), np.random.default_rng(7)
     points = SIX.corners(4)
     seen = [(points, project(LENS, inverse(pose), points) + 0.1 * rng.standard_normal((4, 2))) for pose in c2w]
     options = [mark_poses(LENS, Mark(SIZE * SQUARE, pixels)) for _, pixels in seen]
     world = [(SIZE * SQUARE, pixels) for _, pixels in seen]
-    assert choose(LENS, options, world) == [0] * 15
-
-
-def test_windows_of_photos_give_what_all_photos_at_once_give():
-    rng, count, walk = np.random.default_rng(2), 150, Walk(0.2, 3.0, 2.5)
-    root = 5 * rng.standard_normal((count, 2, 2))
-    precision, pull = root @ root.swapaxes(1, 2) + np.eye(2), rng.standard_normal((count, 2))
-    windows = Windows.of(count)
-    assert windows.core.sum() == count and np.array_equal(np.sort(windows.rows[windows.core]), np.arange(count))
-    mean, covariance = windows.marginals(walk, precision, pull)
-    K = np.kron(walk.covariance(np.subtract.outer(np.arange(count), np.arange(count)).astype(float)), np.eye(2))
-    P = np.zeros((count, 2, count, 2))
-    P[np.arange(count), :, np.arange(count)] = precision
-    exact = np.linalg.inv(np.linalg.inv(K) + P.reshape(2 * count, -1))
-    np.testing.assert_allclose(mean, (exact @ pull.reshape(-1)).reshape(count, 2), atol=2e-3)
-    blocks = exact.reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
-    np.testing.assert_allclose(covariance, blocks, atol=0.03 * blocks.max())  # a window knows its middle less
+    assert resolve_flips(LENS, options, world) == [0] * 15
 
 
 def test_a_lens_that_folds_the_picture_is_told():

@@ -15,7 +15,7 @@ from nerf_lightning.capture.pack import pack
 from nerf_lightning.capture.poses.calibrate import calibrate
 from nerf_lightning.capture.poses.geometry import inverse, project
 from nerf_lightning.capture.poses.solve import solve
-from nerf_lightning.capture.report.contact_sheet import MOST, annotated, contact_sheet, heading
+from nerf_lightning.capture.report.contact_sheet import MOST, annotated, heading, tag_sheet
 from nerf_lightning.capture.report.coverage_chart import displacement, parameters
 from nerf_lightning.capture.report.error_chart import cell_means, corners_and_residuals, error_chart
 from nerf_lightning.capture.report.write import tag_corners, write_report
@@ -183,7 +183,7 @@ def test_many_photos_are_thinned_out_evenly_but_those_left_out_stay():
 def test_a_large_capture_makes_a_sheet_of_readable_size(tmp_path):
     path = stub(tmp_path / "x.png", 32, 24)
     one = Outcome(1, path, {}, {}, 0.1, "")
-    pages = [pixels_of(contact_sheet({"photos": [one] * count}, 4 / 3)) for count in (MOST, 500)]
+    pages = [tag_sheet({"photos": [one] * count}, 4 / 3) for count in (MOST, 500)]
     assert abs(pages[0].shape[0] - pages[1].shape[0]) < 50
 
 
@@ -193,8 +193,8 @@ def test_names_that_would_trip_the_font_are_drawn(tmp_path):
     assert shortened("abcdefghijk", 10) == "abcd…ghijk"
     path = stub(tmp_path / "a$^{_\u5bb6$.png", 32, 24)
     outcomes = [Outcome(n, path, {}, {}, None, "no $tag_ found") for n in (1, 2)]
-    for figure in (contact_sheet({"photos": outcomes}, 4 / 3), error_chart({"photos": outcomes}, LENS)):
-        assert pixels_of(figure).std() > 1
+    for picture in (tag_sheet({"photos": outcomes}, 4 / 3), pixels_of(error_chart({"photos": outcomes}, LENS))):
+        assert picture.std() > 1
 
 
 def test_magnification_takes_round_steps():

@@ -15,7 +15,7 @@ from nerf_lightning.cli.check import check
 from nerf_lightning.dataset import Views, open_scene
 from nerf_lightning.drawing.camera_map import camera_map
 from nerf_lightning.errors import InputError
-from nerf_lightning.stability.toys import PILE, around, photograph
+from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
 from tests.dataset.colmap_files import cameras_of, photos, write_colmap
 
 Edit = Callable[[np.ndarray], np.ndarray]
@@ -24,8 +24,8 @@ Edit = Callable[[np.ndarray], np.ndarray]
 @pytest.fixture(scope="module")
 def views() -> Views:
     """A pile on grey grain."""
-    cameras = around(16, 96)
-    images = photograph(PILE, cameras, (0.5, 0.5, 0.5)).numpy().astype(np.int16)
+    cameras = place_cameras(16, 96)
+    images = render_photos(PILE, cameras, (0.5, 0.5, 0.5)).numpy().astype(np.int16)
     noise = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 60, (96, 96)), (0, 0), 1.0)
     grain = np.stack([np.roll(noise, 7 * i, axis=1) for i in range(16)])[..., None]
     return Views.of(torch.from_numpy((images + grain).clip(0, 255).astype(np.uint8)), cameras)

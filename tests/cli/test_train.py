@@ -125,12 +125,11 @@ def test_killed_at_any_moment_and_resumed_ends_with_the_same_weights(inside, tmp
         state = torch.load(saved[0], weights_only=True) if saved else None
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    (run,) = (tmp_path / "outputs" / "broken").iterdir()
+    run = (tmp_path / "outputs" / "broken" / "latest").resolve()
     assert not (run / "results.json").exists()
     code, _, err = inside(f"resume={run}")
     assert code == 0, err
-    (whole,) = tmp_path.glob("outputs/whole/*/checkpoints/last.ckpt")
-    (broken,) = tmp_path.glob("outputs/broken/*/checkpoints/last.ckpt")
+    whole, broken = (tmp_path / "outputs" / name / "latest/checkpoints/last.ckpt" for name in ("whole", "broken"))
     first, second = (torch.load(path, weights_only=True) for path in (whole, broken))
     assert first["global_step"] == second["global_step"] == 80
     for key, value in first["state_dict"].items():
@@ -139,7 +138,7 @@ def test_killed_at_any_moment_and_resumed_ends_with_the_same_weights(inside, tmp
 
 def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_path: Path):
     assert inside("+experiment=smoke_2d", "dataset.max_side=16", *BARE, "budget.steps=5")[0] == 0
-    (run,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
+    run = (tmp_path / "outputs" / "smoke_2d" / "latest").resolve()
     code, _, err = inside(f"resume={run}", "budget.steps=9")
     assert code == 0, err
     assert yaml.safe_load((run / "results.json").read_text())["steps"] == 9
@@ -149,14 +148,14 @@ def test_resume_takes_further_overrides_and_refuses_unknown_ones(inside, tmp_pat
     before = {name: (run / name).read_bytes() for name in ("config.yaml", "scene.json", "results.json")}
     code, _, err = inside(f"resume={run}", "model.width=24")
     assert code == 2 and "last.ckpt: found " in err and err.count("\n") == 1
-    assert {name: (run / name).read_bytes() for name in before} == before, "what goes on from this state stays"
+    assert {name: (run / name).read_bytes() for name in before} == before, "the run stays as it was"
 
 
 def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path: Path):
     small = ["+experiment=smoke_2d", "dataset.max_side=16", *BARE, "callbacks.checkpoints=null", "logger=null"]
     folder = tmp_path / "mine"
     assert inside(*small, "budget.steps=5", "callbacks.snapshots.steps=[2]", "hydra.run.dir=mine")[0] == 0
-    (folder / "notes.txt").write_text("not the run's")
+    (folder / "video.mp4").write_text("made from the run")
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     again = [*small, "budget.steps=3", "callbacks.snapshots.steps=[1]", "hydra.run.dir=mine"]
     code, _, err = inside(*again)
@@ -167,13 +166,13 @@ def test_a_folder_belongs_to_one_run_until_another_is_asked_for(inside, tmp_path
     code, _, err = inside(*again, "overwrite=true")
     assert code == 0, err
     assert sorted(path.name for path in (folder / "snapshots").iterdir()) == ["step_0000001.png", "step_0000003.png"]
-    assert sorted(path.name for path in folder.iterdir()) == [
-        *("config.yaml", "final.png", "notes.txt", "results.json", "scene.json", "snapshots")
+    assert sorted(path.name for path in folder.iterdir() if not path.name.startswith(".")) == [
+        *("config.yaml", "final.png", "results.json", "scene.json", "snapshots", "truth.png")
     ]
     assert "overwrite" not in (folder / "config.yaml").read_text()
     with owned(folder):
         code, _, err = inside(f"resume={folder}")
-    assert code == 2 and "a run that is still going on (process" in err and err.count("\n") == 1
+    assert code == 2 and "a run that is in progress" in err and err.count("\n") == 1
 
 
 def test_groups_that_can_be_left_out(inside, tmp_path: Path):
@@ -181,7 +180,7 @@ def test_groups_that_can_be_left_out(inside, tmp_path: Path):
     small = ["dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", "dataset.rays=64", "budget.steps=2"]
     code, _, err = inside(*small, "callbacks=null", "logger=null", "recipe=null", "hydra.run.dir=bare")
     assert code == 0, err
-    assert {path.name for path in (tmp_path / "bare").iterdir()} == {"config.yaml", "results.json", "scene.json"}
+    assert {path.name for path in (tmp_path / "bare").glob("[!.]*")} == {"config.yaml", "results.json", "scene.json"}
     cfg = composed(["+experiment=capture", "dataset.path=x", "callbacks=null", "refine=null"], tmp_path)
     assert cfg.callbacks is None and cfg.refine is None
 

@@ -16,8 +16,9 @@ from nerf_lightning.dataset.hypotheses import FLIP, Hypothesis, Matches, convent
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.dataset.scene import BUILT_IN
 from nerf_lightning.errors import InputError
-from nerf_lightning.stability.damage import posed, shuffled, with_focal_length
-from nerf_lightning.stability.rooms import ROOMS, photograph
+from nerf_lightning.synthetic.corruptions import change_poses, scale_focal_length, shuffle_poses
+from nerf_lightning.synthetic.objects import trace_rays
+from nerf_lightning.synthetic.rooms import ROOMS, photograph_room
 
 SIZE, FOCAL = 200, 220.0
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -145,7 +146,7 @@ def scene_of(c2w: np.ndarray, names: tuple[str, ...] = (), focal: float = 80.0, 
     """Photos of a room without bounds; every eighth is held out."""
     cameras = cameras_at(c2w, focal, width, 3 * width // 4)
     room = ROOMS["filling subject"]
-    views = Views.of(torch.stack([photograph(room, cameras, view) for view in range(len(cameras))]), cameras)
+    views = photograph_room(room, cameras)
     views = replace(views, names=names)
     held = torch.arange(len(c2w)) % 8 == 0
     bounds = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True)
@@ -177,7 +178,7 @@ def test_a_photo_with_a_wrong_pose_is_named(forward: Scene):
         c2w[3, :3, 1:3] *= -1
         return c2w
 
-    (doubt,) = check_scene(replace(forward, train=posed(forward.train, turn)))
+    (doubt,) = check_scene(replace(forward, train=change_poses(forward.train, turn)))
     assert doubt.text == "1 training photos whose poses do not fit the others: 4.png"
 
 
@@ -188,7 +189,7 @@ def spoilt(scene: Scene, change: Callable[[np.ndarray], np.ndarray]) -> Scene:
     every[order] = change(every[order])
     moved = torch.from_numpy(every).float()
     train, val = moved[: len(scene.train)], moved[len(scene.train) :]
-    return replace(scene, train=posed(scene.train, lambda _: train), val=posed(scene.val, lambda _: val))
+    return replace(scene, train=change_poses(scene.train, lambda _: train), val=change_poses(scene.val, lambda _: val))
 
 
 ORDERS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
@@ -240,17 +241,17 @@ def test_wrong_poses_are_refused_by_name(forward: Scene, change: Callable[[np.nd
 @pytest.mark.parametrize("factor", [0.1, 4.0])
 def test_a_wrong_focal_length_is_refused_with_the_right_one(forward: Scene, factor: float):
     with pytest.raises(InputError, match=f"a focal length of {80 * factor:g} pixels, where about [6-9][0-9] would fit"):
-        check_scene(with_focal_length(forward, 0, factor))
+        check_scene(scale_focal_length(forward, 0, factor))
 
 
 def test_held_out_photos_with_other_poses_are_refused(forward: Scene):
-    mixed = replace(forward, val=posed(forward.val, lambda c2w: c2w.roll(1, 0)))
+    mixed = replace(forward, val=change_poses(forward.val, lambda c2w: c2w.roll(1, 0)))
     with pytest.raises(InputError, match="held-out photos whose poses"):
         check_scene(mixed)
 
 
 def test_shuffled_poses_are_only_doubted_where_poses_are_corrected(forward: Scene):
-    (doubt,) = check_scene(shuffled(forward, 0), corrected=True)
+    (doubt,) = check_scene(shuffle_poses(forward, 0), corrected=True)
     assert doubt.inexact and doubt.far_off
     with pytest.raises(InputError, match="other convention"):
         check_scene(spoilt(forward, lambda c2w: c2w @ GL), corrected=True)
@@ -274,7 +275,7 @@ def test_matches_lie_where_the_same_point_appears(forward: Scene):
         cameras = forward.train.cameras
         column, row = torch.from_numpy(pair.places[:, 0]).long().unbind(1)
         rays = cameras.rays(torch.full_like(column, pair.first), row, column)
-        points = rays.origins + rays.directions * ROOMS["filling subject"].see(rays)[1][:, None]
+        points = rays.origins + rays.directions * trace_rays(ROOMS["filling subject"].bodies, rays)[1][:, None]
         places = cameras.project(points, pair.second)[0].numpy()
         off.append(np.linalg.norm(places - pair.places[:, 1], axis=1))
     assert np.median(np.concatenate(off)) < 1.5

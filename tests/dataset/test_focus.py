@@ -7,7 +7,7 @@ from nerf_lightning.dataset import RayDataModule, Views
 from nerf_lightning.dataset.focus import EVERY, SIDE, Focus
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.errors import InputError
-from nerf_lightning.stability.toys import MARBLE, toy
+from nerf_lightning.synthetic.objects import MARBLE, make_scene
 
 SIZES = [(40, 20), (16, 16), (7, 33)]
 
@@ -102,7 +102,7 @@ def test_an_error_that_was_not_measured_does_not_count():
 
 
 def test_data_looks_where_steps_were_wrong_and_starts_again():
-    scene = toy(MARBLE, size=32, views=4, held_out=1)
+    scene = make_scene(MARBLE, size=32, views=4, held_out=1)
     data = RayDataModule(scene, rays=500, samples=None)
     first = data.draw(0)
     for step in range(EVERY):
@@ -122,4 +122,4 @@ def test_data_looks_where_steps_were_wrong_and_starts_again():
 @pytest.mark.parametrize("focus", [-0.1, 1.0])
 def test_a_share_that_leaves_nothing_to_the_others_is_refused(focus: float):
     with pytest.raises(InputError, match="dataset.focus"):
-        RayDataModule(toy(MARBLE, size=8, views=3, held_out=1), focus=focus)
+        RayDataModule(make_scene(MARBLE, size=8, views=3, held_out=1), focus=focus)

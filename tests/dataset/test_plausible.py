@@ -16,8 +16,8 @@ from nerf_lightning.dataset.extent import border_colour
 from nerf_lightning.dataset.plausible import check_scene, off_centre
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.errors import InputError
-from nerf_lightning.stability.damage import posed, shuffled, turned_to_opengl
-from nerf_lightning.stability.toys import MARBLE, PILE, ROD, toy
+from nerf_lightning.synthetic.corruptions import change_poses, flip_axes, shuffle_poses
+from nerf_lightning.synthetic.objects import MARBLE, PILE, ROD, make_scene
 
 WHITE = (1.0, 1.0, 1.0)
 Change = Callable[[Scene], Scene]
@@ -34,17 +34,17 @@ def limited(near: float | None, far: float | None) -> Change:
 
 @pytest.fixture(scope="module")
 def pile() -> Scene:
-    return toy(PILE, size=32)
+    return make_scene(PILE, size=32)
 
 
 @pytest.mark.parametrize(
     "scene",
     [
-        lambda: toy(PILE, size=32),
-        lambda: toy(PILE, None, size=32),
-        lambda: toy(MARBLE, WHITE, size=32),
-        lambda: toy(ROD, WHITE, size=32),
-        lambda: toy(PILE, size=32, views=3),
+        lambda: make_scene(PILE, size=32),
+        lambda: make_scene(PILE, None, size=32),
+        lambda: make_scene(MARBLE, WHITE, size=32),
+        lambda: make_scene(ROD, WHITE, size=32),
+        lambda: make_scene(PILE, size=32, views=3),
         lambda: bricks(size=32, train_views=12, val_views=2),
     ],
     ids=["pile", "alpha", "white", "rod", "few", "bricks"],
@@ -54,7 +54,7 @@ def test_good_scenes_raise_no_doubt(scene: Callable[[], Scene]):
 
 
 HOPELESS: list[tuple[Change, str]] = [
-    (lambda scene: turned_to_opengl(scene, 0), "axes of the other convention"),
+    (lambda scene: flip_axes(scene, 0), "axes of the other convention"),
     (lambda scene: replace(scene, background=WHITE), "while the background is said to be"),
     (limited(0.2, 0.6), "far=0.6 cuts"),
     (limited(20.0, None), "near=20 cuts"),
@@ -74,11 +74,11 @@ def test_hopeless_scenes_are_refused(change: Change, words: str, pile: Scene):
 
 def test_photos_that_do_not_fit_are_refused(pile: Scene):
     with pytest.raises(InputError, match="belong to other photos"):
-        check_scene(shuffled(pile, 0))
+        check_scene(shuffle_poses(pile, 0))
 
 
 def test_photos_upside_down_are_warned_of_by_their_outlines(pile: Scene):
-    doubts = check_scene(replace(pile, train=posed(pile.train, upside_down)))
+    doubts = check_scene(replace(pile, train=change_poses(pile.train, upside_down)))
     assert any("outlines that no body has" in doubt.text for doubt in doubts)
 
 
@@ -92,11 +92,11 @@ def no_matches(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_outlines_tell_where_matches_do_not(pile: Scene, monkeypatch: pytest.MonkeyPatch):
     assert check_scene(pile) == []
     with pytest.raises(InputError, match="axes of the other convention.*outlines"):
-        check_scene(turned_to_opengl(pile, 0))
+        check_scene(flip_axes(pile, 0))
     with pytest.raises(InputError, match="world-to-camera matrices.*outlines"):
-        check_scene(replace(pile, train=posed(pile.train, torch.linalg.inv)))
+        check_scene(replace(pile, train=change_poses(pile.train, torch.linalg.inv)))
 
-    inexact = shuffled(pile, 0)
+    inexact = shuffle_poses(pile, 0)
     (doubt,) = check_scene(inexact)
     assert "outlines that no body has" in doubt.text and not doubt.far_off
     monkeypatch.setattr(plausible, "FITS", 0.97)
@@ -117,7 +117,7 @@ def test_hopeless_scenes_are_refused_where_poses_are_corrected_too(pile: Scene):
 
 @pytest.mark.usefixtures("no_matches")
 def test_axes_that_meet_behind_are_only_doubted_without_other_evidence(pile: Scene):
-    away = turned_to_opengl(replace(pile, bounds=Bounds(pile.bounds.aabb, unbounded=True)), 0)
+    away = flip_axes(replace(pile, bounds=Bounds(pile.bounds.aabb, unbounded=True)), 0)
     (doubt,) = check_scene(away)
     assert "100% of the cameras with their backs to the point" in doubt.text and not doubt.hopeless
 
@@ -165,7 +165,9 @@ def test_doubtful_scenes_are_warned_of(pile: Scene):
     assert "near=3.6 cuts" in doubt.text
     assert check_scene(limited(0.1, 40.0)(pile)) == [], "wider than the box: the box decides"
 
-    (doubt,) = check_scene(replace(pile, train=posed(pile.train, lambda c2w: c2w[[0, 1, 2, 3, 4, 4, *range(6, 24)]])))
+    (doubt,) = check_scene(
+        replace(pile, train=change_poses(pile.train, lambda c2w: c2w[[0, 1, 2, 3, 4, 4, *range(6, 24)]]))
+    )
     assert "1 of 24 training photos have the pose of another" in doubt.text
 
     images, poses = pile.val.images.clone(), pile.val.cameras.c2w.clone()
@@ -177,15 +179,15 @@ def test_doubtful_scenes_are_warned_of(pile: Scene):
 
 def test_the_border_tells_the_background(pile: Scene, tmp_path: Path):
     assert border_colour(pile.train) == (0.0, 0.0, 0.0)
-    assert border_colour(toy(PILE, WHITE, size=32).train) == WHITE
-    assert border_colour(toy(PILE, None, size=32).train) is None
+    assert border_colour(make_scene(PILE, WHITE, size=32).train) == WHITE
+    assert border_colour(make_scene(PILE, None, size=32).train) is None
     assert (
         border_colour(replace(pile.train, pixels=torch.randint(0, 255, pile.train.pixels.shape, dtype=torch.uint8)))
         is None
     )
 
     path = tmp_path / "white.npz"
-    save_npz(toy(MARBLE, WHITE, size=32), path)
+    save_npz(make_scene(MARBLE, WHITE, size=32), path)
     arrays = dict(np.load(path))
     assert arrays.pop("background").tolist() == [1, 1, 1]
     np.savez(path, **arrays)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.drawing.frame import Style, colours, depth_colours, error_picture
+from nerf_lightning.drawing.depth import colorize_depth, depth_limits
+from nerf_lightning.drawing.frame import Style, colours, error_picture
 from nerf_lightning.renderer import Rendered
 
 RED = torch.tensor([1.0, 0.0, 0.0])
@@ -17,18 +18,18 @@ def seen(background: torch.Tensor) -> Rendered:
     return Rendered(rgb, opacity, opacity * torch.tensor([0.0, 2.0, 4.0]))
 
 
-def test_the_background_shows_through_all_channels_but_opacity():
+def test_colours_background_shows_through_all_channels_but_opacity():
     blue = (0.0, 0.0, 1.0)
     style = Style(("rgb", "depth", "opacity"), blue, (2.0, 4.0))
     rendered = seen(torch.tensor(blue))
     torch.testing.assert_close(colours(rendered, "rgb", style), torch.tensor([[0, 0, 1.0], [0.5, 0, 0.5], [1, 0, 0]]))
-    near, far = depth_colours(torch.tensor([2.0, 4.0]), (2.0, 4.0))
+    near, far = torch.from_numpy(colorize_depth(np.array([2.0, 4.0]), 2.0, 4.0)) / 255
     expected = torch.stack([torch.tensor(blue), 0.5 * near + torch.tensor([0, 0, 0.5]), far])
     torch.testing.assert_close(colours(rendered, "depth", style), expected)
     torch.testing.assert_close(colours(rendered, "opacity", style), torch.tensor([[0.0], [0.5], [1.0]]).expand(3, 3))
 
 
-def test_transparent_colours_are_straight_and_give_any_background():
+def test_colours_transparent_are_straight_and_give_any_background():
     style = Style(("rgb",), None, (0.0, 1.0))
     straight = colours(seen(torch.zeros(3)), "rgb", style)
     assert straight.shape == (3, 4)
@@ -39,12 +40,20 @@ def test_transparent_colours_are_straight_and_give_any_background():
     torch.testing.assert_close(colours(seen(torch.zeros(3)), "opacity", style)[:, 3], torch.ones(3))
 
 
-def test_near_is_bright_and_far_is_dark_and_what_is_beyond_stays_there():
-    brightness = depth_colours(torch.tensor([0.0, 1.0, 1.5, 2.0, 9.0]), (1.0, 2.0)).sum(1)
+def test_colorize_depth_near_is_bright_and_what_is_beyond_stays_there():
+    brightness = colorize_depth(np.array([0.0, 1.0, 1.5, 2.0, 9.0]), 1.0, 2.0).astype(int).sum(1)
     assert brightness[0] == brightness[1] > brightness[2] > brightness[3] == brightness[4]
+    assert colorize_depth(np.full((4, 5), 1.5), 1.0, 2.0)[0, 0].tolist() == [186, 54, 85], "inferno's middle glows red"
 
 
-def test_errors_are_magnified_and_told_in_decibels():
+def test_depth_limits_are_percentiles():
+    assert depth_limits(np.linspace(0, 100, 101)) == (2.0, 98.0)
+    assert depth_limits(np.empty(0)) == (0.0, 1.0)
+    low, high = depth_limits(np.full(9, 3.0))
+    assert low == 3.0 < high
+
+
+def test_error_picture_is_magnified_and_told_in_decibels():
     truth = np.full((4, 5, 3), 100, np.uint8)
     shown = truth.copy()
     shown[..., 0] += 10

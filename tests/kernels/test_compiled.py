@@ -27,7 +27,7 @@ def lines(cache: Path, python: str = sys.executable) -> list[str]:
     return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout.splitlines()
 
 
-def test_what_was_just_compiled_rounds_as_what_comes_from_the_cache(tmp_path: Path):
+def test_kernel_compiled_or_cached_rounds_alike(tmp_path: Path):
     """The same seed must give the same weights with both. A first run has another process compile, and then finds all kernels
     in the cache as later ones do; where no process can be started, it compiles them itself.
 

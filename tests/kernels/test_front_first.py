@@ -2,13 +2,13 @@ import math
 
 import pytest
 import torch
-from agreement import with_threads
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import front_first, keep_visible, march, use_kernels
 from nerf_lightning.kernels.march import Packed
+from tests.helpers.assert_close import run_with_threads
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 EPS = 0.01
@@ -36,7 +36,7 @@ def looked(rays: Rays, occupied: Tensor) -> tuple[Tensor, Packed, int]:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_all_that_light_reaches_is_found_and_little_else(share: float):
+def test_front_first_any_occupancy_finds_visible_samples(share: float):
     directions = normalize(torch.randn(400, 3), dim=1)
     aside = torch.cat([torch.rand(396, 3) - 0.5, torch.full((4, 3), 5.0)])  # the last miss
     rays = Rays(aside - 4 * directions, directions)
@@ -50,11 +50,11 @@ def test_all_that_light_reaches_is_found_and_little_else(share: float):
         wanted, those = keep_visible(expected, every, EPS, min_thickness)
         assert all(torch.equal(a, b) for a, b in zip((kept, *which), (wanted, *those), strict=True))
     assert asked == len(found) and (len(found) < 0.7 * most or share < 1)
-    again = with_threads(lambda: looked(rays, occupied), 2 if torch.get_num_threads() == 1 else 1)
+    again = run_with_threads(lambda: looked(rays, occupied), 2 if torch.get_num_threads() == 1 else 1)
     assert torch.equal(found, again[0]) and torch.equal(packed[0], again[1][0])
 
 
-def test_rays_with_gradient_take_the_reference():
+def test_front_first_rays_with_gradient_use_reference():
     rays = Rays(torch.tensor([[-3.0, 0.1, 0.2]], requires_grad=True), torch.tensor([[1.0, 0, 0]]))
     found, packed, asked = looked(rays, torch.ones(4**3, dtype=torch.bool))
     near, far = CUBE.near_far(rays)

@@ -2,29 +2,32 @@ import math
 
 import pytest
 import torch
-from agreement import with_threads
-from ragged import COUNTS, MANY, ragged
 
-from nerf_lightning.kernels import composite, keep_visible, use_kernels
+from nerf_lightning.kernels import composite, keep_visible
 from nerf_lightning.sampler import Samples
+from tests.helpers.ragged_samples import MANY, ragged_samples
 
 
 def packed(samples: Samples):
     return samples.t, samples.dt, samples.ray, samples.offsets
 
 
-def flat(kept):
-    thickness, packed = kept
-    return thickness, *packed
-
-
-@pytest.mark.parametrize("counts", COUNTS)
-@pytest.mark.parametrize("early_stop_eps", [1e-4, 0.5])
-@pytest.mark.parametrize(("min_thickness", "dropped"), [(0.0, math.inf), (1e-3, math.inf), (0.2, math.inf), (0.2, 0.3)])
-def test_what_is_seen_agrees_with_a_loop(
+@pytest.mark.parametrize(
+    ("counts", "early_stop_eps", "min_thickness", "dropped"),
+    [
+        ([3, 0, 5, 1], 1e-4, 0.0, math.inf),
+        ([0, 0, 7, 0], 0.5, 1e-3, math.inf),
+        ([0], 1e-4, 0.2, math.inf),
+        ([1] * 6, 0.5, 0.2, 0.3),
+        ([30, 0, 2, 11, 0], 1e-4, 0.2, math.inf),
+        ([30, 0, 2, 11, 0], 0.5, 0.0, math.inf),
+        ([30, 0, 2, 11, 0], 1e-4, 0.2, 0.3),
+    ],
+)
+def test_keep_visible_any_threshold_matches_loop_over_samples(
     counts: list[int], early_stop_eps: float, min_thickness: float, dropped: float, kernels: str
 ):
-    samples = ragged(counts)
+    samples = ragged_samples(counts)
     density = 20 * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.7)
     kept, ends, i = [], [0], 0
     for count in counts:
@@ -44,33 +47,8 @@ def test_what_is_seen_agrees_with_a_loop(
     assert torch.equal(ray, samples.ray[kept]) and offsets.tolist() == ends
 
 
-@pytest.mark.parametrize("counts", [[], [0, 0], MANY])
-@pytest.mark.parametrize(("min_thickness", "dropped"), [(0.0, math.inf), (0.1, math.inf), (0.1, 0.2)])
-def test_what_is_seen_agrees_with_the_reference(counts: list[int], min_thickness: float, dropped: float):
-    samples = ragged(counts)
-    density = 30 * torch.rand(len(samples)) * (torch.rand(len(samples)) < 0.5)
-    results = {}
-    for choice in ("auto", "reference"):
-        use_kernels(choice)
-        results[choice] = flat(
-            keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness, dropped=dropped)
-        )
-    assert all(torch.equal(a, b) for a, b in zip(*results.values(), strict=True))
-    use_kernels("auto")
-    one = with_threads(
-        lambda: keep_visible(density * samples.dt, packed(samples), 1e-3, min_thickness, dropped=dropped), 1
-    )
-    assert all(torch.equal(a, b) for a, b in zip(flat(one), results["auto"], strict=True))
-
-
-def test_nothing_is_dropped_when_all_may_stay(kernels: str):
-    samples = ragged(MANY)
-    _, kept = keep_visible(torch.full((len(samples),), 1e-3), packed(samples), 1e-4, 0.1, dropped=1e-4)
-    assert all(torch.equal(a, b) for a, b in zip(kept, packed(samples), strict=True))
-
-
-def test_dropping_what_is_not_seen_changes_pixels_by_no_more_than_it_may():
-    samples = ragged(MANY)
+def test_keep_visible_pixels_change_within_threshold():
+    samples = ragged_samples(MANY)
     density, rgb = 20 * torch.rand(len(samples)) ** 4, torch.rand(len(samples), 3)
     whole = composite(density, rgb, *packed(samples))
     _, (t, dt, ray, offsets) = keep_visible(density * samples.dt, packed(samples), 1e-3, 0.0)
@@ -81,8 +59,8 @@ def test_dropping_what_is_not_seen_changes_pixels_by_no_more_than_it_may():
     assert 0 < (whole[0] - part[0]).abs().max() <= 1e-3 and (whole[1] - part[1]).abs().max() <= 1e-3
 
 
-def test_a_density_that_is_not_a_number_stays(kernels: str):
-    samples = ragged([3, 5, 2])
+def test_keep_visible_nan_density_stays(kernels: str):
+    samples = ragged_samples([3, 5, 2])
     density = torch.zeros(10)
     density[5] = float("nan")
     _, (t, _, ray, _) = keep_visible(density * samples.dt, packed(samples), 1e-4, 0.01)

@@ -1,10 +1,8 @@
 import pytest
 import torch
-from agreement import agree
 from torch import Tensor
 
 from nerf_lightning.kernels import (
-    interpolate_rows,
     locate,
     mark_rows,
     read_voxels,
@@ -56,7 +54,7 @@ def by_hand(values: Tensor, index: Tensor, position: list[float]) -> Tensor:
     return total
 
 
-def test_interpolation_agrees_with_a_loop_over_vertices(kernels: str):
+def test_read_voxels_any_position_matches_loop_over_vertices(kernels: str):
     index, unit = sparse_index(), places(20)
     density, colour, views = tables(index, 3)
     basis = basis_of(len(unit), 3)
@@ -70,30 +68,7 @@ def test_interpolation_agrees_with_a_loop_over_vertices(kernels: str):
         torch.testing.assert_close(rgb[n].double(), expected, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize("count", [0, 1, 500])
-def test_fast_rows_and_weights_agree_with_the_reference(count: int):
-    agree(locate, [sparse_index(), places(count)])
-
-
-@pytest.mark.parametrize("count", [0, 1, 500])
-def test_fast_value_agrees_with_the_reference(count: int):
-    index, unit = sparse_index(), places(count)
-    (values, *_) = tables(index, 0)
-    with torch.no_grad():
-        agree(voxel_value, [values, index, unit], constants=(0, 2))
-    agree(voxel_value, [values, index, unit], constants=(2,))
-
-
-@pytest.mark.parametrize("terms", [0, 3, 15])
-@pytest.mark.parametrize("count", [0, 1, 700])
-def test_fast_reading_agrees_with_the_reference(terms: int, count: int):
-    index, unit = sparse_index(), places(count)
-    rows, weights = locate(index, unit)
-    inputs = [*tables(index, terms), rows, weights, basis_of(len(unit), terms)]
-    agree(read_voxels, inputs, constants=(5,), atol=3e-6)
-
-
-def test_what_is_not_kept_gets_no_gradient(kernels: str):
+def test_read_voxels_pruned_vertex_gets_no_gradient(kernels: str):
     index, unit = sparse_index(), places(100)
     free = [table.requires_grad_() for table in tables(index, 3)]
     raw, rgb = read_voxels(*free, *locate(index, unit), basis_of(len(unit), 3))
@@ -102,32 +77,7 @@ def test_what_is_not_kept_gets_no_gradient(kernels: str):
         assert not table.grad[0].any() and table.grad[1:].any()
 
 
-def test_gradients_of_weights_and_basis(kernels: str):
-    index, unit = sparse_index(4), torch.rand(5, 3)
-    rows, weights = locate(index, unit)
-    free = [x.double().requires_grad_() for x in (*tables(index, 3), weights, basis_of(5, 3))]
-    free[0].data[0], free[1].data[0], free[2].data[0] = 0, 0, 0
-
-    def call(density: Tensor, colour: Tensor, views: Tensor, weights: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
-        # Row 0 is a constant, whatever its number: a check by differences must not move it.
-        held = [torch.cat([table[:1].detach() * 0, table[1:]]) for table in (density, colour, views)]
-        return read_voxels(*held, rows, weights, basis)
-
-    assert torch.autograd.gradcheck(call, free)
-
-
-def test_positions_have_gradients_where_they_need_them(kernels: str):
-    index, unit = sparse_index(), (torch.randint(0, 5, (9, 3)) + 0.2 + 0.6 * torch.rand(9, 3)) / 5
-    (values, *_) = tables(index, 0)
-    unit.requires_grad_()
-    (got,) = torch.autograd.grad(voxel_value(values, index, unit).sum(), unit)
-    step = 1e-3 * torch.eye(3)
-    with torch.no_grad():
-        slopes = [(voxel_value(values, index, unit + s) - voxel_value(values, index, unit - s)) / 2e-3 for s in step]
-    torch.testing.assert_close(got, torch.stack(slopes, 1), rtol=1e-2, atol=1e-2)
-
-
-def test_what_is_not_a_number_stays_visible(kernels: str):
+def test_read_voxels_nan_input_shows(kernels: str):
     index, unit = torch.arange(1, SIDE**3 + 1, dtype=torch.int32), places(20)
     unit[3, 0], unit[5, 2], unit[7] = NAN, NAN, NAN
     free = [table.requires_grad_() for table in tables(index, 3)]
@@ -144,7 +94,7 @@ def test_what_is_not_a_number_stays_visible(kernels: str):
         assert voxel_value(free[0], index, places(3)).isnan().all()
 
 
-def test_marking_notes_the_step_at_the_rows_that_are_read(kernels: str):
+def test_mark_rows_notes_step_at_rows_read(kernels: str):
     index = torch.arange(1, SIDE**3 + 1, dtype=torch.int32)
     seen = torch.zeros(SIDE**3 + 1, dtype=torch.int32)
     mark_rows(seen, locate(index, torch.tensor([[0.05, 0.05, 0.05]]))[0], 3)
@@ -154,7 +104,7 @@ def test_marking_notes_the_step_at_the_rows_that_are_read(kernels: str):
     assert (seen == 7).nonzero()[:, 0].tolist() == [SIDE**3 + 1 - row for row in reversed(near)]
 
 
-def test_roughness_is_that_of_a_loop_over_neighbours(kernels: str):
+def test_roughness_matches_loop_over_neighbours(kernels: str):
     index = sparse_index()
     (values, *_) = tables(index, 0)
     vertex, rows = vertices_of(index), rows_of(index)
@@ -170,19 +120,7 @@ def test_roughness_is_that_of_a_loop_over_neighbours(kernels: str):
     assert float(roughness(values, vertex, index, 1, rows)) == pytest.approx(squares / (rows - 1), rel=1e-5)
 
 
-@pytest.mark.parametrize(("first", "last"), [(1, None), (1, 2), (20, 60)])
-def test_fast_roughness_agrees_with_the_reference(first: int, last: int | None):
-    index = sparse_index()
-    (values, *_), last = tables(index, 0), last or rows_of(index)
-    vertex = vertices_of(index)
-
-    def rough(values: Tensor) -> Tensor:
-        return roughness(values, vertex, index, first, last)
-
-    agree(rough, [values], rtol=1e-5)
-
-
-def test_pieces_of_the_roughness_pull_as_the_whole(kernels: str):
+def test_roughness_pieces_pull_as_whole(kernels: str):
     index = sparse_index()
     (values, *_) = tables(index, 0)
     vertex, rows = vertices_of(index), rows_of(index)
@@ -194,12 +132,3 @@ def test_pieces_of_the_roughness_pull_as_the_whole(kernels: str):
     torch.testing.assert_close(pull(1, 30) + pull(30, rows), pull(1, rows))
     smoother = values.detach() - 0.01 * pull(1, rows)
     assert roughness(smoother, vertex, index, 1, rows) < roughness(values, vertex, index, 1, rows)
-
-
-def test_all_kept_vertices_count_as_rows():
-    """`interpolate_rows` takes any number of values a vertex."""
-    index, unit = sparse_index(), places(30)
-    values = torch.randn(rows_of(index), 2, 4)
-    rows, weights = locate(index, unit)
-    expected = torch.stack([by_hand(values, index, p) for p in unit.tolist()])
-    torch.testing.assert_close(interpolate_rows(values, rows, weights).double(), expected, atol=1e-5, rtol=1e-5)

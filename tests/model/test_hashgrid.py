@@ -11,11 +11,11 @@ from nerf_lightning.model.hashgrid import level_resolutions
     ("levels", "coarsest", "finest", "expected"),
     [(1, 16, 256, [16]), (2, 3, 50, [3, 50]), (5, 16, 256, [16, 32, 64, 128, 256]), (3, 7, 7, [7, 7, 7])],
 )
-def test_levels_grow_from_coarsest_to_finest(levels, coarsest, finest, expected):
+def test_level_resolutions_grow_from_coarsest_to_finest(levels, coarsest, finest, expected):
     assert level_resolutions(levels, coarsest, finest) == expected
 
 
-def test_a_grid_has_no_more_entries_than_it_needs():
+def test_hash_grid_small_levels_have_one_entry_a_vertex():
     grid = HashGrid(levels=3, log2_entries=9, features=4, coarsest=4, finest=16)
     assert grid.resolutions == [4, 8, 16] and grid.sizes == [125, 512, 512]
     assert grid.tables.shape == (125 + 512 + 512, 4) and grid.width == 12
@@ -25,6 +25,6 @@ def test_a_grid_has_no_more_entries_than_it_needs():
 
 
 @pytest.mark.parametrize(("coarsest", "finest"), [(0, 16), (17, 16)])
-def test_a_grid_that_shrinks_is_refused(coarsest, finest):
+def test_hash_grid_that_shrinks_is_refused(coarsest, finest):
     with pytest.raises(InputError, match="model.coarsest"):
         HashGrid(coarsest=coarsest, finest=finest)

@@ -4,15 +4,15 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from agreement import with_threads
 from torch import Tensor
 
 from nerf_lightning.dataset import Picture, PixelDataModule, pixel_grid
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import FourierField, HashGrid2DField, PictureField, PictureMLP, SirenField
 from nerf_lightning.system import NeRF2D, constant, psnr
+from tests.helpers.assert_close import run_with_threads
 
-SIZES = pytest.mark.parametrize("size", [(64, 64), (40, 25), (25, 40), (1, 1), (1, 30), (30, 1), (2, 1), (3, 2)])
+SIZES = pytest.mark.parametrize("size", [(40, 25), (1, 1), (1, 30), (2, 1)])
 MAKERS: dict[str, Callable[[tuple[int, int]], PictureField]] = {
     "hash grid": HashGrid2DField,
     "octaves": lambda size: PictureMLP(size, None, width=64),
@@ -22,13 +22,9 @@ MAKERS: dict[str, Callable[[tuple[int, int]], PictureField]] = {
 FIELDS = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 
 
-def corners(resolution: tuple[int, int]) -> int:
-    return (resolution[0] + 1) * (resolution[1] + 1)
-
-
 @FIELDS
 @SIZES
-def test_a_picture_of_any_size_has_a_field(make, size: tuple[int, int]):
+def test_picture_field_any_size_learns_with_all_parameters(make, size: tuple[int, int]):
     field = make(size)
     for uv in (torch.rand(0, 2), torch.rand(1, 2), pixel_grid(size[1], size[0]), torch.rand(30, 2)):
         rgb = field(uv)
@@ -39,7 +35,7 @@ def test_a_picture_of_any_size_has_a_field(make, size: tuple[int, int]):
 
 
 @FIELDS
-def test_a_field_learns_a_picture(make):
+def test_picture_field_smooth_picture_is_learned(make):
     """100 steps on a smooth picture leave less than a twentieth of the squared error of the best plain colour."""
     x, y = pixel_grid(48, 64).T
     smooth = torch.stack([0.5 + 0.4 * torch.sin(5 * x), 0.5 + 0.4 * torch.cos(4 * y + 2 * x), 0.2 + 0.6 * x * y], dim=1)
@@ -56,15 +52,15 @@ def test_a_field_learns_a_picture(make):
         return [system.colours(view.uv)]
 
     view = data.held_out(0)
-    (learned,) = with_threads(train, 1)  # steps so small are slower with two, and far slower on a busy machine
+    (learned,) = run_with_threads(train, 1)  # steps so small are slower with two, and far slower on a busy machine
     assert psnr(learned, view.rgb) > psnr(view.rgb.mean(0).expand_as(view.rgb), view.rgb) + 13
 
 
 # What follows from the picture's size
 
 
-@pytest.mark.parametrize("size", [(16, 12), (12, 16), (33, 7)])
-def test_the_finest_level_has_a_vertex_at_each_pixels_centre(size: tuple[int, int]):
+@pytest.mark.parametrize("size", [(16, 12), (33, 7)])
+def test_hash_grid_2d_finest_level_has_vertex_at_pixel_centre(size: tuple[int, int]):
     width, height = size
     field = HashGrid2DField(size, levels=3, log2_entries=8, coarsest=4)
     assert field.resolutions[-1] == (width - 1, height - 1)
@@ -82,87 +78,14 @@ def test_the_finest_level_has_a_vertex_at_each_pixels_centre(size: tuple[int, in
         assert moved.max() < 1e-3, "and no other pixel's"
 
 
-@pytest.mark.parametrize("size", [(256, 256), (640, 360), (97, 1400), (40, 30), (1, 1000)])
-@pytest.mark.parametrize("features", [1, 2])
-@pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
-def test_tables_hold_up_to_a_share_of_the_pictures_numbers(size: tuple[int, int], features: int, share: float):
-    field = HashGrid2DField(size, features=features, share=share)
-    values = 2 * share * 3 * size[0] * size[1]
-    most = math.log2(max(field.sizes))
-    everything = features * sum(corners(r) for r in field.resolutions)
-    assert field.tables.numel() <= values / 2 and (
-        field.tables.numel() > values / 4 or field.tables.numel() == everything
-    )
-    for resolution, entries in zip(field.resolutions, field.sizes, strict=True):
-        assert entries == corners(resolution) or (entries == 2**most and entries < corners(resolution))
-    assert all(isinstance(entries, int) for entries in field.sizes)
-
-
-@pytest.mark.parametrize("size", [(256, 256), (640, 360), (97, 1400), (3000, 4000)])
-def test_by_default_no_entries_are_shared(size: tuple[int, int]):
-    field = HashGrid2DField(size)
-    assert field.sizes == [corners(resolution) for resolution in field.resolutions]
-    assert field.tables.numel() <= 3 * size[0] * size[1]
-
-
-@pytest.mark.parametrize("size", [(1, 1), (4, 4)])
-def test_the_smallest_pictures_keep_sixteen_entries_a_level(size: tuple[int, int]):
-    field = HashGrid2DField(size)
-    assert max(field.sizes) <= 16 and field.sizes == [min(corners(r), 16) for r in field.resolutions]
-    assert set(field.resolutions) == {tuple(max(side - 1, 1) for side in size)}, "no level is finer than the pixels"
-
-
-@pytest.mark.parametrize("size", [(256, 256), (640, 360), (360, 640)])
-def test_cells_stay_nearly_square_at_every_level(size: tuple[int, int]):
-    field = HashGrid2DField(size)
-    longer = [max(resolution) for resolution in field.resolutions]
-    assert longer[0] == 16 and longer[-1] == max(size) - 1 and longer == sorted(set(longer))
-    for across, down in field.resolutions:
-        assert abs(across / (size[0] - 1) - down / (size[1] - 1)) * (min(size) - 1) <= 1
-
-
-@pytest.mark.parametrize(
-    ("size", "levels"), [((16, 12), 1), ((18, 18), 1), ((40, 40), 2), ((512, 300), 5), ((4000, 300), 7)]
-)
-def test_no_two_levels_are_the_same(size: tuple[int, int], levels: int):
-    field = HashGrid2DField(size)
-    assert len(set(field.resolutions)) == len(field.resolutions) == levels
-    assert field(torch.rand(5, 2)).shape == (5, 3)
-
-
-def test_a_single_level_is_the_finest_and_a_given_table_size_is_kept():
-    assert HashGrid2DField((300, 200), levels=1).resolutions == [(299, 199)]
-    assert max(HashGrid2DField((256, 256), log2_entries=9).sizes) == 2**9
-    assert HashGrid2DField((64, 64), log2_entries=20).sizes[-1] == 64 * 64, "a level needs no more than its corners"
-
-
-@pytest.mark.parametrize(
-    ("size", "octaves"), [((1, 1), 1), ((2, 1), 1), ((64, 64), 6), ((256, 192), 8), ((100, 60), 7), ((60, 100), 7)]
-)
-def test_octaves_end_at_half_of_what_the_pixels_show(size: tuple[int, int], octaves: int):
+@pytest.mark.parametrize(("size", "octaves"), [((1, 1), 1), ((64, 64), 6), ((256, 192), 8), ((60, 100), 7)])
+def test_picture_mlp_octaves_end_at_half_of_nyquist(size: tuple[int, int], octaves: int):
     field = PictureMLP(size, None, width=8, depth=2)
     assert field.frequencies == octaves
     assert size == (1, 1) or 2 ** (octaves - 1) / 2 == pytest.approx(field.nyquist / 2, rel=0.42), (
         "to the nearest octave"
     )
     assert field.net[0].in_features == 2 * (1 + 2 * octaves)
-
-
-def test_the_last_octaves_sine_has_four_pixels_a_cycle():
-    seen = inputs_of(PictureMLP((64, 64), None, width=8), pixel_grid(64, 64))
-    sine_x = seen[:64, -4]  # per octave: the sines of x and y, then the cosines
-    cycle = math.sqrt(0.5) * torch.tensor([1.0, 1.0, -1.0, -1.0])
-    torch.testing.assert_close(sine_x, cycle.repeat(16), atol=1e-3, rtol=0)
-
-
-def test_octaves_have_as_many_pixels_a_cycle_along_both_sides():
-    field = PictureMLP((64, 16), None, width=8)
-    seen = inputs_of(field, pixel_grid(16, 64)).view(16, 64, -1)
-    along, down = seen[0, :, -4], seen[:, 0, -3]  # of the last octave the sines of x and of y
-    assert field.frequencies == 6
-    torch.testing.assert_close(along[:12], along[4:16], atol=1e-3, rtol=0)
-    torch.testing.assert_close(down[:12], down[4:], atol=1e-3, rtol=0)
-    assert along.std() > 0.5 and down.std() > 0.5
 
 
 def inputs_of(field: PictureField, uv: Tensor) -> Tensor:
@@ -173,8 +96,8 @@ def inputs_of(field: PictureField, uv: Tensor) -> Tensor:
     return seen[0]
 
 
-@pytest.mark.parametrize("size", [(8, 8), (8, 4), (3, 10), (1, 1)])
-def test_pixels_stay_square(size: tuple[int, int]):
+@pytest.mark.parametrize("size", [(8, 4), (3, 10), (1, 1)])
+def test_picture_field_centred_pixels_stay_square(size: tuple[int, int]):
     width, height = size
     places = PictureField(size).centred(pixel_grid(height, width)).view(height, width, 2)
     step = 2 / max(size)
@@ -186,8 +109,8 @@ def test_pixels_stay_square(size: tuple[int, int]):
 # Options
 
 
-@pytest.mark.parametrize("rate", [0.1, 1.0, 3.0])
-def test_a_fields_rate_multiplies_the_optimisers(rate: float):
+@pytest.mark.parametrize("rate", [0.1, 3.0])
+def test_picture_field_rate_multiplies_learning_rate(rate: float):
     fields = [HashGrid2DField((9, 9), rate=rate), FourierField((9, 9), rate=rate), SirenField((9, 9), rate=rate)]
     for field in fields:
         system = NeRF2D(field, functools.partial(torch.optim.SGD, lr=0.25), constant)
@@ -201,17 +124,11 @@ def test_a_fields_rate_multiplies_the_optimisers(rate: float):
         (HashGrid2DField, {"log2_entries": 25}, "model.log2_entries"),
         (HashGrid2DField, {"share": 0.0}, "model.share"),
         (PictureMLP, {"frequencies": -1}, "model.frequencies"),
-        *((FourierField, {"spread": spread}, "model.spread") for spread in (0.0, -0.1, math.nan)),
-        *((SirenField, {"reach": reach}, "model.reach") for reach in (0.0, -0.1, math.nan)),
-        *((HashGrid2DField, {"rate": rate}, "model.rate") for rate in (0.0, -1.0, math.nan)),
-        *((kind, {"rate": 0.0}, "model.rate") for kind in (FourierField, SirenField)),
+        (FourierField, {"spread": math.nan}, "model.spread"),
+        (SirenField, {"reach": 0.0}, "model.reach"),
+        *((kind, {"rate": 0.0}, "model.rate") for kind in (HashGrid2DField, FourierField, SirenField)),
     ],
 )
-def test_options_that_make_no_field_are_refused(kind, options: dict, key: str):
+def test_picture_field_bad_option_is_refused(kind, options: dict, key: str):
     with pytest.raises(InputError, match=key):
         kind((9, 9), **options)
-
-
-def test_a_field_without_colours_says_what_it_lacks():
-    with pytest.raises(TypeError, match="PictureField must define forward"):
-        PictureField((9, 9))(torch.rand(3, 2))

@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import normalize
 
 from nerf_lightning.model import Field, HashGridField, VoxelField
-from nerf_lightning.model.layers.pruning import vertices_in, widened
+from nerf_lightning.model.layers.pruning import vertices_in
 from tests.model.test_warm_start import BOX, hashgrid, mlp, tensorf, voxels
 
 FIELDS = pytest.mark.parametrize("make", [hashgrid, tensorf, voxels, mlp])
@@ -15,7 +15,7 @@ Make = Callable[[], Field]
 
 
 @pytest.mark.parametrize("cells", [1, 3, 8, 13])
-def test_vertices_are_those_around_every_place_in_a_reached_cell(cells: int):
+def test_vertices_in_reached_cells_are_their_corners(cells: int):
     reached = torch.zeros(8, 8, 8, dtype=torch.bool)
     reached[2, 5, 7] = reached[0, 0, 3] = True
     expected = torch.zeros(cells + 1, cells + 1, cells + 1, dtype=torch.bool)
@@ -25,12 +25,6 @@ def test_vertices_are_those_around_every_place_in_a_reached_cell(cells: int):
         for corner in torch.cartesian_prod(*[torch.arange(2)] * 3):
             expected[tuple((low + corner).T)] = True
     assert torch.equal(vertices_in(reached, cells), expected)
-
-
-def test_widened_takes_in_all_neighbours():
-    mask = torch.zeros(5, 5, 5, dtype=torch.bool)
-    mask[2, 2, 0] = True
-    assert int(widened(mask).sum()) == 18
 
 
 def some_cells() -> torch.Tensor:
@@ -43,7 +37,7 @@ def inside(reached: torch.Tensor) -> torch.Tensor:
 
 
 @FIELDS
-def test_a_pruned_field_is_the_same_where_it_was_reached(make: Make):
+def test_prune_reached_places_keep_their_values(make: Make):
     field, reached = make(), some_cells()
     positions = inside(reached)
     directions = normalize(torch.randn(len(positions), 3), dim=1)
@@ -53,7 +47,7 @@ def test_a_pruned_field_is_the_same_where_it_was_reached(make: Make):
         torch.testing.assert_close(found, was)
 
 
-def test_pruning_leaves_less():
+def test_prune_few_cells_leaves_less():
     reached = some_cells()
     grid, sparse = hashgrid(entries=12), voxels(finest=12, coarsest=12)
     assert isinstance(grid, HashGridField) and isinstance(sparse, VoxelField)
@@ -65,17 +59,10 @@ def test_pruning_leaves_less():
 
 
 @FIELDS
-def test_what_is_packed_can_be_unpacked(make: Make):
+def test_export_state_of_pruned_field_imports_alike(make: Make):
     field, other = make(), make()
     field.prune(some_cells())
     other.import_state(field.export_state())
     positions, directions = BOX.to_world(torch.rand(40, 3)), normalize(torch.randn(40, 3), dim=1)
     for found, was in zip(other(positions, directions), field(positions, directions), strict=True):
         assert torch.equal(found, was)
-
-
-def test_tables_that_do_not_fit_their_vertices_are_refused():
-    field = voxels()
-    packed = field.export_state()
-    with pytest.raises(RuntimeError, match="another length"):
-        field.import_state({**packed, "colours": packed["colours"][:-1]})

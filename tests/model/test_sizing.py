@@ -10,12 +10,11 @@ from nerf_lightning.cameras import Bounds, Cameras, bounds
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, save_npz
 from nerf_lightning.errors import InputError
-from nerf_lightning.model import Field, HashGrid2DField, HashGridField, PictureMLP, TensoRFField, VoxelField
+from nerf_lightning.model import HashGridField, TensoRFField, VoxelField
 from nerf_lightning.model import tensorf as planes
-from nerf_lightning.model.tensorf import FINEST
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.sampler import OccupancySampler
-from nerf_lightning.stability.toys import MARBLE, around, toy
+from nerf_lightning.synthetic.objects import MARBLE, make_scene, place_cameras
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train
 
@@ -39,13 +38,13 @@ GRIDS = pytest.mark.parametrize("resolutions", [hashgrid, tensorf, voxels])
 Resolutions = Callable[[Bounds, int, int, str], list[int]]
 
 
-def test_a_pixel_shows_its_share_of_the_distance():
-    cameras = around(9, size=40, distance=4.0)
+def test_pixel_width_is_share_of_distance():
+    cameras = place_cameras(9, size=40, distance=4.0)
     assert cameras.pixel_width(torch.zeros(3)) == pytest.approx(4 / float(cameras.K[0, 0, 0]))
 
 
 @pytest.mark.parametrize(("unbounded", "across"), [(False, 20), (True, 40)])
-def test_pixels_across_are_those_of_the_unit_cube(unbounded: bool, across: int):
+def test_pixels_across_are_of_unit_cube(unbounded: bool, across: int):
     assert Bounds(BOX, unbounded, pixel=0.1).pixels_across == pytest.approx(across)
     # A step of one pixel along the longest axis is one part in so many of the unit cube.
     bounds = Bounds(BOX, unbounded, pixel=0.1)
@@ -54,7 +53,7 @@ def test_pixels_across_are_those_of_the_unit_cube(unbounded: bool, across: int):
 
 
 @GRIDS
-def test_grids_are_no_finer_than_two_cells_a_pixel(resolutions: Resolutions):
+def test_grid_auto_size_has_two_cells_a_pixel_at_most(resolutions: Resolutions):
     bounds = Bounds(BOX, pixel=0.1)
     auto, fixed = resolutions(bounds, 16, 100, "auto"), resolutions(bounds, 16, 100, "fixed")
     assert auto[0] == fixed[0] == 16 and auto[-1] == 40 and fixed[-1] == 100
@@ -69,7 +68,7 @@ def test_grids_are_no_finer_than_two_cells_a_pixel(resolutions: Resolutions):
     ("unbounded", "across", "finest", "width"),
     [(False, 150, 160, 32), (False, 450, 240, 48), (False, 800, 320, 64), (False, 9000, 320, 64), (True, 800, 160, 32)],
 )
-def test_planes_and_their_network_are_larger_for_large_photos(unbounded: bool, across: int, finest: int, width: int):
+def test_tensorf_large_photos_enlarge_planes_and_network(unbounded: bool, across: int, finest: int, width: int):
     """Planes have numbers in proportion to the width of the photos, the network neurons in proportion to the planes' side."""
     bounds = Bounds(BOX, unbounded, pixel=2 / across)
     field, given = TensoRFField(bounds, 2, 2), TensoRFField(bounds, 2, 2, finest=100, width=24)
@@ -79,29 +78,12 @@ def test_planes_and_their_network_are_larger_for_large_photos(unbounded: bool, a
     assert TensoRFField(Bounds(BOX, unbounded), 2, 2, coarsest=200).resolutions[-1] == 200
 
 
-def test_fields_say_in_a_line_what_their_size_follows_from():
-    assert "20 pixels wide" in TensoRFField(Bounds(BOX, pixel=0.1), size="auto").sizing
-    assert Field(Bounds(BOX)).sizing == ""
-    assert "64 x 48 pixels" in HashGrid2DField((64, 48)).sizing
-    assert PictureMLP((64, 48)).sizing.startswith("6 octaves") and PictureMLP((64, 48), frequencies=3).sizing == ""
-
-
-def test_a_run_folder_knows_the_size_without_its_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    save_npz(toy(MARBLE, size=16, views=6, held_out=1), tmp_path / "scene.npz")
-    given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_small", "budget.steps=3"]
-    train(composed([*given, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "~logger"], tmp_path / "run"))
-    (tmp_path / "scene.npz").unlink()
-    field = load_run(tmp_path / "run").system.field
-    assert isinstance(field, TensoRFField) and field.resolutions[-1] < 16
-
-
-def test_a_run_on_large_photos_trains_a_finer_field_resumes_and_opens_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_run_on_large_photos_resumes_with_finer_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(bounds, "USUAL_WIDTH", 4)  # so that small photos count as large
     monkeypatch.setattr(planes, "SETTLED", 2)
+    monkeypatch.setattr(planes, "FINEST", 24)
     scene = tmp_path / "scene.npz"
-    save_npz(toy(MARBLE, size=24, views=5, held_out=1), scene)
+    save_npz(make_scene(MARBLE, size=24, views=5, held_out=1), scene)
     given = ["dataset=photos", f"dataset.path={scene}", "recipe=tensorf_medium", "model.coarsest=8", "model.size=fixed"]
     given += ["model.width=8", "model.stages=3", "dataset.samples=500", "device=cpu", "callbacks.orbit=null"]
     given += ["callbacks.snapshots.steps=[]", "~logger", "callbacks.checkpoints.every_seconds=1e-6"]
@@ -132,4 +114,4 @@ def test_a_run_on_large_photos_trains_a_finer_field_resumes_and_opens_again(
     finer = found.field.finer
     assert told == [1.0] * 4 + [finer] * 3, "the data aims for more samples once the field is finer"
     assert finer > 1.1 and found.sampler.samples == 3 * found.sampler.resolution > 192 * 1.1
-    assert found.field.resolutions[-1] == round(FINEST * finer)
+    assert found.field.resolutions[-1] == round(24 * finer)

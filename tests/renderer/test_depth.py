@@ -4,14 +4,14 @@ import math
 
 import pytest
 import torch
-from ragged import COUNTS, ragged
 
 from nerf_lightning.renderer.depth import median_depth
+from tests.helpers.ragged_samples import COUNTS, ragged_samples
 
 
-@pytest.mark.parametrize("counts", COUNTS)
-def test_half_of_the_opacity_lies_before_it(counts: list[int]):
-    samples = ragged(counts, torch.float64)
+@pytest.mark.parametrize("counts", COUNTS[1:3])
+def test_median_depth_halves_opacity(counts: list[int]):
+    samples = ragged_samples(counts, torch.float64)
     density = 4 * torch.rand(len(samples), dtype=torch.float64)
 
     def before(ray: int, distance: float) -> float:
@@ -29,8 +29,8 @@ def test_half_of_the_opacity_lies_before_it(counts: list[int]):
             assert depth[ray] == 0
 
 
-def test_what_is_left_for_a_long_last_interval_does_not_move_it():
-    samples = ragged([3])
+def test_median_depth_ignores_long_last_interval():
+    samples = ragged_samples([3])
     samples.dt[2], samples.t[2] = 1000, 500
     density = torch.tensor([0.0, 1e3, 1e-5])
     depth = median_depth(density, torch.tensor([0.99]), samples)

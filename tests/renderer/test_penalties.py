@@ -33,7 +33,7 @@ def by_pairs(density: torch.Tensor, samples: Samples, scale: float) -> torch.Ten
 
 
 @pytest.mark.parametrize("counts", [[5, 1, 7], [0, 4, 0, 3, 0], [6]])
-def test_the_fast_sum_is_the_sum_over_pairs(counts: list[int]):
+def test_distortion_loss_matches_sum_over_pairs(counts: list[int]):
     density, samples = packed(counts)
     density.requires_grad_()
     fast, slow = distortion_loss(weights(density, samples), samples, 0.7), by_pairs(density, samples, 0.7)
@@ -41,7 +41,7 @@ def test_the_fast_sum_is_the_sum_over_pairs(counts: list[int]):
     torch.testing.assert_close(torch.autograd.grad(fast, density), torch.autograd.grad(slow, density))
 
 
-def test_gathered_weight_costs_less_than_fog():
+def test_distortion_loss_wall_costs_less_than_fog():
     _, samples = packed([40])
     fog, wall = torch.full((40,), 0.1, dtype=torch.float64), torch.zeros(40, dtype=torch.float64)
     wall[20] = 100.0
@@ -50,13 +50,7 @@ def test_gathered_weight_costs_less_than_fog():
     )
 
 
-def test_no_samples_cost_nothing():
-    density, samples = packed([0, 0])
-    for loss in (distortion_loss, near_loss):
-        assert loss(weights(density, samples), samples, 1.0) == 0
-
-
-def test_the_same_wall_costs_less_from_farther():
+def test_near_loss_falls_with_distance():
     density, samples = packed([6, 6], seed=1)
     nearness = 0.5 / (samples.t + 0.5)
     w = weights(density, samples)
@@ -66,7 +60,7 @@ def test_the_same_wall_costs_less_from_farther():
     assert costs == sorted(costs, reverse=True)
 
 
-def test_what_the_direction_adds_costs_by_its_weight_which_it_does_not_move():
+def test_view_loss_has_no_gradient_of_weights():
     density, samples = packed([6, 0, 3], seed=2)
     view_part = torch.rand(9, 3, dtype=torch.float64, requires_grad=True)
     w = weights(density.requires_grad_(), samples)
@@ -78,7 +72,7 @@ def test_what_the_direction_adds_costs_by_its_weight_which_it_does_not_move():
     assert view_loss(w, torch.zeros(9, 3), samples) == 0
 
 
-def test_where_photos_are_plain_the_size_of_a_view_part_has_a_price_too():
+def test_view_loss_plain_places_cost_more():
     density, samples = packed([6, 0, 3], seed=2)
     w, plain = weights(density, samples), torch.tensor([1.0, 0.3, 0.5], dtype=torch.float64)
     view_part = 0.1 + torch.rand(9, 3, dtype=torch.float64)

@@ -1,153 +1,120 @@
-"""The compact file: as small as it can be rendered from, whole or refused."""
+"""The compact file renders what the run renders, in fewer bytes, or is refused."""
 
 import io
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from once import once
 
-from nerf_lightning.cli.export import export_compact
+from nerf_lightning.config.build import build_system, frame_of
 from nerf_lightning.config.compose import composed
-from nerf_lightning.dataset import save_npz
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.dataset.picture import builtin_picture
+from nerf_lightning.dataset.pixels import Picture
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.compact import decode, load_compact
-from nerf_lightning.runs.folder import load_run
-from nerf_lightning.stability.toys import MARBLE, toy
-from nerf_lightning.training.train import train
+from nerf_lightning.export import smallest
+from nerf_lightning.runs.compact import decode, encode, load_compact, without_folders
+from nerf_lightning.runs.folder import plain_config
+from nerf_lightning.runs.scene_file import scene_content
+from nerf_lightning.synthetic.objects import MARBLE, make_scene
+from nerf_lightning.system import System
+
+Run = tuple[System, RayDataModule | PixelDataModule, dict]
 
 
-def trained(folder: Path, recipe: str = "tensorf_small", *more: str) -> Path:
-    save_npz(toy(MARBLE, size=20, views=10, held_out=2), folder / "scene.npz")
-    given = [
-        "dataset=photos",
-        f"dataset.path={folder}/scene.npz",
-        f"recipe={recipe}",
-        "budget.steps=40",
-        "threads=1",
-        *more,
-    ]
-    train(
-        composed(
-            [*given, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "callbacks.heldout=null", "~logger"],
-            folder,
-        )
-    )
-    return folder
+def make_run(folder: Path, *given: str) -> Run:
+    """An untrained system in which there is something to see, its data and its configuration."""
+    picture = "+experiment=picture" in given
+    cfg = composed(["dataset=photos", f"dataset.path={folder}/scene.npz", *given][2 if picture else 0 :], folder)
+    data: RayDataModule | PixelDataModule
+    if picture:
+        data = PixelDataModule(Picture("sunset", "test", builtin_picture(64)), pixels=10)
+    else:
+        data = RayDataModule(make_scene(MARBLE, size=12, views=4, held_out=2))
+    system = build_system(cfg, frame_of(data)).eval()
+    with torch.no_grad():
+        for parameter in system.field.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape))
+    return system, data, plain_config(cfg)
 
 
-@pytest.fixture
-def run_folder(tmp_path_factory: pytest.TempPathFactory, own_cache: None, tmp_path: Path) -> Path:
-    """A run trained once, in a folder of the test's own."""
-    return Path(shutil.copytree(once(tmp_path_factory, "compact", trained), tmp_path / "run"))
+def make_compact(run: Run, precision: str = "byte") -> bytes:
+    system, data, config = run
+    return encode(system, precision, config, scene_content(data))
 
 
 @pytest.mark.parametrize(
-    ("recipe", "more"),
+    "given",
     [
-        ("tensorf_small", ()),
-        ("hashgrid_small", ("model.log2_entries=12",)),
-        ("voxels_small", ("model.finest=40",)),
-        ("mlp_small", ()),
-        ("hashgrid_small", ("sampler=uniform", "model.log2_entries=10")),
+        ("recipe=tensorf_small",),
+        ("recipe=hashgrid_small", "model.log2_entries=12"),
+        ("recipe=voxels_small", "model.coarsest=8", "model.finest=20"),
+        ("recipe=mlp_small",),
+        ("recipe=hashgrid_small", "sampler=uniform", "model.log2_entries=10"),
+        ("+experiment=picture",),
     ],
 )
-def test_it_shows_what_the_run_shows_in_far_fewer_bytes(
-    recipe: str, more: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    folder = trained(tmp_path, recipe, *more, "budget.steps=80")  # after 40, one of 400 pixels may make 0.3 dB
-    export_compact(folder)
-    assert "dB lost" in capsys.readouterr().out
-    run, small = load_run(folder).system, load_compact(folder / "compact.npz").system
-    held = sum(tensor.numel() * tensor.element_size() for tensor in run.state_dict().values())
-    assert (folder / "compact.npz").stat().st_size < 0.5 * held
-    from nerf_lightning.config.build import build_data
-
-    view = build_data(load_run(folder).cfg).held_out(0)
-    assert (run.evaluate(view).rgb - small.evaluate(view).rgb).abs().max() < 0.1
-    assert abs(run.evaluate(view).psnr - small.evaluate(view).psnr) < 0.2
+def test_compact_file_renders_like_the_run_in_fewer_bytes(given: tuple[str, ...], tmp_path: Path):
+    run = make_run(tmp_path, *given)
+    system, data, _ = run
+    content = make_compact(run)
+    small = decode(content, "compact").system
+    size = sum(tensor.numel() * tensor.element_size() for tensor in system.state_dict().values())
+    assert len(content) < 0.6 * size
+    view = data.held_out(0)
+    assert (system.evaluate(view).rgb - small.evaluate(view).rgb).abs().mean() < 0.01
 
 
-def test_halves_are_nearer_than_bytes(run_folder: Path):
-    folder = run_folder
-    errors, sizes, used = {}, {}, torch.empty(0)
-    planes = load_run(folder).system.field.density_volume.planes.detach()
+def test_halves_are_nearer_than_bytes(tmp_path: Path):
+    run = make_run(tmp_path, "recipe=hashgrid_small", "model.log2_entries=12")
+    name, whole = max(run[0].field.export_state().items(), key=lambda item: item[1].numel())
+    errors = {}
     for precision in ("half", "byte"):
-        path = folder / f"{precision}.npz"
-        export_compact(folder, precision=precision, output=path)
-        kept = load_compact(path).system.field.density_volume.planes.detach()
-        used = kept.any(-1) if precision == "half" else used  # bytes do not tell nothing from the least
-        errors[precision], sizes[precision] = float((kept - planes)[used].abs().max()), path.stat().st_size
-    assert errors["half"] < errors["byte"] / 4 and sizes["byte"] < sizes["half"]
-    assert errors["byte"] <= float(planes.max() - planes.min()) / 255
+        kept = decode(make_compact(run, precision), "compact").system.field.export_state()[name]
+        errors[precision] = float((kept - whole).abs().max())
+    assert errors["half"] < errors["byte"] / 4 and errors["byte"] <= float(whole.max() - whole.min()) / 255
 
 
-def test_pictures_too(tmp_path: Path):
-    given = ["+experiment=picture", "dataset.max_side=32", "budget.steps=40", "threads=1", "~logger"]
-    train(composed([*given, *(f"callbacks.{one}=null" for one in ("training_gif", "charts", "baselines"))], tmp_path))
-    export_compact(tmp_path)
-    assert load_compact(tmp_path / "compact.npz").orbit is None
-
-
-def test_too_much_lost_is_refused_and_nothing_written(run_folder: Path, monkeypatch: pytest.MonkeyPatch):
-    from nerf_lightning.export import smallest
-
-    folder = run_folder
+def test_smallest_refuses_what_loses_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scores = iter([30.0, 29.5, 29.6, 29.7, 29.4])
     monkeypatch.setattr(smallest, "held_out_psnr", lambda *_: next(scores))
     monkeypatch.setattr(smallest, "seen_cells", lambda system, _: smallest.occupied_cells(system) & False)  # not all
-    with pytest.raises(
-        InputError, match=r"0\.30 dB lost with --precision half, expected at most 0\.1 dB; allow it with --loss-db 0\.3"
-    ):
-        export_compact(folder)
-    assert not (folder / "compact.npz").exists()
+    with pytest.raises(InputError, match=r"0\.30 dB lost with --precision half, expected at most 0\.1 dB"):
+        smallest.smallest(*make_run(tmp_path, "recipe=hashgrid_small"), 0.1)
 
 
-def test_moved_photos_can_be_pointed_at(tmp_path: Path):
-    folder = trained(tmp_path)
-    (folder / "scene.npz").rename(folder / "moved.npz")
-    with pytest.raises(InputError, match=r"scene\.npz"):
-        export_compact(folder)
-    export_compact(folder, photos=folder / "moved.npz")
-    assert (folder / "compact.npz").exists()
-
-
-def changed(content: bytes, **arrays: np.ndarray) -> bytes:
+def test_compact_file_to_send_holds_no_folders(tmp_path: Path):
+    content = without_folders(make_compact(make_run(tmp_path)))
     with np.load(io.BytesIO(content)) as file:
-        whole = {**{key: file[key] for key in file.files}, **arrays}
-    out = io.BytesIO()
-    np.savez(out, **whole)
-    return out.getvalue()
+        header = file["header"].tobytes().decode()
+    assert str(tmp_path) not in header and json.loads(header)["config"]["dataset"]["path"] == "scene.npz"
 
 
 def with_header(content: bytes, **values: object) -> bytes:
     with np.load(io.BytesIO(content)) as file:
-        header = {**json.loads(file["header"].tobytes()), **values}
-    return changed(content, header=np.frombuffer(json.dumps(header).encode(), np.uint8))
+        arrays = {key: file[key] for key in file.files}
+    header = {**json.loads(arrays["header"].tobytes()), **values}
+    out = io.BytesIO()
+    np.savez(out, **{**arrays, "header": np.frombuffer(json.dumps(header).encode(), np.uint8)})
+    return out.getvalue()
 
 
-def test_what_is_broken_or_not_trusted_is_refused(run_folder: Path):
-    export_compact(run_folder)
-    content = (run_folder / "compact.npz").read_bytes()
-    for broken in (b"", b"no zip at all", content[: len(content) // 2]):
-        with pytest.raises(InputError, match="expected a compact file"):
-            decode(broken, "given.npz")
-    with pytest.raises(InputError, match="version 99, expected .* version 1; export the run again"):
-        decode(with_header(content, version=99), "given.npz")
-    config = load_run(run_folder).cfg
-    config.model._target_ = "os.system"
-    from omegaconf import OmegaConf
-
-    with pytest.raises(InputError, match=r"model\._target_: found 'os.system', expected a class of this package"):
-        decode(with_header(content, config=OmegaConf.to_container(config)), "given.npz")
-    with pytest.raises(InputError, match=r"given\.npz: found .*, expected the weights of the model it names"):
-        decode(with_header(content, arrays={}), "given.npz")
-    pickled = np.array([{"a": 1}], dtype=object)
-    with pytest.raises(InputError, match="expected a compact file"):
-        decode(changed(content, header=pickled), "given.npz")
+def test_damaged_or_untrusted_compact_file_is_refused(tmp_path: Path):
+    content = make_compact(make_run(tmp_path, "recipe=hashgrid_small", "model.log2_entries=10"))
+    with np.load(io.BytesIO(content)) as file:
+        config = json.loads(file["header"].tobytes())["config"]
+    for damaged, words in (
+        (b"", "expected a compact file"),
+        (content[: len(content) // 2], "expected a compact file"),
+        (with_header(content, version=99), "version 99"),
+        (with_header(content, config={**config, "version": "9.9"}), "version 9.9"),
+        (with_header(content, config={**config, "model": {"_target_": "os.system"}}), "a class of this package"),
+        (with_header(content, arrays={}), "the weights of the model"),
+        (with_header(content, scene=[]), "given.npz"),
+    ):
+        with pytest.raises(InputError, match=words):
+            decode(damaged, "given.npz")
     with pytest.raises(InputError, match="nothing there"):
-        load_compact(run_folder / "missing.npz")
-    assert torch.is_tensor(decode(content, "given.npz").system.field.aabb)
+        load_compact(tmp_path / "missing.npz")

@@ -52,7 +52,7 @@ def published(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_was_downloaded_is_found_from_anywhere(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_downloaded_scene_is_found_from_any_folder(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     run = a_run(tmp_path / "run", "dataset.folder=data")
     (tmp_path / "elsewhere").mkdir()
@@ -63,7 +63,7 @@ def test_what_was_downloaded_is_found_from_anywhere(published: Path, tmp_path: P
         again(run)
 
 
-def test_the_built_in_scene_stays_what_a_run_was_trained_on(tmp_path: Path):
+def test_built_in_scene_is_not_replaced_by_a_download(tmp_path: Path):
     run = a_run(tmp_path / "run", f"dataset.folder={tmp_path}")
     assert again(run).name == "bricks"
     save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), tmp_path / "published.npz")
@@ -74,7 +74,7 @@ def test_the_built_in_scene_stays_what_a_run_was_trained_on(tmp_path: Path):
     assert again(run, str(tmp_path / "published.npz")).name == "published"
 
 
-def test_a_strangers_run_neither_asks_the_network_nor_leaves_a_file(small_run: Path, inside, tmp_path: Path):
+def test_resumed_run_of_a_stranger_uses_no_network(small_run: Path, inside, tmp_path: Path):
     run = tmp_path / "run"
     shutil.copytree(small_run, run)
     config = yaml.safe_load((run / "config.yaml").read_text())
@@ -93,7 +93,7 @@ def test_a_strangers_run_neither_asks_the_network_nor_leaves_a_file(small_run: P
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (5e5, 5.4112e6, 300.0)], ids=["local", "georeferenced"])
-def test_photos_are_seen_in_the_frame_of_the_run(shift: tuple[float, float, float], tmp_path: Path):
+def test_other_photos_are_placed_in_the_frame_of_the_run(shift: tuple[float, float, float], tmp_path: Path):
     """Half of a capture has another middle and another scale than all of it; its cameras still stand where they stood."""
     whole = bricks(size=16, train_views=12, val_views=2, cache="")
     views: Views = whole.train

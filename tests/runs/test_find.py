@@ -7,13 +7,13 @@ import pytest
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.find import find_run, link_latest
-from nerf_lightning.runs.owner import LOCK
+from nerf_lightning.runs.owner import MARKER
 
 
 def make_run(folder: Path, seconds: float) -> Path:
     """A run that was last written at a time."""
     (folder / "checkpoints").mkdir(parents=True)
-    for name in ("config.yaml", "results.json", "checkpoints/last.ckpt", LOCK):
+    for name in ("config.yaml", "results.json", "checkpoints/last.ckpt", MARKER):
         (folder / name).touch()
         os.utime(folder / name, (seconds, seconds))
     return folder

@@ -8,7 +8,7 @@ import pytest
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.owner import LOCK, Taken, clear, own_folder, owned
+from nerf_lightning.runs.owner import LOCK, MARKER, Taken, clear, holds_run, own_folder, owned
 
 MANY = 8
 
@@ -48,7 +48,7 @@ def test_owned_removes_what_was_made_for_nothing(tmp_path: Path, monkeypatch: py
     assert not list(tmp_path.iterdir())
     with owned(Path("kept")):
         Path("kept/file").touch()
-    assert sorted(path.name for path in Path("kept").iterdir()) == [LOCK, "file"]
+    assert sorted(path.name for path in Path("kept").iterdir()) == [LOCK, MARKER, "file"]
 
 
 def test_owned_refuses_what_it_cannot_write_and_files_of_others(tmp_path: Path):
@@ -57,9 +57,12 @@ def test_owned_refuses_what_it_cannot_write_and_files_of_others(tmp_path: Path):
         pass
     with pytest.raises(InputError, match="other files in it"), owned(tmp_path):
         pass
-    with owned(tmp_path, resumed=True):
-        pass
-    assert (tmp_path / "file").exists()
+    (tmp_path / "config.yaml").touch()
+    for overwrite in (False, True):  # a run that somebody moved here, or no run at all
+        with pytest.raises((Taken, KeyError)), own_folder(tmp_path, overwrite) as folder:
+            clear(folder)
+            raise KeyError
+    assert (tmp_path / "file").exists() and not holds_run(tmp_path)
 
 
 def test_processes_that_share_a_run_leave_the_folder_to_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -77,6 +80,6 @@ def test_clear_removes_all_of_its_own_folder_and_only_runs_elsewhere(own: bool, 
     (tmp_path / "checkpoints" / "last.ckpt").touch()
     (tmp_path / "results.json").touch()
     if own:
-        (tmp_path / LOCK).touch()
+        (tmp_path / MARKER).touch()
     clear(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == [LOCK if own else "notes.txt"]
+    assert [path.name for path in tmp_path.iterdir()] == [MARKER if own else "notes.txt"]

@@ -8,13 +8,8 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at
 from nerf_lightning.kernels import cell_index, use_kernels
 from nerf_lightning.sampler import OccupancySampler, occupancy
-from nerf_lightning.sampler.occupancy import spread_evenly
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-
-
-def nowhere(positions: Tensor) -> Tensor:
-    raise AssertionError("not every step asks")
 
 
 def seeded(seed: int = 3) -> Generator:
@@ -27,7 +22,7 @@ def toward_the_cube(count: int, seed: int) -> Rays:
     return Rays(aside - 4 * directions, directions)
 
 
-def test_what_lies_inside_a_solid_is_looked_at_once_in_a_while():
+def test_occupancy_inside_solid_is_queried_after_updates_only():
     """A hard ball: training asks the field in its shell alone, but for the first step after each update.
 
     Where rays do not go front first, which would hide it.
@@ -64,7 +59,7 @@ def test_what_lies_inside_a_solid_is_looked_at_once_in_a_while():
     assert hit.sum() > 150 and close.float().mean() > 0.95, "and both see the surface"
 
 
-def test_a_cell_that_light_reaches_again_is_looked_at_again():
+def test_occupancy_cell_reached_again_is_queried_again():
     sampler = OccupancySampler(CUBE, samples=100, resolution=8, memory=2, decay=0.0)
     rays = Rays(torch.tensor([[-3.0, 0.1, 0.1]]), torch.tensor([[1.0, 0, 0]]))
     behind = int(cell_index(torch.tensor([[0.9, 0.55, 0.55]]), 8))
@@ -91,7 +86,7 @@ def cells(resolution: int) -> tuple[Tensor, float]:
     return torch.cartesian_prod(middle, middle, middle), math.sqrt(3) / resolution
 
 
-def test_updates_learn_where_the_content_is():
+def test_occupancy_updates_find_content():
     sampler = OccupancySampler(CUBE, samples=64, resolution=12, warmup=64)
     assert sampler.occupied.all(), "nothing is skipped before anything is known"
     centre, corner = cells(12)
@@ -101,70 +96,28 @@ def test_updates_learn_where_the_content_is():
     assert not sampler.occupied[centre.norm(dim=-1) > 0.5 + corner].any()
 
 
-def test_a_place_that_empties_is_forgotten():
-    sampler = OccupancySampler(CUBE, samples=64, resolution=8, warmup=64)
-    centre, corner = cells(8)
-    for step in range(0, 320, 16):
-        sampler.update(step, ball(-0.5), seeded(step))
-    for step in range(320, 3_200, 16):
-        sampler.update(step, ball(0.5), seeded(step))
-    assert not sampler.occupied[centre[:, 0] < -corner].any()
-    assert sampler.occupied[(centre - torch.tensor([0.5, 0, 0])).norm(dim=-1) < 0.5 - corner].all()
-
-
-def test_density_anywhere_in_a_cell_is_found_in_time():
-    """A speck a quarter of a cell in each direction: random places meet it sooner or later."""
-    speck = torch.tensor([0.13, 0.13, 0.13])
-    sampler = OccupancySampler(CUBE, samples=16, resolution=2, decay=1.0, warmup=10**6)
-    for step in range(0, 16 * 400, 16):
-        sampler.update(step, lambda x: 1000.0 * ((x - speck).abs() < 0.125).all(-1).float(), seeded(step))
-    assert sampler.occupied.tolist() == [False] * 7 + [True]
-
-
-@pytest.mark.parametrize("density", [0.0, 1e-3, 10.0])
-def test_a_field_of_one_density_everywhere_keeps_all_its_cells(density: float):
-    sampler = OccupancySampler(CUBE, samples=256, resolution=8)
-    for step in range(0, 512, 16):
-        sampler.update(step, lambda x: torch.full((len(x),), density), seeded(step))
-    assert sampler.occupied.all()
-
-
 @pytest.mark.parametrize(("share", "kept"), [(0.5, False), (2.0, True)])
-def test_the_threshold_is_the_optical_thickness_of_a_step(share: float, kept: bool):
+def test_occupancy_threshold_is_optical_thickness_of_step(share: float, kept: bool):
     sampler = OccupancySampler(CUBE, samples=100, resolution=4, threshold=0.02)
     thin = share * 0.02 / (2 * math.sqrt(3) / 100)
     sampler.update(0, lambda x: torch.where(x[:, 0] < 0, thin, 1000.0), seeded())
     assert sampler.occupied.tolist() == [kept] * 32 + [True] * 32
 
 
-def test_an_unbounded_scene_is_learned_outside_its_box_too():
+def test_occupancy_unbounded_scene_is_learned_outside_box():
     sampler = OccupancySampler(replace(CUBE, unbounded=True), samples=64, resolution=16)
     sampler.update(0, lambda x: 10.0 * (x[:, 0] > 3).float(), seeded())
     unit = replace(CUBE, unbounded=True).to_unit(torch.tensor([[20.0, 0, 0], [0.0, 0, 0], [-20.0, 0, 0]]))
     assert sampler.occupied[cell_index(unit, 16)].tolist() == [True, False, False]
 
 
-def test_updates_come_every_so_often_and_follow_the_generator():
-    samplers = [OccupancySampler(CUBE, samples=64, resolution=6, warmup=32) for _ in range(2)]
-    untouched = samplers[0].thickness.clone()
-    for step in (1, 15, 17):
-        samplers[0].update(step, nowhere, seeded())
-    assert torch.equal(samplers[0].thickness, untouched)
-    asked = []
-    for sampler in samplers:
-        for step in (0, 16, 32, 48):
-            sampler.update(step, lambda x: (asked.append(len(x)), x.norm(dim=-1))[1], seeded(step))
-    assert asked == [216, 216, 54, 54] * 2, "all cells, then a quarter"
-    assert torch.equal(samplers[0].thickness, samplers[1].thickness)
-
-
-@pytest.mark.parametrize("stop", [48, 52])
-def test_a_restored_sampler_goes_on_as_the_unbroken_one(stop: int):
+def test_occupancy_restored_sampler_continues_alike():
     sampler, restored = (OccupancySampler(CUBE, samples=64, resolution=8, memory=1) for _ in range(2))
 
     def solid(x: Tensor) -> Tensor:
         return 500.0 * (x.norm(dim=-1) < 0.7).float()
 
+    stop = 52
     for step in range(80):
         if step == stop:
             restored.load_state_dict(sampler.state_dict())
@@ -179,7 +132,7 @@ def test_a_restored_sampler_goes_on_as_the_unbroken_one(stop: int):
         assert torch.equal(taken[0], taken[-1]), step
 
 
-def test_what_too_few_cameras_have_in_view_stays_empty():
+def test_occupancy_cells_few_cameras_see_stay_empty():
     """Three cameras look along x from -4; a fourth, alone, looks along y: only what three see may hold anything."""
     eyes = torch.tensor([[-4.0, -0.1, 0], [-4, 0, 0], [-4, 0.1, 0], [0, -4, 0]])
     targets = torch.tensor([[0.0, -0.1, 0], [0, 0, 0], [0, 0.1, 0], [0, 0, 0]])
@@ -200,18 +153,7 @@ def test_what_too_few_cameras_have_in_view_stays_empty():
     assert not near.allowed.view(16, 16, 16)[2, 8, 8], "nearer than rays begin"
 
 
-def test_few_cameras_allow_what_all_of_them_see():
-    K = torch.tensor([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])[None]
-    c2w = look_at(torch.tensor([[-4.0, 0, 0]]), torch.zeros(1, 3), torch.tensor([0.0, 0, 1]))
-    sampler = OccupancySampler(CUBE, resolution=8, seen_by=3)
-    sampler.look_through(Cameras.of_size(K, c2w, 16, 16))
-    assert sampler.allowed.all()
-    away = look_at(torch.tensor([[-4.0, 0, 0]]), torch.tensor([[-9.0, 0, 0]]), torch.tensor([0.0, 0, 1]))
-    sampler.look_through(Cameras.of_size(K, away, 16, 16))
-    assert sampler.allowed.all(), "a view of nothing must not leave nothing to train"
-
-
-def test_steps_and_cells_follow_the_field_unless_stated():
+def test_occupancy_refine_steps_follow_field_unless_stated():
     usual, stated = OccupancySampler(CUBE), OccupancySampler(CUBE, resolution=16)
     assert (usual.samples, usual.resolution) == (192, 64)
     before = usual.length(usual.samples)
@@ -223,7 +165,7 @@ def test_steps_and_cells_follow_the_field_unless_stated():
     assert stated.samples == stated.picture_samples == 100 and usual.picture_samples == 4 * 128
 
 
-def test_finer_cells_hold_what_the_cells_that_they_lie_in_held(monkeypatch: pytest.MonkeyPatch):
+def test_occupancy_refine_finer_cells_keep_maximum(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(occupancy, "RESOLUTION", 8)
     sampler = OccupancySampler(CUBE, samples=100)
     sampler.thickness.copy_(torch.rand(8**3, generator=seeded()))
@@ -244,7 +186,7 @@ def test_finer_cells_hold_what_the_cells_that_they_lie_in_held(monkeypatch: pyte
     assert sampler.thickness.max() == pytest.approx(before["thickness"].max() * 100 / 72), "for a step as long as now"
 
 
-def test_a_state_of_any_stage_loads_into_any_other():
+def test_occupancy_state_of_any_stage_loads():
     early, late = OccupancySampler(CUBE), OccupancySampler(CUBE)
     late.refine(1.25)
     late.occupied = torch.rand(80**3) < 0.5
@@ -259,21 +201,3 @@ def test_a_state_of_any_stage_loads_into_any_other():
         OccupancySampler(CUBE, resolution=16).import_state(late.export_state())
     with pytest.raises(RuntimeError, match="size mismatch"):
         OccupancySampler(CUBE, resolution=16).load_state_dict(late.state_dict())
-
-
-def test_pictures_take_finer_steps_than_training(rays: Rays, box: Bounds):
-    sampler = OccupancySampler(box, resolution=8)
-    training, picture = (sampler(rays, lambda x: torch.ones(len(x)), generator) for generator in (seeded(), None))
-    assert picture.dt.max() < 0.76 * training.dt.max() and len(picture) > 1.2 * len(training)
-
-
-def test_cells_are_looked_at_all_over_and_elsewhere_each_time():
-    numbers = torch.arange(0, 40000, 4, dtype=torch.int32)
-    one, other = (spread_evenly(numbers, torch.Generator().manual_seed(seed)) for seed in (0, 1))
-    for places in (one, other, spread_evenly(numbers + 2_000_000_000, torch.Generator().manual_seed(0))):
-        assert float(places.min()) >= 0 and float(places.max()) < 1
-        cells = (places * 10).long()
-        counts = torch.bincount((cells[0] * 10 + cells[1]) * 10 + cells[2], minlength=1000)
-        assert int(counts.min()) >= 5 and int(counts.max()) <= 16  # 10 each
-    moved = (other - one) % 1
-    assert (moved - moved[:, :1]).abs().max() < 1e-6 and moved[:, 0].min() > 1e-3

@@ -2,12 +2,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from agreement import agree
 from torch import Generator
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import along, resample, volume_weights
+from nerf_lightning.kernels import volume_weights
 from nerf_lightning.sampler import OccupancySampler, ProposalSampler, Samples, suited_sampler
 from nerf_lightning.sampler.proposal import interlevel_loss
 from nerf_lightning.sampler.samples import Histogram
@@ -57,7 +56,7 @@ def share_on_surfaces(samples: Samples, some: Rays) -> float:
     return float((((far - 0.3).abs() < 0.1) | ((far - 4).abs() < 0.4)).float().mean())
 
 
-def test_samples_move_to_where_the_field_has_surfaces():
+def test_proposal_sampler_after_training_finds_surfaces():
     small = ProposalSampler(AROUND, anneal=20)
     some = rays(200, 99)
     before = share_on_surfaces(small(some, ball), some)
@@ -65,18 +64,7 @@ def test_samples_move_to_where_the_field_has_surfaces():
     assert before < 0.25 and after > 0.5
 
 
-def test_first_proposals_hardly_count_and_then_in_full():
-    sampler = ProposalSampler(AROUND, anneal=100)
-    trusts = []
-    for step in (0, 10, 50, 99, 5000):
-        sampler.update(step, nothing, Generator())
-        trusts.append(sampler.trust)
-    assert trusts == sorted(trusts) and trusts[0] < 0.1 and trusts[-2] == trusts[-1] == 1
-    sampler.restart(5000)
-    assert sampler.trust < 0.1 and not sampler.grid.tables.any()
-
-
-def test_every_ray_has_its_samples_in_order_without_gaps():
+def test_proposal_sampler_samples_tile_ray():
     sampler, some = ProposalSampler(AROUND, samples=10), rays(30)
     samples = sampler(some, nothing, Generator().manual_seed(1))
     t, dt = samples.t.view(30, 10), samples.dt.view(30, 10)
@@ -86,7 +74,7 @@ def test_every_ray_has_its_samples_in_order_without_gaps():
     torch.testing.assert_close(t[:, 1:] - dt[:, 1:] / 2, t[:, :-1] + dt[:, :-1] / 2, rtol=1e-4, atol=1e-4)
 
 
-def test_a_picture_does_not_depend_on_chance_or_on_how_its_rays_are_split():
+def test_proposal_sampler_picture_is_the_same_in_parts():
     sampler, some = taught(ProposalSampler(AROUND), 10), rays(40)
     whole, again = sampler(some, ball), sampler(some, ball)
     parts = [sampler(some[first : first + 7], ball) for first in range(0, 40, 7)]
@@ -94,13 +82,7 @@ def test_a_picture_does_not_depend_on_chance_or_on_how_its_rays_are_split():
     assert whole.proposals is None and sampler.loss(whole, whole.t) is None
 
 
-def test_training_draws_from_its_generator_alone():
-    sampler, some = ProposalSampler(AROUND), rays(40)
-    one, two, other = (sampler(some, nothing, Generator().manual_seed(seed)) for seed in (3, 3, 4))
-    assert torch.equal(one.t, two.t) and not torch.equal(one.t, other.t)
-
-
-def test_only_weight_that_nobody_expected_costs():
+def test_interlevel_loss_only_unexpected_weight_costs():
     edges = torch.linspace(0, 1, 5)[None]
     found = torch.tensor([[0.0, 0.2, 0.5, 0.0]])
 
@@ -117,7 +99,7 @@ def test_only_weight_that_nobody_expected_costs():
     assert too_little[1] == 0 and too_little[2] < 0
 
 
-def test_what_rendering_needs_comes_back():
+def test_proposal_sampler_state_export_renders_alike():
     sampler, other, some = taught(ProposalSampler(AROUND), 20), ProposalSampler(AROUND), rays(20)
     other.import_state(sampler.export_state())
     assert torch.equal(sampler(some, ball).t, other(some, ball).t)
@@ -125,33 +107,12 @@ def test_what_rendering_needs_comes_back():
         ProposalSampler(AROUND, finest=48).import_state(sampler.export_state())
 
 
-def test_no_padding_would_let_places_starve():
-    with pytest.raises(InputError, match="sampler.padding"):
-        ProposalSampler(AROUND, padding=0.0)
-
-
 @pytest.mark.parametrize("final", [0.0, 1.5])
-def test_a_rate_that_grows_or_learns_nothing_is_refused(final: float):
+def test_proposal_sampler_final_rate_out_of_range_is_refused(final: float):
     with pytest.raises(InputError, match=f"sampler.final: found {final}, expected above 0, at most 1"):
         ProposalSampler(AROUND, final=final)
 
 
-@pytest.mark.parametrize("unbounded", [False, True])
-def test_fast_and_plain_intervals_agree(unbounded: bool):
-    bounds, some = replace(AROUND, unbounded=unbounded), rays(50)
-    near, far = bounds.near_far(some)
-    s = torch.rand(50, 13).sort(1).values
-    agree(lambda *given: along(some, bounds, *given), [near, far, s], constants=(0, 1, 2), rtol=0, atol=0)
-
-
-def test_fast_and_plain_resampling_agree():
-    s, share, shift = torch.rand(50, 13).sort(1).values, torch.rand(50, 12), torch.rand(50) - 0.5
-    share[::5] = 0
-    agree(lambda *given: resample(*given, 20), [s, share, shift], constants=(0, 1, 2), rtol=1e-4, atol=1e-4)
-    even = resample(torch.linspace(0, 1, 5)[None], torch.zeros(1, 4), torch.zeros(1), 8)
-    torch.testing.assert_close(even, torch.linspace(0, 1, 9)[None])
-
-
-def test_a_background_asks_for_proposals_and_empty_space_for_a_grid():
+def test_suited_sampler_unbounded_scene_takes_proposals():
     assert isinstance(suited_sampler(AROUND), ProposalSampler)
     assert isinstance(suited_sampler(replace(AROUND, unbounded=False, near=None)), OccupancySampler)

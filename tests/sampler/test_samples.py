@@ -1,4 +1,3 @@
-import jaxtyping
 import pytest
 import torch
 
@@ -6,8 +5,8 @@ from nerf_lightning.cameras import Rays
 from nerf_lightning.sampler import Samples, pack
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
-def test_packing_keeps_the_chosen_intervals_ray_by_ray(share: float):
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_pack_keeps_chosen_intervals_ray_by_ray(share: float):
     edges = torch.rand(13, 8).cumsum(1)
     keep = torch.rand(13, 7) < share
     t, dt, ray, offsets = [], [], [], [0]
@@ -26,22 +25,9 @@ def test_packing_keeps_the_chosen_intervals_ray_by_ray(share: float):
     torch.testing.assert_close(samples.dt, torch.tensor(dt), rtol=1e-4, atol=1e-6)
 
 
-def test_positions_lie_on_the_samples_own_rays():
+def test_samples_positions_lie_on_own_rays():
     rays = Rays(torch.tensor([[0.0, 0, 0], [1, 2, 3]]), torch.tensor([[1.0, 0, 0], [0, 0.6, 0.8]]))
     t, ray = torch.tensor([2.0, 5.0, 10.0]), torch.tensor([0, 1, 1])
     samples = Samples(t, torch.ones(3), ray, torch.tensor([0, 1, 3]))
     torch.testing.assert_close(samples.positions(rays), torch.tensor([[2.0, 0, 0], [1, 5, 7], [1, 8, 11]]))
     assert torch.equal(samples.directions(rays), rays.directions[[0, 1, 1]])
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: pack(torch.zeros(4, 5), torch.ones(3, 4, dtype=torch.bool)),
-        lambda: pack(torch.zeros(4, 5), torch.ones(4, 4)),
-        lambda: Samples(torch.zeros(3), torch.zeros(2), torch.zeros(3).long(), torch.zeros(2).long()),
-    ],
-)
-def test_a_wrong_shape_or_type_is_refused_in_tests(call):
-    with pytest.raises(jaxtyping.TypeCheckError):
-        call()

@@ -34,7 +34,7 @@ def bare(steps: int) -> L.Trainer:
     )
 
 
-def test_a_trainer_with_steps_alone_gives_the_weights_of_a_budget_of_as_many(tmp_path: Path):
+def test_plain_trainer_same_steps_gives_same_weights(tmp_path: Path):
     cfg = composed([*OPTIONS, *OFF], tmp_path)
     train(cfg)
     expected = load_run(tmp_path).system.state_dict()
@@ -51,9 +51,7 @@ def test_a_trainer_with_steps_alone_gives_the_weights_of_a_budget_of_as_many(tmp
 
 
 @pytest.mark.parametrize(("weight", "unbounded"), [(0.0, True), (0.001, False), (0.001, True)])
-def test_plain_places_are_looked_for_before_a_background_where_view_parts_have_a_price(
-    weight: float, unbounded: bool, tmp_path: Path
-):
+def test_plain_places_are_found_for_view_loss_of_unbounded_scene(weight: float, unbounded: bool, tmp_path: Path):
     cfg = composed([*OPTIONS, "model.split_colour=true", f"renderer.view_loss_weight={weight}"], tmp_path)
     data = build_data(cfg)
     data.scene = replace(data.scene, bounds=replace(data.scene.bounds, unbounded=unbounded))
@@ -64,30 +62,7 @@ def test_plain_places_are_looked_for_before_a_background_where_view_parts_have_a
 PROPOSALS = ("refine=poses", "sampler=proposal", "~sampler.resolution", "sampler.final=0.01", "optimizer.lr=0.02")
 
 
-def test_a_run_whose_proposals_learned_with_the_field_goes_on_so(tmp_path: Path):
-    """As runs did before proposals had a rate of their own."""
-    cfg, saved = composed([*OPTIONS, *PROPOSALS, "schedule=constant"], tmp_path), tmp_path / "before.ckpt"
-    data = build_data(cfg)
-    first, trainer = build_system(cfg, frame_of(data), CPU), bare(2)
-    trainer.fit(first, data)
-    trainer.save_checkpoint(saved)
-    content = torch.load(saved, weights_only=True)
-    (state,) = content["optimizer_states"]
-    field, proposals, poses = state["param_groups"]
-    del proposals["final"]
-    state["param_groups"] = [{**field, "params": field["params"] + proposals["params"]}, poses]
-    torch.save(content, saved)
-
-    system = build_system(cfg, frame_of(data), CPU)
-    bare(4).fit(system, data, ckpt_path=saved, weights_only=True)
-    assert isinstance(system, NeRF3D)
-    optimizer = system.optimizers(use_pl_optimizer=False)
-    assert all(int(optimizer.state[parameter]["step"]) == 4 for parameter in system.sampler.parameters())
-    assert [group["lr"] for group in system.parameter_groups[:2]] == [0.02, 0.02]
-    assert [group["params"] for group in system.parameter_groups] == [group["params"] for group in system.learned()]
-
-
-def test_proposals_and_corrections_learn_at_rates_of_their_own(tmp_path: Path):
+def test_proposals_and_corrections_have_own_learning_rates(tmp_path: Path):
     cfg = composed([*OPTIONS, *PROPOSALS, "schedule=constant"], tmp_path)
     data = build_data(cfg)
     system, trainer = build_system(cfg, frame_of(data), CPU), bare(2)

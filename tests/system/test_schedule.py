@@ -9,13 +9,8 @@ STEPS = [i / 200 for i in range(201)]
 
 
 @SCHEDULES
-def test_without_warm_up_it_starts_at_one(schedule):
-    assert schedule(0.0, 0, 0.0) == 1.0
-
-
-@SCHEDULES
 @pytest.mark.parametrize("warmup", [0.05, 0.3])
-def test_warm_up_rises_to_the_schedule_without_it(schedule, warmup):
+def test_schedule_warmup_rises_linearly(schedule, warmup):
     assert 0 < schedule(0.0, 0, warmup) < 0.05, "small, but no step is lost"
     assert schedule(warmup, 0, warmup) == pytest.approx(schedule(warmup, 0, 0.0))
     rising = [schedule(p, 0, warmup) / schedule(p, 0, 0.0) for p in STEPS if p <= warmup]
@@ -25,7 +20,7 @@ def test_warm_up_rises_to_the_schedule_without_it(schedule, warmup):
 
 
 @pytest.mark.parametrize(("schedule", "final"), [(exponential, 0.1), (exponential, 0.01), (cosine, 0.0), (cosine, 0.2)])
-def test_it_falls_to_the_final_factor(schedule, final):
+def test_schedule_falls_to_final_factor(schedule, final):
     values = [schedule(p, 0, 0.0, final) for p in STEPS]
     assert values[0] == 1 and values[-1] == pytest.approx(final)
     assert all(a > b for a, b in zip(values, values[1:], strict=False))
@@ -33,13 +28,13 @@ def test_it_falls_to_the_final_factor(schedule, final):
     assert values[100] == pytest.approx(halfway)
 
 
-def test_constant_stays():
+def test_constant_schedule_stays():
     assert {constant(p) for p in STEPS} == {1.0}
     assert {constant(p, 0, 0.1) for p in STEPS if p >= 0.1} == {1.0}
 
 
 @SCHEDULES
-def test_many_steps_are_taken_at_a_lower_rate(schedule):
+def test_schedule_inverse_root_lowers_rate_of_many_steps(schedule):
     assert schedule(0.5, 0, inverse_root=100) == schedule(0.5, 9999) == schedule(0.5)
     assert schedule(0.5, 300, inverse_root=100) == pytest.approx(schedule(0.5) / 2)
     assert schedule(0.5, 9900, inverse_root=100) == pytest.approx(schedule(0.5) / 10)

@@ -20,7 +20,7 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import NoRoom
 from nerf_lightning.model import TensoRFField
 from nerf_lightning.runs.folder import load_run
-from nerf_lightning.runs.owner import LOCK
+from nerf_lightning.runs.owner import LOCK, MARKER
 from nerf_lightning.system import System
 from nerf_lightning.training.train import train
 
@@ -48,7 +48,7 @@ def assert_same(one: State, other: State) -> None:
 
 
 def temporary_files() -> list[Path]:
-    return [path for path in Path().rglob(".*") if path.name != LOCK]
+    return [path for path in Path().rglob(".*") if path.name not in (LOCK, MARKER)]
 
 
 @pytest.fixture(scope="module")

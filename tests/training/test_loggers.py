@@ -14,6 +14,33 @@ from nerf_lightning.training import loggers
 SMALL = ("+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3", "callbacks=null", "hydra.run.dir=run")
 
 
+def test_tensorboard_run_is_one_file_with_curves_config_and_short_hparams(inside, tmp_path: Path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+
+    small = [word for word in SMALL if word != "callbacks=null"]
+    quick = ("callbacks.throughput.every=1", "callbacks.training_gif=null", "callbacks.charts=null", "seed=3")
+    code, _, err = inside(*small, *quick)
+    assert code == 0, err
+    results = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
+    (file,) = (tmp_path / "run").glob("events.out.tfevents.*")
+    assert not (tmp_path / "run" / "hparams.yaml").exists()
+    events = EventAccumulator(str(file)).Reload()
+    assert [event.step for event in events.Scalars("loss/rgb")] == [1, 2, 3]
+    last = events.Scalars("val/psnr")[-1]
+    assert (last.step, last.value) == (3, pytest.approx(results["psnr"], abs=1e-3))
+    dated = last.wall_time - events.Scalars("speed/train_seconds")[0].wall_time
+    passed = results["train_seconds"] - events.Scalars("speed/train_seconds")[0].value
+    assert dated == pytest.approx(passed, abs=0.01), "dates are seconds of training"
+    assert not [name for name in events.Tags()["scalars"] if name.startswith(("final", "hp", "test"))]
+    (text,) = events.Tensors("config/text_summary")
+    assert b"max_side: 16" in text.tensor_proto.string_val[0]
+    content = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    told = HParamsPluginData.FromString(content).session_start_info.hparams
+    assert set(told) == {"method", "recipe", "seed", "bytes"}
+    assert told["method"].string_value == "picture_mlp" and told["bytes"].number_value == results["artifact_bytes"]
+
+
 def test_csv(inside, tmp_path: Path):
     code, out, err = inside(*SMALL, "logger=csv", "seed=3")
     assert code == 0 and "tensorboard" not in out, err
@@ -22,7 +49,7 @@ def test_csv(inside, tmp_path: Path):
     with (folder / "metrics.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     figures = {key: float(value) for row in rows for key, value in row.items() if value}
-    assert [figures["test/psnr"], figures["final/psnr"]] == pytest.approx([results["psnr"]] * 2, abs=1e-4)
+    assert [figures["val/psnr"], figures["final/psnr"]] == pytest.approx([results["psnr"]] * 2, abs=1e-4)
     assert figures["final/artifact_bytes"] == results["artifact_bytes"] and figures["step"] == 3
     options = yaml.safe_load((folder / "hparams.yaml").read_text(encoding="utf-8"))
     assert (options["seed"], options["budget"]["steps"]) == (3, 3)

@@ -19,8 +19,8 @@ from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.dataset.picture import builtin_picture
 from nerf_lightning.dataset.pixels import Picture
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.owner import LOCK
-from nerf_lightning.stability.toys import MARBLE, toy
+from nerf_lightning.runs.owner import LOCK, MARKER
+from nerf_lightning.synthetic.objects import MARBLE, make_scene
 from nerf_lightning.system import NeRF2D
 from nerf_lightning.utils.device import CPU, devices, synchronize, the_device
 from nerf_lightning.utils.machine import accelerator, device_in_words
@@ -72,7 +72,7 @@ def test_resumed_run_may_use_another_device(inside, small_run: Path, plain_torch
     for key in ("device", "trainer.accelerator"):
         code, _, err = inside(f"resume={run}", f"{key}=cuda")
         assert code == 2 and err.count("\n") == 1 and "device: found 'cuda', but" in err, err
-    after = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.name != LOCK}
+    after = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.name not in (LOCK, MARKER)}
     assert before == after, "nothing was touched"
     code, _, err = inside(f"resume={run}", "device=cpu", "limits.chunk=100", "budget.steps=12")
     assert code == 0, err
@@ -169,7 +169,7 @@ def test_limits_follow_device_and_run(device: str, batch: int, chunk: int):
 def test_chunk_follows_the_device(tmp_path: Path):
     from nerf_lightning.config.build import PictureFrame, frame_of
 
-    cfg, data = composed([], tmp_path), RayDataModule(toy(MARBLE, size=4, views=3, held_out=1))
+    cfg, data = composed([], tmp_path), RayDataModule(make_scene(MARBLE, size=4, views=3, held_out=1))
     assert build_system(cfg, frame_of(data)).chunk == 32768
     system = build_system(cfg, frame_of(data), torch.device("cuda"))
     assert system.chunk == system.sampler.chunk == 524288
@@ -191,7 +191,7 @@ def test_resumed_batch_is_scaled_to_the_device():
     picture = PixelDataModule(Picture("sunset", "test", builtin_picture(8)), pixels=10)
     picture.enlarge(4)
     assert len(picture.draw(0).uv) == 40
-    scene = toy(MARBLE, size=4, views=3, held_out=1)
+    scene = make_scene(MARBLE, size=4, views=3, held_out=1)
     small, large, fixed = (RayDataModule(scene, 100, samples) for samples in (1000, 1000, None))
     large.enlarge(8)
     fixed.enlarge(8)

@@ -7,7 +7,7 @@ import torch
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.stability.toys import MARBLE, toy
+from nerf_lightning.synthetic.objects import MARBLE, make_scene
 from nerf_lightning.training.train import prepare_system
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.memory import check_memory, free_memory, out_of_memory
@@ -23,7 +23,7 @@ def test_free_memory_is_plausible_and_checked():
 
 def test_field_larger_than_memory_is_refused_before_training(tmp_path, monkeypatch: pytest.MonkeyPatch):
     cfg = composed(["model.log2_entries=16"], tmp_path)
-    data = RayDataModule(toy(MARBLE, size=4, views=3, held_out=1))
+    data = RayDataModule(make_scene(MARBLE, size=4, views=3, held_out=1))
     needed = prepare_system(cfg, data, CPU, False).field.training_bytes
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": needed // 2}))
     with pytest.raises(InputError, match="config: model: found numbers"):

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf_lightning.capture.poses.bundle import Bundle, simplified
+from nerf_lightning.capture.poses.flips import resolve_flips
 from nerf_lightning.capture.poses.geometry import folds, inverse
 from nerf_lightning.capture.poses.pose import Hypothesis, mark_poses, photo_poses, points_and_pixels
 from nerf_lightning.capture.poses.refine import Refined, refine, rms_length
-from nerf_lightning.capture.poses.walk import choose
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.dataset.lens import Lens
 
@@ -117,7 +117,7 @@ def solve(
     if not placed:
         return None
     seen = [points_and_pixels(marks[i], tags) for i in placed]
-    chosen = choose(lens, [options[i] for i in placed], seen)
+    chosen = resolve_flips(lens, [options[i] for i in placed], seen)
     w2c = np.stack([options[i][c].pose for i, c in zip(placed, chosen, strict=True)])
     numbers = sorted({tag for i in placed for tag in marks[i] if tag in tags})
     row = {tag: n for n, tag in enumerate(numbers)}

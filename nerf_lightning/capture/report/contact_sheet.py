@@ -1,6 +1,5 @@
 """Contact sheets: small photos with their tags outlined, and the error of each photo or why it was left out."""
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -9,21 +8,19 @@ from math import ceil, sqrt
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.figure import Figure
 
 from nerf_lightning.capture.outcome import Outcome, thinned
 from nerf_lightning.capture.tags.detect import THREADS
 from nerf_lightning.dataset.formats.decode import read_pixels
-from nerf_lightning.drawing.ink import DPI, FONT, ORANGE, SKY, VERMILLION, readable, rgb
+from nerf_lightning.drawing.contact_sheet import GAP, contact_sheet
+from nerf_lightning.drawing.ink import ORANGE, SKY, rgb
 
 WIDTH = 2400
 """Of a sheet, pixels."""
 MOST = 24
 """Photos of one folder on a sheet."""
 KEY = "Outlined: tags as found, with their ids. Crosses: where the solved cameras put the corners. px: rms reprojection error."
-GAP, LINE, HEADING = 12, 26, 64
-"""Pixels between photos, a line of a caption, and of a folder's heading."""
-POINTS = 13
+TEXT_PX = 18
 """Size of the captions' letters."""
 SHIFT = 4
 """OpenCV draws at 1 / 2^SHIFT pixels."""
@@ -82,57 +79,27 @@ def heading(title: str, outcomes: Sequence[Outcome], shown: Sequence[Outcome]) -
     return text if len(shown) == len(outcomes) else f"{text}; {len(shown)} evenly chosen ones are shown"
 
 
-def contact_sheet(folders: Mapping[str, Sequence[Outcome]], aspect: float) -> Figure:
+def tag_sheet(folders: Mapping[str, Sequence[Outcome]], aspect: float) -> UInt8[np.ndarray, "H W 3"]:
     """The photos of each folder, one folder below the other; an even choice where there are many.
 
     Args:
         folders: their outcomes, by title.
         aspect: width / height of most photos.
     """
-    strips = [_blank(2 * LINE)]
-    texts: list[tuple[float, float, str, str, float]] = [(GAP, 2 * LINE - 10, KEY, "black", POINTS)]
-    top = 2 * LINE
+    sheets: list[UInt8[np.ndarray, "H W 3"]] = []
     for title, outcomes in folders.items():
         shown = thinned(outcomes, MOST)
-        texts.append((GAP, top + HEADING - 14, heading(title, outcomes, shown), "black", POINTS + 7))
-        strips.append(_blank(HEADING))
-        top += HEADING
         columns = min(6, max(3, ceil(sqrt(1.5 * len(shown)))))
         width = (WIDTH - GAP) // columns - GAP
-        height = round(width / aspect)
         with ThreadPoolExecutor(THREADS) as pool:
-            small = list(pool.map(partial(_thumbnail, width=width, height=height), shown))
-        for first in range(0, len(shown), columns):
-            row = shown[first : first + columns]
-            captions = [textwrap.wrap(readable(o.caption), int(width / (0.85 * POINTS))) for o in row]
-            strip = _blank(height + LINE * max(map(len, captions)) + 2 * GAP)
-            for i, (outcome, lines) in enumerate(zip(row, captions, strict=True)):
-                left, image = GAP + i * (width + GAP), small[first + i]
-                strip[: image.shape[0], left : left + image.shape[1]] = image
-                colour = VERMILLION if outcome.reason else "black"
-                for n, line in enumerate(lines):
-                    below = top + image.shape[0] + (n + 1) * LINE - 4
-                    texts.append((left, below, line, colour, POINTS))
-            strips.append(strip)
-            top += len(strip)
-    return _figure(np.concatenate(strips), texts)
-
-
-def _blank(height: int) -> UInt8[np.ndarray, "H W 3"]:
-    return np.full((height, WIDTH, 3), 255, np.uint8)
+            small = list(pool.map(partial(_thumbnail, width=width, height=round(width / aspect)), shown))
+        text = heading(title, outcomes, shown) if sheets else f"{KEY}\n{heading(title, outcomes, shown)}"
+        left_out = [i for i, outcome in enumerate(shown) if outcome.reason]
+        captions = [outcome.caption for outcome in shown]
+        sheets.append(contact_sheet(small, captions, columns, WIDTH, left_out, text, TEXT_PX))
+    return np.concatenate(sheets)
 
 
 def _thumbnail(outcome: Outcome, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
     photo = np.ascontiguousarray(read_pixels(outcome.path, upright=True)[..., :3])
     return annotated(photo, outcome, width, height)
-
-
-def _figure(sheet: UInt8[np.ndarray, "H W 3"], texts: list[tuple[float, float, str, str, float]]) -> Figure:
-    """A picture, pixel by pixel, with texts on it: x and y of the start of the base line, the text, its colour and size."""
-    height, width = sheet.shape[:2]
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
-    figure.figimage(sheet, origin="upper")
-    for x, y, text, colour, points in texts:
-        place = x / width, 1 - y / height
-        figure.text(*place, text, color=colour, fontsize=points, fontfamily=FONT, parse_math=False)
-    return figure

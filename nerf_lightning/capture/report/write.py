@@ -3,22 +3,20 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import imageio.v3 as imageio
 import numpy as np
-from jaxtyping import Float
-from matplotlib.figure import Figure
+from jaxtyping import Float, UInt8
 
 from nerf_lightning.capture.outcome import calibration_outcomes, photo_outcomes
 from nerf_lightning.capture.outputs import Placed
 from nerf_lightning.capture.poses.geometry import move
-from nerf_lightning.capture.report.contact_sheet import contact_sheet
+from nerf_lightning.capture.report.contact_sheet import tag_sheet
 from nerf_lightning.capture.report.coverage_chart import coverage_chart
 from nerf_lightning.capture.report.error_chart import error_chart
 from nerf_lightning.capture.run import Capture
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.drawing.camera_map import camera_map
 from nerf_lightning.drawing.ink import pixels_of
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.drawing.panels import write_png
 
 
 def write_report(capture: Capture, folder: Path) -> list[Path]:
@@ -37,18 +35,18 @@ def write_report(capture: Capture, folder: Path) -> list[Path]:
     """
     lens = capture.calibration.lens
     folders = {"calibration": calibration_outcomes(capture), "photos": photo_outcomes(capture)}
-    figures = {
-        "tags": contact_sheet(folders, lens.width / lens.height),
-        "errors": error_chart(folders, lens),
-        "coverage": coverage_chart(capture.calibration),
-        "cameras": camera_map(numbered(capture.photos), capture.scene, tag_corners(capture), "metres"),
+    pictures = {
+        "tags": tag_sheet(folders, lens.width / lens.height),
+        "errors": pixels_of(error_chart(folders, lens)),
+        "coverage": pixels_of(coverage_chart(capture.calibration)),
+        "cameras": pixels_of(camera_map(numbered(capture.photos), capture.scene, tag_corners(capture), "metres")),
     }
-    return [_write(figure, folder / f"{name}.png") for name, figure in figures.items()]
+    return [_write(picture, folder / f"{name}.png") for name, picture in pictures.items()]
 
 
 def draw_cameras(photos: list[Placed], scene: Scene, folder: Path) -> Path:
     """Writes `cameras.png` alone, for a capture without tags."""
-    return _write(camera_map(numbered(photos), scene, {}), folder / "cameras.png")
+    return _write(pixels_of(camera_map(numbered(photos), scene, {})), folder / "cameras.png")
 
 
 def tag_corners(capture: Capture) -> dict[int, Float[np.ndarray, "M 3"]]:
@@ -62,7 +60,6 @@ def numbered(photos: Sequence[Placed]) -> list[tuple[int, Float[np.ndarray, "4 4
     return [(number, photo.c2w) for number, photo in enumerate(photos, 1) if photo.c2w is not None]
 
 
-def _write(figure: Figure, file: Path) -> Path:
-    with atomic(file) as temporary:
-        imageio.imwrite(temporary, pixels_of(figure))
+def _write(picture: UInt8[np.ndarray, "H W 3"], file: Path) -> Path:
+    write_png(file, picture)
     return file

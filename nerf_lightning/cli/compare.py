@@ -1,0 +1,51 @@
+"""nerf_lightning compare."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from nerf_lightning.cli.command import Output, command
+from nerf_lightning.utils.options import AtLeast
+
+
+@command
+def compare(
+    runs: list[Path] | None = None,
+    /,
+    *,
+    seconds: Annotated[float, AtLeast(0)] = 15.0,
+    within_db: Annotated[float, AtLeast(0)] = 0.5,
+    smallest_within_db: Annotated[float, AtLeast(0)] = 1.0,
+    references: str = "published",
+    output: Output = None,
+) -> Any:
+    """Compare runs: which method is worth its time and bytes, as a page, a figure, a table and advice in words.
+
+    Medians over seeds; runs of other scenes or machines stand apart. `train +experiment=pareto` makes runs to compare.
+
+    Args:
+        runs: Folders with runs in them or below them; default: outputs/.
+        seconds: Name the best after this much training, too.
+        within_db: How near to the best the fastest must be, dB.
+        smallest_within_db: How near to the best the smallest must be, dB.
+        references: Published figures of the same scene: published, none, or a YAML file of your own.
+        output: Folder for compare.html, compare.png and compare.csv; default: compare/ in the first folder.
+
+    Returns:
+        The pandas.DataFrame that compare.csv holds.
+
+    Raises:
+        InputError: for a folder that is not there or holds no run, and for references that cannot be read.
+    """
+    from nerf_lightning.compare.references import PUBLISHED, read_references
+    from nerf_lightning.compare.report import write_comparison
+    from nerf_lightning.runs.find import OUTPUTS
+    from nerf_lightning.runs.index import find_runs
+    from nerf_lightning.utils.files import output_path, user_path
+
+    folders = [user_path(folder) for folder in runs or []] or [OUTPUTS]
+    folder = folders[0] / "compare" if output is None else output_path(output)
+    file = PUBLISHED if references in ("published", "none") else user_path(references)
+    published = read_references(file)
+    published = published.head(0) if references == "none" else published
+    found = {run.folder.resolve(): run for folder in folders for run in find_runs(folder)}
+    return write_comparison(list(found.values()), folder, published, within_db, seconds, smallest_within_db)

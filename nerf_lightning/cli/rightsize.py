@@ -1,0 +1,88 @@
+"""nerf_lightning rightsize."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from nerf_lightning.cli.command import command
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.options import AtLeast
+
+IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic")
+"""Suffixes of a 2D image."""
+
+
+@command
+def rightsize(
+    scene: str,
+    overrides: list[str] | None = None,
+    /,
+    *,
+    within_db: Annotated[float, AtLeast(0)] | None = None,
+    psnr: float | None = None,
+    ladder: str | None = None,
+    output: Annotated[Path, Parameter(alias="-o")] = Path("outputs/rightsize"),
+) -> dict[str, Any]:
+    """Find the smallest model that is good enough, and train it.
+
+    One training climbs a ladder of sizes, growing while that is worth the bytes. The size that seems enough is then trained in
+    full, and a neighbour to compare with. Leaves runs (rung_N), compact.npz, chart.png, rightsize.json, and best.yaml for
+    train +experiment=best.yaml. Interrupted, the same command continues.
+
+    Args:
+        scene: Path of a scene or an image, or the name of an experiment or a built-in scene, such as lego.
+        overrides: Options of the trainings, such as budget.seconds=60 recipe=tensorf_small.
+        within_db: How far below the best that can be reached the choice may be; default: 0.3.
+        psnr: Or: the PSNR on held-out views that is enough.
+        ladder: Sizes to try: a name in conf/ladders or a YAML file; default: those of the model.
+        output: Folder for all of it.
+
+    Returns:
+        What rightsize.json holds, such as `rung`, `model` (its options), `psnr` and `artifact_bytes`.
+
+    Raises:
+        InputError: where an option or the scene is no good, or the folder holds something else.
+    """
+    if within_db is not None and psnr is not None:
+        raise InputError("rightsize", "psnr", f"{psnr:g} and within_db={within_db:g}", "one of the two")
+    from nerf_lightning.config.compose import composed
+    from nerf_lightning.rightsize.choose import Target
+    from nerf_lightning.rightsize.ladder import read_ladder
+    from nerf_lightning.rightsize.report import REPORT, explain, write_report
+    from nerf_lightning.rightsize.search import begin, search
+    from nerf_lightning.runs.owner import owned
+    from nerf_lightning.utils.files import output_path
+    from nerf_lightning.utils.parsing import read_json
+
+    folder = output_path(output)
+    cfg = composed([*describe_scene(scene), *(overrides or [])], folder)
+    sizes = read_ladder(ladder or str(cfg.method))
+    target = Target(psnr, 0.3 if within_db is None else within_db)
+    with owned(folder):
+        if (folder / REPORT).is_file():
+            begin(folder, cfg, target, sizes)
+            found = read_json(folder / REPORT, "a finished search")
+        else:
+            found = search(cfg, target, sizes, folder)
+            write_report(found, cfg, folder)
+    print(explain(found, folder))
+    return found
+
+
+def describe_scene(scene: str) -> list[str]:
+    """The overrides that a scene's path or an experiment's name stands for."""
+    from nerf_lightning.config import conf_dir
+    from nerf_lightning.config.literal import override_of
+    from nerf_lightning.utils.files import user_path
+
+    path = user_path(scene)
+    for key in ("+experiment", "dataset"):
+        if scene in {file.stem for file in (conf_dir() / key.lstrip("+")).glob("*.yaml")}:
+            if path.exists():
+                print(f"{scene}: {key}={scene}; ./{scene} means what is here")
+            return [f"{key}={scene}"]
+    if not path.exists():
+        raise InputError("rightsize", "scene", scene, "a path, or a name in conf/experiment or conf/dataset")
+    kind = "+experiment=picture" if path.suffix.lower() in IMAGES else "dataset=photos"
+    return [kind, override_of("dataset.path", path)]

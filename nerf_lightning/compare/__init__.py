@@ -1,0 +1,1 @@
+"""Runs -> configurations compared by quality and cost: a page, a table, a figure, and advice in words."""

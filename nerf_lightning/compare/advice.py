@@ -1,0 +1,63 @@
+"""Recommendations in words, and what weakens them."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from nerf_lightning.compare.points import format_bytes, round_cost
+from nerf_lightning.utils.machine import CROWDED
+
+MIN_SEEDS = 3
+"""Runs below which a point on a frontier may be luck."""
+
+
+def recommend(points: pd.DataFrame, within_db: float, seconds: float, smallest_within_db: float) -> list[str]:
+    """Sentences about the points of one comparison, one for each point that is best at something.
+
+    Args:
+        points: of `compute_points`, the best first.
+        within_db: how far below the best the fastest may be, dB.
+        seconds: a budget of training time.
+        smallest_within_db: how far below the best the smallest may be, dB.
+    """
+    best, costs = points["psnr"].max(), points["train_seconds"].map(round_cost)
+    choices = {
+        "best": points.index[0],
+        f"fastest within {within_db:g} dB of the best": costs[points["psnr"] >= best - within_db].idxmin(),
+    }
+    quick = points[costs <= seconds]
+    if len(quick):
+        choices[f"best after at most {seconds:g} s of training"] = quick.index[0]
+    sizes = points.loc[points["psnr"] >= best - smallest_within_db, "bytes"].dropna()
+    if len(sizes):
+        choices[f"smallest within {smallest_within_db:g} dB of the best"] = sizes.idxmin()
+    sentences = []
+    for chosen in dict.fromkeys(choices.values()):
+        *first, last = [words for words, number in choices.items() if number == chosen]
+        words = f"{', '.join(first)} and {last}" if first else last
+        sentences.append(f"{words[0].upper()}{words[1:]}: {describe_point(points.loc[chosen])}.")
+    return sentences if len(quick) else [*sentences, f"Nothing trained for {seconds:g} s or less."]
+
+
+def describe_point(point: Any) -> str:
+    count = len(point.runs)
+    seeds = f"{point.psnr_min:.2f} to {point.psnr_max:.2f} over {count} seeds" if count > 1 else "one seed"
+    seeds = f"{point.collapsed} of {count} runs collapsed" if point.collapsed else seeds
+    size = "" if np.isnan(point.bytes) else f", {format_bytes(point.bytes)}"
+    return f"{point.label}: {point.psnr:.2f} dB ({seeds}) after {point.train_seconds:.3g} s{size}"
+
+
+def list_caveats(points: pd.DataFrame) -> list[str]:
+    """What weakens a comparison: a busy machine, few seeds."""
+    caveats = []
+    busy = points[points["crowding"] > CROWDED]
+    if len(busy):
+        caveats.append(
+            f"The machine was busy with something else, which took up to {busy['crowding'].max():.0%} of the threads: seconds"
+            f" are too long of {', '.join(busy['label'])}. Delete those runs and repeat them."
+        )
+    few = points[(points["frontier"] != "") & (points["runs"].map(len) < MIN_SEEDS)]
+    if len(few):
+        caveats.append(f"On a frontier with fewer than {MIN_SEEDS} seeds: {', '.join(few['label'])}.")
+    return caveats

@@ -1,0 +1,147 @@
+"""Runs of one configuration, over their seeds, as one point: a row of a table."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from nerf_lightning.runs.index import Run, flat
+from nerf_lightning.utils.machine import crowding
+
+COSTS = {"train_seconds": "training time, s", "render_seconds": "rendering time, s per view", "bytes": "size"}
+"""Columns against which PSNR is charted."""
+IGNORED_OPTIONS = ("callbacks", "logger", "resume", "name", "method", "recipe", "threads", "device")
+"""Options that do not change what is trained, or that repeat others."""
+IGNORED_NAMES = ("seed", "path", "folder", "url", "download", "accelerator")
+"""Last parts of options that differ between runs of one configuration, or belong to the conditions."""
+BACKGROUNDS = {"[0.0, 0.0, 0.0]": "black background", "[1.0, 1.0, 1.0]": "white background"}
+
+
+class Conditions(NamedTuple):
+    """What two runs must share before their figures can stand on one axis; what is not known is called so."""
+
+    scene: str
+    resolution: str
+    views: str
+    """"" for an image, which is all there is."""
+    background: str
+    machine: str
+    fingerprint: str
+    """First letters of the SHA-256 of the images and their split."""
+
+
+def conditions_of(run: Run) -> Conditions:
+    """A run's conditions, from its results.json."""
+    scene: dict[str, Any] = run.results.get("scene") or {}
+    machine: dict[str, Any] = run.results.get("machine") or {}
+    size, views, background = scene.get("resolution"), scene.get("views"), run.results.get("background")
+    counts = [views.get(split) for split in ("train", "val")] if isinstance(views, dict) else []
+    kind, chip = str(run.results.get("device")).partition(":")[0], machine.get("processor", "unknown processor")
+    threads = f"{run.results.get('threads')} threads on {machine.get('cores')} cores"
+    return Conditions(
+        scene=str(scene.get("name") or "unknown scene"),
+        resolution="x".join(map(str, size)) if isinstance(size, list) else "unknown resolution",
+        views="{} training and {} held-out views".format(*counts) if counts and counts != [1, 1] else "",
+        background="" if background is None else BACKGROUNDS.get(str(background), f"background {background}"),
+        machine=f"{chip}, {threads}" if kind == "cpu" else f"{machine.get('accelerator') or chip} ({kind})",
+        fingerprint=str(scene.get("sha256") or "")[:8],
+    )
+
+
+def compute_points(runs: Sequence[Run]) -> list[tuple[Conditions, pd.DataFrame]]:
+    """Groups runs by their conditions and configuration, those with most points first.
+
+    Columns: label, method, psnr (dB, median over runs, a collapsed one counting as minus infinity), psnr_min, psnr_max, the
+    medians train_seconds, render_seconds and bytes (nan where unknown), collapsed (how many), crowding (see
+    `utils/machine`), options, runs, and the costs of whose frontier a point is. Sorted by falling PSNR. A configuration of
+    which half of the runs or more collapsed makes no point, nor do runs without a figure.
+    """
+    table = pd.DataFrame([make_record(run) for run in runs if has_figures(run)])
+    found = []
+    for conditions, group in table.groupby("conditions") if len(table) else ():
+        points = group.groupby("key", sort=False).agg(
+            label=("label", "first"),
+            method=("method", "first"),
+            psnr=("psnr", "median"),
+            psnr_min=("psnr", "min"),
+            psnr_max=("psnr", "max"),
+            **{cost: (cost, "median") for cost in COSTS},
+            collapsed=("psnr", lambda psnr: int(np.isneginf(psnr).sum())),
+            crowding=("crowding", "max"),
+            options=("options", "first"),
+            runs=("run", list),
+        )
+        points = points[np.isfinite(points["psnr"])].sort_values(["psnr", "train_seconds"], ascending=[False, True])
+        if len(points):
+            points = points.reset_index(drop=True).assign(label=name_points(points))
+            fronts = {cost: find_frontier(points[cost].map(round_cost), points["psnr"]) for cost in COSTS}
+            points["frontier"] = [" ".join(cost for cost in COSTS if i in fronts[cost]) for i in points.index]
+            found.append((Conditions(*conditions), points))
+    return sorted(found, key=lambda pair: -len(pair[1]))
+
+
+def has_figures(run: Run) -> bool:
+    """Whether a run can be compared."""
+    return run.psnr is not None and (run.figure("train_seconds") or 0) > 0
+
+
+def make_record(run: Run) -> dict[str, Any]:
+    """A run as a row."""
+    method, options = str(run.results.get("method") or run.option("method")), options_of(run)
+    return {
+        "run": run,
+        "conditions": conditions_of(run),
+        "key": f"{method} {options}",
+        "label": str(run.option("recipe") or method),
+        "method": method,
+        "psnr": -np.inf if run.status == "collapsed" else run.psnr,
+        "train_seconds": run.figure("train_seconds"),
+        "render_seconds": run.figure("render_seconds_per_view") or np.nan,
+        "bytes": run.figure("artifact_bytes") or np.nan,
+        "crowding": crowding(run.results),
+        "options": options,
+    }
+
+
+def options_of(run: Run) -> dict[str, Any]:
+    """The options that shape a run's result, with dotted keys; the folder stands for them where they cannot be read."""
+    plain = {key: value for key, value in run.config.items() if key not in IGNORED_OPTIONS}
+    options = {key: value for key, value in flat(plain).items() if key.rsplit(".", 1)[-1] not in IGNORED_NAMES}
+    return options or {"folder": str(run.folder)}
+
+
+def name_points(points: pd.DataFrame) -> list[str]:
+    """Labels: recipe or method, then the options that tell it from others of that name."""
+    names = []
+    for label, mine in zip(points["label"], points["options"], strict=True):
+        alike = points.loc[points["label"] == label, "options"]
+        apart = [key for key in mine if any(other.get(key) != mine[key] for other in alike)]
+        told = [key for key in apart if mine[key] is not None and not key.endswith("_target_")]
+        names.append(", ".join([label, *(f"{key.rsplit('.', 1)[-1]} {mine[key]}" for key in told)]))
+    return names
+
+
+def round_cost(value: float) -> float:
+    """A cost to two significant figures: what differs by less is noise of the clock (5.01 s and 5.03 s are both 5.0)."""
+    return float(f"{value:.1e}")
+
+
+def find_frontier(costs: pd.Series, gains: pd.Series) -> pd.Index:
+    """The Pareto frontier: points to which no other is at least equal in both respects and better in one, by rising cost.
+
+    Points that are equal in both are all on it; those of unknown cost are not.
+    """
+    table = pd.DataFrame({"cost": costs, "gain": gains}).dropna().sort_values(["cost", "gain"], ascending=[True, False])
+    best_so_far = table["gain"] == table["gain"].cummax()
+    cheapest = table["cost"] == table.groupby("gain")["cost"].transform("min")
+    return table.index[best_so_far & cheapest]
+
+
+def typical_run(point: Any) -> Run:
+    """The run nearest to a point's median."""
+    return min(point.runs, key=lambda run: abs(run.psnr - point.psnr))
+
+
+def format_bytes(size: float) -> str:
+    return f"{size / 1e6:.3g} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"

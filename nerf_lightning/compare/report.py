@@ -1,0 +1,162 @@
+"""Everything a comparison leaves behind: compare.html, compare.png, compare.csv and the same on the terminal."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import UInt8
+
+from nerf_lightning.compare.advice import list_caveats, recommend
+from nerf_lightning.compare.charts import draw_panels
+from nerf_lightning.compare.images import collect_images
+from nerf_lightning.compare.points import COSTS, Conditions, compute_points, format_bytes, has_figures, typical_run
+from nerf_lightning.drawing.contact_sheet import contact_sheet
+from nerf_lightning.drawing.panels import data_url, write_png
+from nerf_lightning.runs.index import FIELD_PAGE, Run
+from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.html import address_from, render_page
+
+SHEET_PX = 1720
+"""Width of compare.png."""
+MAX_COMPARISONS, MAX_FAILURES = 4, 24
+"""In compare.png; the page and the table have all."""
+HEADINGS = ("dB", "worst", "train s", "view s", "size", "runs", "frontier")
+CAPTION = "dB: median over seeds; frontier: by T(raining time), R(endering time), S(ize)"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Points that were made under the same conditions, and what to say about them."""
+
+    conditions: Conditions
+    points: pd.DataFrame
+    """See `compute_points`."""
+    advice: list[str]
+    remarks: list[str]
+    """Caveats, and where published figures are from."""
+    panels: list[UInt8[np.ndarray, "_ _ 3"]]
+    images: list[tuple[str, UInt8[np.ndarray, "_ _ 3"]]]
+
+    @property
+    def title(self) -> str:
+        return f"{self.conditions.scene}, {self.conditions.resolution}"
+
+    @property
+    def details(self) -> str:
+        return "; ".join(filter(None, self.conditions[2:]))
+
+
+def write_comparison(
+    runs: Sequence[Run],
+    output: Path,
+    references: pd.DataFrame,
+    within_db: float = 0.5,
+    seconds: float = 15.0,
+    smallest_within_db: float = 1.0,
+) -> pd.DataFrame:
+    """Compares runs, writes compare.html, compare.png and compare.csv into a folder, and prints table and advice.
+
+    Returns:
+        The table: a row for each point, then one for each run that is in none.
+    """
+    comparisons = []
+    for conditions, points in compute_points(runs):
+        published = references[references["scene"].str.lower() == conditions.scene.lower()]
+        advice = recommend(points, within_db, seconds, smallest_within_db)
+        origins = [f"Published, other hardware: {origin}." for origin in published["origin"].unique()]
+        panels, images = draw_panels(points, published), collect_images(points)
+        comparisons.append(Comparison(conditions, points, advice, [*list_caveats(points), *origins], panels, images))
+    failures, table = list_failures(runs), tabulate(comparisons, runs)
+    with atomic(output / "compare.csv") as temporary:
+        table.to_csv(temporary, index=False)
+    write_png(output / "compare.png", draw_figure(comparisons, failures))
+    with atomic(output / "compare.html") as temporary:
+        temporary.write_text(fill_page(comparisons, failures, output), encoding="utf-8")
+    print_comparisons(comparisons, failures)
+    print(f"{output}: compare.html, compare.png, compare.csv")
+    return table
+
+
+def list_failures(runs: Sequence[Run]) -> list[str]:
+    """A line for each run that did not end well, with its folder as seen from the one that holds all runs."""
+    common = os.path.commonpath([run.folder.absolute().parent for run in runs])
+    bad = [run for run in runs if run.status not in ("finished", "stopped_early") or not has_figures(run)]
+    return [f"{os.path.relpath(run.folder, common)}: {run.status}: {run.diagnosis}".rstrip(": ") for run in bad]
+
+
+def tabulate(comparisons: Sequence[Comparison], runs: Sequence[Run]) -> pd.DataFrame:
+    """What compare.csv holds."""
+    tables, charted = [], set()
+    for one in comparisons:
+        folders = [[str(run.folder) for run in some] for some in one.points["runs"]]
+        ends = {"runs": [*map(len, folders)], **one.conditions._asdict(), "folders": [*map(";".join, folders)]}
+        tables.append(one.points.drop(columns="options").assign(**ends, status="compared"))
+        charted |= {folder for some in folders for folder in some}
+    left_out = [run for run in runs if str(run.folder) not in charted]
+    rows = [(run.folder.name, str(run.folder), run.status, run.diagnosis) for run in left_out]
+    table = pd.concat([*tables, pd.DataFrame(rows, columns=["label", "folders", "status", "diagnosis"])])
+    return table.replace([np.inf, -np.inf], np.nan)
+
+
+def draw_figure(comparisons: Sequence[Comparison], failures: Sequence[str]) -> UInt8[np.ndarray, "H W 3"]:
+    """Panels, images and words of all comparisons, one below the other."""
+
+    def write(*lines: str, text_px: int = 12) -> UInt8[np.ndarray, "H W 3"]:
+        return contact_sheet([], [], 1, SHEET_PX, heading="\n".join(lines), text_px=text_px)
+
+    parts = []
+    for one in comparisons[:MAX_COMPARISONS]:
+        parts += [write(one.title, text_px=20), write(one.details, *one.advice, *one.remarks)]
+        for captioned, most in ([("", panel) for panel in one.panels], 3), (one.images, 6):
+            captions, images = [caption for caption, _ in captioned], [image for _, image in captioned]
+            parts.append(contact_sheet(images, captions, choose_columns(len(images), most), SHEET_PX, text_px=18))
+    if len(comparisons) > MAX_COMPARISONS:
+        parts.append(write(f"{len(comparisons) - MAX_COMPARISONS} more comparisons are in compare.html"))
+    if failures:
+        parts.append(write(f"Failed, collapsed or cut short ({len(failures)}):", *failures[:MAX_FAILURES]))
+    return np.concatenate(parts)
+
+
+def choose_columns(count: int, most: int) -> int:
+    """How many columns leave the fewest cells empty; of several the most, but not one alone."""
+    return min(range(max(1, min(count, most)), 0, -1), key=lambda columns: -count % columns + (columns == 1) * most)
+
+
+def fill_page(comparisons: Sequence[Comparison], failures: Sequence[str], folder: Path) -> str:
+    """The page in a folder: rows link to the turnable page of a run, where it has one."""
+
+    def find_page(point: Any) -> str | None:
+        page = typical_run(point).folder / FIELD_PAGE
+        return address_from(folder, page) if page.is_file() else None
+
+    values: dict[str, Any] = {"cells": fill_cells, "find_page": find_page, "url": data_url, "headings": HEADINGS}
+    values |= {"comparisons": comparisons, "failures": failures, "caption": CAPTION}
+    here = Path(__file__)
+    return render_page(here.with_name("compare.html"), [here.with_name("compare.css")], title="Comparison", **values)
+
+
+def fill_cells(point: Any) -> list[str]:
+    """A point's row below `HEADINGS`."""
+    return [
+        f"{point.psnr:.2f}",
+        "collapsed" if np.isinf(point.psnr_min) else f"{point.psnr_min:.2f}",
+        f"{point.train_seconds:.3g}",
+        "" if np.isnan(point.render_seconds) else f"{point.render_seconds:.2g}",
+        "" if np.isnan(point.bytes) else format_bytes(point.bytes),
+        f"{len(point.runs)}" + (f", {point.collapsed} collapsed" if point.collapsed else ""),
+        " ".join(COSTS[cost][0].upper() for cost in point.frontier.split()),
+    ]
+
+
+def print_comparisons(comparisons: Sequence[Comparison], failures: Sequence[str]) -> None:
+    """The same on the terminal."""
+    for one in comparisons:
+        cells = [[point.label, *fill_cells(point)] for point in one.points.itertuples()]
+        table = pd.DataFrame(cells, columns=["", *HEADINGS]).to_string(index=False)
+        print(f"{one.title}; {one.details}", table, CAPTION, *one.advice, *one.remarks, sep="\n")
+    if failures:
+        print("Failed, collapsed or cut short:", *failures, sep="\n")

@@ -1,0 +1,90 @@
+"""Contact sheets: images of any size in a grid, each with a caption below it."""
+
+import textwrap
+from collections.abc import Container, Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.font_manager import findfont
+from numpy import ndarray
+from PIL import Image, ImageDraw, ImageFont
+
+from nerf_lightning.drawing.ink import FONT, VERMILLION, readable
+
+GAP = 12
+"""Pixels between images."""
+LETTER_WIDTH = 0.6
+"""Of `FONT`, as a share of its size, on average."""
+
+
+def contact_sheet(
+    images: Sequence[UInt8[ndarray, "_ _ 3"] | None],
+    captions: Sequence[str],
+    columns: int,
+    width: int | None = None,
+    flagged: Container[int] = (),
+    heading: str = "",
+    text_px: int = 15,
+) -> UInt8[ndarray, "H W 3"]:
+    """Lays out images row by row on white.
+
+    Args:
+        images: None leaves a grey box; none at all make a sheet of the heading alone.
+        captions: of each image, in as many lines as they need.
+        columns: images side by side, at most.
+        width: of the sheet in pixels, to which images are scaled; None keeps their own sizes.
+        flagged: indices of images to outline in vermillion.
+        heading: above all images.
+        text_px: size of the captions' letters; those of the heading are larger by half.
+    """
+    columns = max(1, min(columns, len(images)))
+    shapes = [image.shape[:2] for image in images if image is not None] or [(3, 4)]
+    if width is None:
+        cell = max(w for _, w in shapes)
+        box, width = max(h for h, _ in shapes), columns * (cell + GAP) + GAP
+    else:
+        cell = (width - GAP) // columns - GAP
+        box = round(cell * float(np.median([h / w for h, w in shapes])))
+    scaled = [np.full((box, cell, 3), 221, np.uint8) if one is None else fit_into(one, cell, box) for one in images]
+    texts = [wrap(caption, cell, text_px) for caption in captions]
+    title = wrap(heading, width - 2 * GAP, 3 * text_px // 2)
+    line = round(1.3 * text_px)
+    tops = [GAP + 3 * line // 2 * len(title)]
+    for first in range(0, len(images), columns):
+        row = range(first, min(first + columns, len(images)))
+        tops.append(tops[-1] + max(scaled[i].shape[0] + line * len(texts[i]) for i in row) + 2 * GAP)
+
+    sheet = Image.new("RGB", (width, tops[-1]), "white")
+    draw = ImageDraw.Draw(sheet)
+    for n, words in enumerate(title):
+        draw.text((GAP, GAP // 2 + n * (3 * line // 2)), words, "black", _font(3 * text_px // 2))
+    for i, (image, text) in enumerate(zip(scaled, texts, strict=True)):
+        left, top = GAP + i % columns * (cell + GAP), tops[i // columns]
+        right, bottom = left + image.shape[1], top + image.shape[0]
+        sheet.paste(Image.fromarray(image), (left, top))
+        if i in flagged:
+            draw.rectangle((left - 4, top - 4, right + 3, bottom + 3), outline=VERMILLION, width=4)
+        for n, words in enumerate(text):
+            draw.text((left, bottom + 5 + n * line), words, VERMILLION if i in flagged else "black", _font(text_px))
+    return np.array(sheet)
+
+
+def fit_into(image: UInt8[ndarray, "H W 3"], width: int, height: int) -> UInt8[ndarray, "h w 3"]:
+    """Scales an image to the largest size in a box: averaged where that is smaller, with hard edges where it is larger."""
+    rows, cols = image.shape[:2]
+    scale = min(width / cols, height / rows)
+    size = max(1, round(cols * scale)), max(1, round(rows * scale))
+    if size == (cols, rows):
+        return image
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST))
+
+
+def wrap(text: str, width: int, text_px: int) -> list[str]:
+    """Lines of at most about `width` pixels; line ends in the text stay."""
+    letters = max(1, int(width / (LETTER_WIDTH * text_px)))
+    return [line for part in text.splitlines() for line in textwrap.wrap(readable(part), letters)]
+
+
+def _font(text_px: int) -> ImageFont.FreeTypeFont:
+    return ImageFont.truetype(findfont(FONT), text_px)

@@ -1,1 +1,0 @@
-"""All runs of a sweep in one picture."""

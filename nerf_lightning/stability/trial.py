@@ -1,0 +1,155 @@
+"""One trial of the suite: a condition, a method and a seed, trained as a user would."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import asdict, dataclass
+from itertools import repeat
+from pathlib import Path
+from typing import Any
+
+from nerf_lightning.config.resolvers import slug
+from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.stability.conditions import CONDITIONS, METHODS, UPSCALE
+from nerf_lightning.utils.files import full_disk, write_json
+from nerf_lightning.utils.parsing import read_json
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of a trial, as in stability.json."""
+
+    condition: str
+    method: str
+    seed: int
+    guard: bool
+    psnr: float | None
+    """dB on held-out views; of an image, at `UPSCALE` times the pixels it was trained on along each side."""
+    status: str
+    """finished, collapsed, refused (before training) or failed."""
+    diagnosis: str
+    recoveries: int
+    alarm: str
+    """What the run warned of, about the data or the result."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What to train."""
+
+    condition: str
+    method: str
+    seed: int
+    steps: int
+
+
+def list_trials(conditions: Sequence[str], methods: Sequence[str], seeds: int, steps: int) -> list[Trial]:
+    """The trials of a suite: one seed of hopeless conditions, and no control method under a control condition."""
+    return [
+        Trial(condition.name, name, seed, steps)
+        for condition in CONDITIONS.values()
+        if condition.name in conditions
+        for name in methods
+        if METHODS[name].flat == condition.flat and METHODS[name].options_under(condition) is not None
+        if not (METHODS[name].control and condition.control)
+        for seed in range(1 if condition.hopeless else seeds)
+    ]
+
+
+def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Iterator[Outcome]:
+    """Runs trials in processes of one thread each, which end with this one; yields their outcomes in order.
+
+    Raises:
+        InputError: where the system ends a process.
+    """
+    from joblib.externals.loky import ProcessPoolExecutor
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    # Should this process be killed, they end when they have been idle for a minute.
+    pool = ProcessPoolExecutor(workers, timeout=60, env={"OMP_NUM_THREADS": "1"})
+    try:
+        yield from pool.map(run_trial, trials, repeat(root))
+    except TerminatedWorkerError as error:
+        found, expected = "a process that the system ended", f"memory for {workers} of them"
+        raise InputError("stability", "workers", found, expected, "give fewer; the same command continues") from error
+    finally:
+        pool.shutdown(kill_workers=True)
+
+
+def trial_folder(root: Path, condition: str, method: str, seed: int) -> Path:
+    """Where a trial's run is left."""
+    return root / "trials" / slug(condition) / f"{slug(method)}_seed{seed}"
+
+
+def run_trial(trial: Trial, root: Path) -> Outcome:
+    """Trains, unless the outcome of a trial with the same options is there."""
+    condition, method = CONDITIONS[trial.condition], METHODS[trial.method]
+    folder = trial_folder(root, trial.condition, trial.method, trial.seed)
+    identity = {"steps": trial.steps, "options": method.options_under(condition), "condition": asdict(condition)}
+    try:
+        content = read_json(folder / "trial.json", "a trial's outcome")
+        if content["identity"] == identity:
+            return Outcome(**content["outcome"])
+    except (InputError, KeyError, TypeError):
+        pass  # missing or damaged: trained again
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "log.txt").open("w", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
+        found = train_trial(trial, folder)
+    outcome = Outcome(trial.condition, trial.method, trial.seed, method.guarded is None, **found)
+    write_json(folder / "trial.json", {"identity": identity, "outcome": asdict(outcome)})
+    return outcome
+
+
+def train_trial(trial: Trial, folder: Path) -> dict[str, Any]:
+    """Trains and measures; returns the fields of the outcome that this decides.
+
+    Raises:
+        OSError, NoRoom: for a full disk, which says nothing about the method.
+    """
+    from nerf_lightning.config.compose import composed
+    from nerf_lightning.config.literal import override_of
+    from nerf_lightning.dataset import Picture, save_npz
+    from nerf_lightning.drawing.panels import write_png
+    from nerf_lightning.training.train import train
+
+    condition, method = CONDITIONS[trial.condition], METHODS[trial.method]
+    made = condition.make(trial.seed)
+    if isinstance(made, Picture):
+        path = folder / "image.png"
+        write_png(path, made.image.numpy())
+        given = [f"callbacks.{name}=null" for name in ("training_gif", "charts", "baselines")]
+        given += [f"dataset.max_side={max(made.size) // UPSCALE}", f"render.scale={UPSCALE}"]
+    else:
+        path = folder / "scene.npz"
+        save_npz(made, path)
+        given = ["dataset=photos", "callbacks.orbit=null"]
+    given += [
+        *(method.options_under(condition) or []),
+        override_of("dataset.path", path),
+        f"seed={trial.seed}",
+        f"budget.steps={trial.steps}",
+    ]
+    given += ["threads=1", "device=cpu"]  # trials are small, and run side by side
+    given += ["~logger", "callbacks.snapshots.steps=[]", "callbacks.heldout=null", "callbacks.checkpoints=null"]
+    found: dict[str, Any] = {"psnr": None, "status": "failed", "diagnosis": "", "recoveries": 0, "alarm": ""}
+    try:
+        cfg = composed(given, folder)
+        cfg.optimizer.lr *= condition.rate
+        train(cfg)
+        results = read_json(folder / "results.json", "figures")
+        found |= {key: results[key] for key in ("psnr", "status", "diagnosis")}
+        if method.flat:
+            between = read_json(folder / "enlarged.json", "figures")["field"]
+            found["psnr"] = found["psnr"] if between is None else between  # None where every byte is right
+        found["recoveries"] = len(results["recoveries"])
+        alarms = [*results["warnings"], found["diagnosis"] if found["status"] == "finished" else ""]
+        found["alarm"] = "; ".join(filter(None, alarms))
+    except NoRoom:
+        raise
+    except InputError as error:
+        found |= {"status": "refused", "diagnosis": str(error).replace(str(path), condition.name)}
+    except Exception as error:  # noqa: BLE001  (failures are what the suite looks for)
+        if full_disk(error):
+            raise
+        found["diagnosis"] = " ".join(f"{type(error).__name__}: {error}".split())
+    path.unlink(missing_ok=True)
+    return found

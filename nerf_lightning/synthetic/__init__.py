@@ -1,0 +1,1 @@
+"""Synthetic scenes with exact geometry, for the stability suite, tests and benchmarks, and ways to corrupt them."""

@@ -1,0 +1,102 @@
+"""What torch.compile makes of fields and trainings, beside what they are without it: a process of its own, where no types are
+checked, as the checks would be compiled too. Prints what it found as JSON.
+
+python compile_models.py mlp voxels FOLDER     some fields, and a training where there is a folder for it; without the
+                                               compiler's kernels, which take most of the time
+python compile_models.py whole                 one field as users have it
+"""
+
+import copy
+import json
+import pickle
+import sys
+import warnings
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from torch._dynamo.utils import counters
+from torch.nn.functional import normalize
+
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.config.compose import composed
+from nerf_lightning.kernels import use_kernels
+from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
+from nerf_lightning.renderer import VolumeRenderer
+from nerf_lightning.sampler import Samples
+from nerf_lightning.system.compiled import BACKEND, part
+from nerf_lightning.training import train as training
+from tests.helpers.train_models import MODELS
+
+TRACED, DIFFERENTIATED = "eager", "aot_eager"  # as inductor has it up to its kernels, in a tenth of the time
+BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+FIELDS = {
+    "mlp": lambda: MLPField(BOX, depth=2, width=8, skip=1, position_frequencies=2, density="exp"),
+    "hashgrid": lambda: HashGridField(BOX, levels=3, log2_entries=8, coarsest=3, finest=12, width=8),
+    "tensorf": lambda: TensoRFField(BOX, 4, 4, coarsest=6, finest=10, stages=2, width=8),
+    "voxels": lambda: VoxelField(BOX, coarsest=6, finest=10, stages=2),
+}
+SIZES = ((5, 13, 0.0), (40, 300, 0.0), (7, 90, 1.0), (6, 40, 1.0))
+"""Rays and samples, and the progress to which a field grows before."""
+
+
+def outcome(field: Field, renderer: VolumeRenderer | None, rays: Rays, samples: Samples, backend: str | None) -> list:
+    """What a step asks of a field, with the renderer where there is one, and the gradients."""
+    field.zero_grad()
+    with torch.no_grad():
+        density = part(field.density, backend)(rays.origins)
+    if renderer is None:
+        values = part(field.forward, backend)(samples.positions(rays), samples.directions(rays))
+    else:
+        rendered = part(renderer.forward, backend)(rays, samples, field, torch.ones(len(rays), 3))
+        values = rendered.rgb, rendered.opacity
+    sum(value.square().sum() for value in values).backward()
+    gradients = [parameter.grad.clone() for parameter in field.parameters() if parameter.grad is not None]
+    return [density, *(value.detach() for value in values), *gradients]
+
+
+def check_field(name: str, backend: str | None = None) -> dict[str, float]:
+    """The largest difference, of the largest value in its tensor, and how many graphs were made at first, and anew."""
+    field, renderer = FIELDS[name](), VolumeRenderer() if name == "mlp" else None  # the same for all
+    backend = backend or (TRACED if renderer is None and name != "voxels" else DIFFERENTIATED)
+    keys, worst, before, graphs = list(field.state_dict()), 0.0, counters["stats"]["unique_graphs"], []
+    for rays, count, progress in SIZES:
+        field.grow(progress)
+        ray = torch.randint(0, rays, (count,)).sort().values
+        bundle = Rays(torch.rand(rays, 3) - 0.5, normalize(torch.randn(rays, 3), dim=1))
+        offsets = torch.searchsorted(ray, torch.arange(rays + 1))
+        samples = Samples(torch.rand(count), torch.rand(count) / 10, ray, offsets)
+        expected = outcome(field, renderer, bundle, samples, None)
+        found = outcome(field, renderer, bundle, samples, backend)
+        assert len(found) == len(expected)
+        for one, other in zip(found, expected, strict=True):
+            assert one.shape == other.shape
+            worst = max(worst, float((one - other).abs().max() / other.abs().max().clamp_min(1e-6)))
+        graphs.append(counters["stats"]["unique_graphs"])
+        field = pickle.loads(pickle.dumps(copy.deepcopy(field)))
+    assert list(field.state_dict()) == keys and isinstance(field, Field)
+    fresh = [later - earlier for earlier, later in pairwise([before, *graphs])]
+    return {"worst": worst, "compiled": fresh[0], "again": fresh[1] + fresh[3]}
+
+
+def trained(name: str, folder: Path, *more: str) -> float:
+    """The held-out PSNR of a small run."""
+    options = [one for one in MODELS[name] if one != "model.grown=1"]
+    cfg = composed([f"model={name}", *options, "device=cpu", "kernels=reference", "~logger", *more], folder)
+    return training.train(cfg)
+
+
+if __name__ == "__main__":
+    warnings.filterwarnings("error", category=UserWarning)
+    torch.manual_seed(0)
+    use_kernels("reference")
+    if sys.argv[1] == "whole":
+        print(json.dumps(check_field("voxels", BACKEND)))
+        sys.exit()
+    found: dict[str, object] = {name: check_field(name) for name in sys.argv[1:] if name in FIELDS}
+    if sys.argv[-1] not in FIELDS:
+        training.BACKEND = DIFFERENTIATED
+        folder = Path(sys.argv[-1])
+        options = ("budget.steps=30", "model.depth=1", "callbacks.snapshots=null")
+        found["trained"] = [trained("siren", folder / on, f"compile={on}", *options) for on in ("true", "false")]
+    print(json.dumps(found))

@@ -1,0 +1,93 @@
+"""Trains every shipped model for a moment and takes a fingerprint of its weights; as a process of its own it prints them.
+
+python train_models.py FOLDER STOP     (interrupted after STOP steps and resumed; 0: in one go)
+"""
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+
+from nerf_lightning.callbacks import Checkpoints
+from nerf_lightning.config.compose import composed
+from nerf_lightning.refine import corrections
+from nerf_lightning.system import aligned
+from nerf_lightning.training.train import train
+
+SCENE = [
+    *("dataset=bricks", "dataset.size=16", "dataset.train_views=12", "dataset.val_views=1", "dataset.rays=256"),
+    *("dataset.samples=2048", "sampler.samples=32", "sampler.resolution=16", "callbacks.orbit=null"),
+]
+PICTURE = [
+    *("+experiment=picture", "dataset.max_side=24", "dataset.pixels=256", "callbacks.baselines=null"),
+    *("callbacks.training_gif=null", "callbacks.charts=null"),
+]
+MODELS = {
+    "hashgrid": [*SCENE, "refine=auto", "model.levels=3", "model.finest=32", "model.log2_entries=10", "model.width=16"],
+    "voxels": [*SCENE, "recipe=voxels_small", "model.coarsest=8", "model.finest=16", "model.grown=1"],
+    "tensorf": [
+        *(*SCENE, "refine=both", "refine.focal=true", "refine.affine=true", "refine.vignetting=true"),
+        *("recipe=tensorf_small", "model.coarsest=8", "model.finest=16", "model.grown=1"),
+    ],
+    "mlp": [*SCENE, "recipe=mlp_small", "model.width=16"],
+    "hashgrid2d": PICTURE,
+    "picture_mlp": [*PICTURE, "model.width=32"],
+    "fourier": [*PICTURE, "model.width=32"],
+    "siren": [*PICTURE, "model.width=32"],
+}
+ANOTHER = "siren, another seed"
+STEPS = 14
+
+
+aligned.TOGETHER = aligned.APART = 1  # held-out photos are not what is compared
+
+
+class Stop(Exception):
+    """Training is to end here."""
+
+
+@patch.dict(corrections.WORTHWHILE, poses=-1.0, light=-1.0)  # refine=auto begins with its first trial
+@patch.multiple(corrections, FIRST=2, EARLY=2)
+def fingerprints(folder: Path, stop: int) -> dict[str, str]:
+    save = Checkpoints.on_train_batch_end
+
+    def save_and_stop(self: Checkpoints, trainer: Any, *rest: Any) -> None:
+        save(self, trainer, *rest)
+        if trainer.global_step == stop:
+            self.save(trainer, "last.ckpt")
+            raise Stop
+
+    prints = {}
+    for name in [*MODELS, ANOTHER]:
+        model, seed, run = name.partition(",")[0], int(name == ANOTHER), folder / name
+        options = [f"model={model}", f"seed={seed}", "threads=2", f"budget.steps={STEPS}", "~logger"]
+        cfg = composed([*MODELS[model], *options], run)
+        last = run / "checkpoints" / "last.ckpt"
+        if stop:
+            Checkpoints.on_train_batch_end = save_and_stop  # type: ignore[method-assign]
+            try:
+                train(cfg)
+            except Stop:
+                Checkpoints.on_train_batch_end = save  # type: ignore[method-assign]
+            assert json.loads((run / "results.json").read_text())["steps"] == stop
+        train(cfg, last if stop else None)
+        prints[name] = fingerprint(run / "checkpoints" / "last.ckpt")
+    return prints
+
+
+def fingerprint(checkpoint: Path) -> str:
+    """Of all weights and buffers, bit by bit."""
+    state = torch.load(checkpoint, weights_only=True)
+    assert state["global_step"] == STEPS
+    digest = hashlib.sha256()
+    for key, value in sorted(state["state_dict"].items()):
+        digest.update(f"{key} {tuple(value.shape)} {value.dtype}".encode() + value.numpy().tobytes())
+    return digest.hexdigest()
+
+
+if __name__ == "__main__":
+    print(json.dumps(fingerprints(Path(sys.argv[1]), int(sys.argv[2]))))
