@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
+from nerf_lightning.cli.compare import compare
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.cli.export import (
     export_compact,
@@ -46,6 +47,7 @@ from nerf_lightning.utils.files import user_path
 from nerf_lightning.utils.libraries import NOISY
 from nerf_lightning.utils.signals import Interrupted, handle_signals
 
+__all__ = ["Run", "View", "compare", "load_run", "load_scene", "rightsize", "train"]
 P = ParamSpec("P")
 T = TypeVar("T")
 
