@@ -42,7 +42,8 @@ def measure(args: argparse.Namespace) -> Rows:
     overrides, seconds, output = args.overrides, args.budgets[0], args.output
     scenes, folder = {"sphere": "", "bricks": "bricks", "heap": "", "lego": "lego"}, output / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
-    for name, bodies in {"sphere": [Ball((0.0, 0.0, 0.0), 0.8, grain=0.0)], "heap": make_heap()}.items():
+    made: dict[str, list[Body]] = {"sphere": [Ball((0.0, 0.0, 0.0), 0.8, grain=0.0)], "heap": make_heap()}
+    for name, bodies in made.items():
         scenes[name] = str(folder / f"{name}.npz")
         save_npz(make_scene(bodies, size=SIZE, views=VIEWS, held_out=HELD_OUT), Path(scenes[name]))
     given = ["recipe=tensorf_medium", f"budget.seconds={seconds}", "callbacks.orbit=null", *overrides]
@@ -64,6 +65,7 @@ def measure(args: argparse.Namespace) -> Rows:
         row |= {"search_ratio": found["search_seconds"] / mine.seconds}
         rows.append({**row, "rungs": " ".join(f"{one.psnr:.1f}/{one.size / 1000:.0f}" for one in full)})
     path = folder / f"{name}_{FEW}.npz"
+    assert isinstance(data, RayDataModule)  # of the last of them
     save_npz(replace(data.scene, train=data.scene.train.spread(FEW)), path)
     sparse = composed([*describe_scene(str(path)), *given], output)
     for views, of, result in (

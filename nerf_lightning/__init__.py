@@ -18,8 +18,8 @@ The tree is the data flow, seven stages in order:
     api.py      the same from Python: load_scene, train, load_run
     runs/       run folders and compact files: found, read without trusting them, opened
 
-Each command is a typed function in cli/, which calls its room: capture/, check/, view/, render/, evaluate/, export/, comparison/
-(speed against accuracy), sizing/ (the smallest model that is good enough), stability/ (methods where they are known to fail,
+Each command is a typed function in cli/, which calls its room: capture/, check/, view/, render/, evaluate/, export/,
+comparison/ (speed against accuracy), sizing/ (the smallest model that is good enough), stability/ (methods where they are known to fail,
 on scenes of synthetic/). What they all draw with is in drawing/; what knows nothing of fields is in utils/.
 
 Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples
