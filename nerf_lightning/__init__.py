@@ -19,8 +19,8 @@ The tree is the data flow, seven stages in order:
     runs/       run folders and compact files: found, read without trusting them, opened
 
 Each command is a typed function in cli/, which calls its room: capture/, check/, view/, render/, evaluate/, export/,
-comparison/ (speed against accuracy), sizing/ (the smallest model that is good enough), stability/ (methods where they are known to fail,
-on scenes of synthetic/). What they all draw with is in drawing/; what knows nothing of fields is in utils/.
+comparison/ (speed against accuracy), sizing/ (the smallest model that is good enough), stability/ (methods where they
+are known to fail, on scenes of synthetic/). What they all draw with is in drawing/; what knows nothing of fields, in utils/.
 
 Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples
 (or points), L levels or frequencies, F features. Cameras follow OpenCV: x right, y down, z forward; `c2w` maps camera
