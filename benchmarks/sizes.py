@@ -13,8 +13,8 @@ from nerf_lightning.cli.rightsize import describe_scene, rightsize
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, save_npz
-from nerf_lightning.rightsize.ladder import read_ladder
-from nerf_lightning.rightsize.search import train_in_full
+from nerf_lightning.sizing.ladder import read_ladder
+from nerf_lightning.sizing.search import train_in_full
 from nerf_lightning.synthetic.objects import Ball, Block, Body, make_scene
 
 SIZE, VIEWS, HELD_OUT = 200, 100, 10
@@ -42,7 +42,8 @@ def measure(args: argparse.Namespace) -> Rows:
     overrides, seconds, output = args.overrides, args.budgets[0], args.output
     scenes, folder = {"sphere": "", "bricks": "bricks", "heap": "", "lego": "lego"}, output / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
-    for name, bodies in {"sphere": [Ball((0.0, 0.0, 0.0), 0.8, grain=0.0)], "heap": make_heap()}.items():
+    made: dict[str, list[Body]] = {"sphere": [Ball((0.0, 0.0, 0.0), 0.8, grain=0.0)], "heap": make_heap()}
+    for name, bodies in made.items():
         scenes[name] = str(folder / f"{name}.npz")
         save_npz(make_scene(bodies, size=SIZE, views=VIEWS, held_out=HELD_OUT), Path(scenes[name]))
     given = ["recipe=tensorf_medium", f"budget.seconds={seconds}", "callbacks.orbit=null", *overrides]
@@ -64,6 +65,7 @@ def measure(args: argparse.Namespace) -> Rows:
         row |= {"search_ratio": found["search_seconds"] / mine.seconds}
         rows.append({**row, "rungs": " ".join(f"{one.psnr:.1f}/{one.size / 1000:.0f}" for one in full)})
     path = folder / f"{name}_{FEW}.npz"
+    assert isinstance(data, RayDataModule)  # of the last of them
     save_npz(replace(data.scene, train=data.scene.train.spread(FEW)), path)
     sparse = composed([*describe_scene(str(path)), *given], output)
     for views, of, result in (

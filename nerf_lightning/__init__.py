@@ -18,9 +18,9 @@ The tree is the data flow, seven stages in order:
     api.py      the same from Python: load_scene, train, load_run
     runs/       run folders and compact files: found, read without trusting them, opened
 
-The verbs, each a folder with `__main__.py` (its options) and `verb.py` (its work): capture/, render/, evaluate/, export/,
-view/, compare/ (speed against accuracy), rightsize/ (the smallest model that is good enough), stability/ (methods
-where they are known to fail). What they all paint with is in drawing/; what knows nothing of fields is in utils/.
+Each command is a typed function in cli/, which calls its room: capture/, check/, view/, render/, evaluate/, export/,
+comparison/ (speed against accuracy), sizing/ (the smallest model that is good enough), stability/ (methods where they
+are known to fail, on scenes of synthetic/). What they all draw with is in drawing/; what knows nothing of fields, in utils/.
 
 Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples
 (or points), L levels or frequencies, F features. Cameras follow OpenCV: x right, y down, z forward; `c2w` maps camera
@@ -34,10 +34,10 @@ from nerf_lightning.utils.libraries import guard_torchvision
 guard_torchvision()  # before anything imports Lightning
 
 if TYPE_CHECKING:
-    from nerf_lightning.api import Run, View, load_run, load_scene, train
+    from nerf_lightning.api import Run, View, compare, load_run, load_scene, rightsize, train
 
 __version__ = "0.1.0"
-__all__ = ["Run", "View", "load_run", "load_scene", "train"]
+__all__ = ["Run", "View", "compare", "load_run", "load_scene", "rightsize", "train"]
 
 
 def __getattr__(name: str) -> Any:

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
+from nerf_lightning.cli.compare import compare
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.cli.export import (
     export_compact,
@@ -30,6 +31,8 @@ from nerf_lightning.cli.export import (
     export_transforms,
     export_voxels,
 )
+from nerf_lightning.cli.render import render as render_run
+from nerf_lightning.cli.rightsize import rightsize
 from nerf_lightning.cli.view import view
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.literal import override_of
@@ -46,6 +49,7 @@ from nerf_lightning.utils.files import user_path
 from nerf_lightning.utils.libraries import NOISY
 from nerf_lightning.utils.signals import Interrupted, handle_signals
 
+__all__ = ["Run", "View", "compare", "load_run", "load_scene", "rightsize", "train"]
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -97,7 +101,7 @@ class Run:
         return View(rgb.clamp(0, 1).view(*shape, 3), opacity.view(shape), depth.view(shape))
 
     evaluate = _as_method(evaluate)
-    render_video = _as_method(render)
+    render_video = _as_method(render_run)
     view = _as_method(view)
 
     @property

@@ -47,11 +47,11 @@ def rightsize(
     if within_db is not None and psnr is not None:
         raise InputError("rightsize", "psnr", f"{psnr:g} and within_db={within_db:g}", "one of the two")
     from nerf_lightning.config.compose import composed
-    from nerf_lightning.rightsize.choose import Target
-    from nerf_lightning.rightsize.ladder import read_ladder
-    from nerf_lightning.rightsize.report import REPORT, explain, write_report
-    from nerf_lightning.rightsize.search import begin, search
     from nerf_lightning.runs.owner import owned
+    from nerf_lightning.sizing.choose import Target
+    from nerf_lightning.sizing.ladder import read_ladder
+    from nerf_lightning.sizing.report import REPORT, explain, write_report
+    from nerf_lightning.sizing.search import begin, search
     from nerf_lightning.utils.files import output_path
     from nerf_lightning.utils.parsing import read_json
 

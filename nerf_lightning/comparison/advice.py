@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nerf_lightning.compare.points import format_bytes, round_cost
+from nerf_lightning.comparison.points import format_bytes, round_cost
 from nerf_lightning.utils.machine import CROWDED
 
 MIN_SEEDS = 3

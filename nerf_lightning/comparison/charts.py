@@ -10,7 +10,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from nerf_lightning.compare.points import COSTS, format_bytes, typical_run
+from nerf_lightning.comparison.points import COSTS, format_bytes, typical_run
 from nerf_lightning.drawing.ink import GREY, VERMILLION, assign_styles, pixels_of, readable, shortened
 
 WIDTH, HEIGHT, DPI = 4.8, 3.5, 172

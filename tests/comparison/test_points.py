@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from made_runs import MakeRun
 
-from nerf_lightning.compare.points import compute_points, conditions_of, find_frontier, format_bytes, typical_run
+from nerf_lightning.comparison.points import compute_points, conditions_of, find_frontier, format_bytes, typical_run
 
 
 def test_compute_points_seeds_of_one_configuration_are_one_point(make_run: MakeRun):

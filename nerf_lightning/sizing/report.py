@@ -10,8 +10,8 @@ from omegaconf import DictConfig
 
 from nerf_lightning.drawing.ink import BLUE, DPI, GREY, ORANGE, VERMILLION, pixels_of
 from nerf_lightning.drawing.panels import write_png
-from nerf_lightning.rightsize.search import format_figures, set_options
 from nerf_lightning.runs.folder import plain_config
+from nerf_lightning.sizing.search import format_figures, set_options
 from nerf_lightning.utils.files import atomic, write_json
 
 REPORT = "rightsize.json"

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import UInt8
 
-from nerf_lightning.compare.points import typical_run
+from nerf_lightning.comparison.points import typical_run
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.drawing.contact_sheet import fit_into
 from nerf_lightning.drawing.ink import VERMILLION, rgb

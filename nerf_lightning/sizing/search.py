@@ -20,13 +20,13 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.export.reach import confined_to, seen_cells
 from nerf_lightning.export.smallest import held_out_psnr, smallest, some_cameras
 from nerf_lightning.model import as_wide
-from nerf_lightning.rightsize.choose import Measured, Target, choose_final, choose_first, choose_second, stop_growing
-from nerf_lightning.rightsize.ladder import Ladder, Options
 from nerf_lightning.runs.compact import encode
 from nerf_lightning.runs.folder import load_run, plain_config
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.runs.owner import LOCK
 from nerf_lightning.runs.scene_file import scene_content
+from nerf_lightning.sizing.choose import Measured, Target, choose_final, choose_first, choose_second, stop_growing
+from nerf_lightning.sizing.ladder import Ladder, Options
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.before import left_of
 from nerf_lightning.training.train import prepare, train, warm_up

@@ -2,8 +2,8 @@ import pandas as pd
 import pytest
 from made_runs import MakeRun
 
-from nerf_lightning.compare.advice import list_caveats, recommend
-from nerf_lightning.compare.points import compute_points
+from nerf_lightning.comparison.advice import list_caveats, recommend
+from nerf_lightning.comparison.points import compute_points
 
 
 @pytest.fixture

@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 from jaxtyping import UInt8
 
-from nerf_lightning.compare.advice import list_caveats, recommend
-from nerf_lightning.compare.charts import draw_panels
-from nerf_lightning.compare.images import collect_images
-from nerf_lightning.compare.points import COSTS, Conditions, compute_points, format_bytes, has_figures, typical_run
+from nerf_lightning.comparison.advice import list_caveats, recommend
+from nerf_lightning.comparison.charts import draw_panels
+from nerf_lightning.comparison.images import collect_images
+from nerf_lightning.comparison.points import COSTS, Conditions, compute_points, format_bytes, has_figures, typical_run
 from nerf_lightning.drawing.contact_sheet import contact_sheet
 from nerf_lightning.drawing.panels import data_url, write_png
 from nerf_lightning.runs.index import FIELD_PAGE, Run

@@ -17,9 +17,9 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import VoxelField
-from nerf_lightning.rightsize import search
-from nerf_lightning.rightsize.ladder import read_ladder
 from nerf_lightning.runs.compact import load_compact
+from nerf_lightning.sizing import search
+from nerf_lightning.sizing.ladder import read_ladder
 from nerf_lightning.synthetic.objects import PILE, make_scene
 
 RUNGS = [

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nerf_lightning.rightsize.choose import (
+from nerf_lightning.sizing.choose import (
     Measured,
     Target,
     choose_final,

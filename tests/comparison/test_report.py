@@ -11,11 +11,11 @@ from compare.conftest import run_maker
 from made_runs import MakeRun
 
 from nerf_lightning.cli.compare import compare
-from nerf_lightning.compare.charts import MAX_NAMED, draw_cost, draw_quality
-from nerf_lightning.compare.images import CROP, collect_images, find_differences
-from nerf_lightning.compare.points import compute_points
-from nerf_lightning.compare.references import PUBLISHED, read_references
-from nerf_lightning.compare.report import choose_columns
+from nerf_lightning.comparison.charts import MAX_NAMED, draw_cost, draw_quality
+from nerf_lightning.comparison.images import CROP, collect_images, find_differences
+from nerf_lightning.comparison.points import compute_points
+from nerf_lightning.comparison.references import PUBLISHED, read_references
+from nerf_lightning.comparison.report import choose_columns
 from nerf_lightning.errors import InputError
 
 ENTRY = "  source: a paper\n  hardware: a cluster\n  scene: Toy\n  conditions: 800x800\n"
