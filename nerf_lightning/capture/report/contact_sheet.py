@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 
-from nerf_lightning.capture.outcome import Outcome, thinned
+from nerf_lightning.capture.photo_status import PhotoStatus, subsample_photos
 from nerf_lightning.capture.tags.detect import THREADS
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.drawing.ink import DPI, FONT, ORANGE, SKY, VERMILLION, readable, rgb
@@ -30,7 +30,7 @@ SHIFT = 4
 
 
 def annotated(
-    photo: UInt8[np.ndarray, "H W 3"], outcome: Outcome, width: int, height: int
+    photo: UInt8[np.ndarray, "H W 3"], status: PhotoStatus, width: int, height: int
 ) -> UInt8[np.ndarray, "h w 3"]:
     """A photo (sRGB, upright, at full size) scaled to fit into a box of `width` x `height` pixels: its tags are outlined with
     their ids, and a cross shows where each corner projects to."""
@@ -43,12 +43,12 @@ def annotated(
     def drawn(pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
         return pixels * stretch - 0.5  # OpenCV puts pixel centres at integers
 
-    for tag, mark in outcome.marks.items():
+    for tag, mark in status.marks.items():
         outline = cv2.convexHull(drawn(mark.pixels).astype(np.float32)).reshape(-1, 2)
         _lines(small, [outline], True, rgb(ORANGE), 2)
         _label(small, str(tag), outline.mean(0), float(np.sqrt(cv2.contourArea(outline))))
-    for tag, residuals in outcome.residuals.items():
-        for place in drawn(outcome.marks[tag].pixels + residuals):
+    for tag, residuals in status.residuals.items():
+        for place in drawn(status.marks[tag].pixels + residuals):
             _lines(small, [place + [[-5, 0], [5, 0]], place + [[0, -5], [0, 5]]], False, rgb(SKY), 1)
     return small
 
@@ -75,26 +75,26 @@ def _label(image: UInt8[np.ndarray, "H W 3"], text: str, middle: Float[np.ndarra
         cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, ink, wide, cv2.LINE_AA)
 
 
-def heading(title: str, outcomes: Sequence[Outcome], shown: Sequence[Outcome]) -> str:
+def heading(title: str, statuses: Sequence[PhotoStatus], shown: Sequence[PhotoStatus]) -> str:
     """The line above a folder's photos."""
-    left_out = sum(bool(o.reason) for o in outcomes)
-    text = f"{title}: {len(outcomes)} photos, {left_out or 'none'} left out"
-    return text if len(shown) == len(outcomes) else f"{text}; {len(shown)} evenly chosen ones are shown"
+    left_out = sum(bool(o.reason) for o in statuses)
+    text = f"{title}: {len(statuses)} photos, {left_out or 'none'} left out"
+    return text if len(shown) == len(statuses) else f"{text}; {len(shown)} evenly chosen ones are shown"
 
 
-def contact_sheet(folders: Mapping[str, Sequence[Outcome]], aspect: float) -> Figure:
+def contact_sheet(folders: Mapping[str, Sequence[PhotoStatus]], aspect: float) -> Figure:
     """The photos of each folder, one folder below the other; an even choice where there are many.
 
     Args:
-        folders: their outcomes, by title.
+        folders: their statuses, by title.
         aspect: width / height of most photos.
     """
     strips = [_blank(2 * LINE)]
     texts: list[tuple[float, float, str, str, float]] = [(GAP, 2 * LINE - 10, KEY, "black", POINTS)]
     top = 2 * LINE
-    for title, outcomes in folders.items():
-        shown = thinned(outcomes, MOST)
-        texts.append((GAP, top + HEADING - 14, heading(title, outcomes, shown), "black", POINTS + 7))
+    for title, statuses in folders.items():
+        shown = subsample_photos(statuses, MOST)
+        texts.append((GAP, top + HEADING - 14, heading(title, statuses, shown), "black", POINTS + 7))
         strips.append(_blank(HEADING))
         top += HEADING
         columns = min(6, max(3, ceil(sqrt(1.5 * len(shown)))))
@@ -106,10 +106,10 @@ def contact_sheet(folders: Mapping[str, Sequence[Outcome]], aspect: float) -> Fi
             row = shown[first : first + columns]
             captions = [textwrap.wrap(readable(o.caption), int(width / (0.85 * POINTS))) for o in row]
             strip = _blank(height + LINE * max(map(len, captions)) + 2 * GAP)
-            for i, (outcome, lines) in enumerate(zip(row, captions, strict=True)):
+            for i, (status, lines) in enumerate(zip(row, captions, strict=True)):
                 left, image = GAP + i * (width + GAP), small[first + i]
                 strip[: image.shape[0], left : left + image.shape[1]] = image
-                colour = VERMILLION if outcome.reason else "black"
+                colour = VERMILLION if status.reason else "black"
                 for n, line in enumerate(lines):
                     below = top + image.shape[0] + (n + 1) * LINE - 4
                     texts.append((left, below, line, colour, POINTS))
@@ -122,9 +122,9 @@ def _blank(height: int) -> UInt8[np.ndarray, "H W 3"]:
     return np.full((height, WIDTH, 3), 255, np.uint8)
 
 
-def _thumbnail(outcome: Outcome, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-    photo = np.ascontiguousarray(read_pixels(outcome.path, upright=True)[..., :3])
-    return annotated(photo, outcome, width, height)
+def _thumbnail(status: PhotoStatus, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+    photo = np.ascontiguousarray(read_pixels(status.path, upright=True)[..., :3])
+    return annotated(photo, status, width, height)
 
 
 def _figure(sheet: UInt8[np.ndarray, "H W 3"], texts: list[tuple[float, float, str, str, float]]) -> Figure:
