@@ -1,6 +1,5 @@
 """What is bounded is decided by the photos, the same for every file format."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import torch
 from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.dataset import Reading, Scene, Views, open_scene, save_npz
 from nerf_lightning.errors import InputError
-from tests.dataset.colmap_files import cameras_of, photos, write_colmap, write_llff, write_transforms
+from tests.dataset.colmap_files import write_scene
 
 FORMATS = ("npz", "blender", "transforms", "colmap", "llff")
 
@@ -21,37 +20,6 @@ FORMATS = ("npz", "blender", "transforms", "colmap", "llff")
 @pytest.fixture(scope="session")
 def ball_views(ball_views_of: Callable[..., Views]) -> Views:
     return ball_views_of(4)
-
-
-def write_scene(format: str, folder: Path, views: Views) -> Path:
-    """All views in a format; the first three are held out where it has a split."""
-    folder.mkdir(exist_ok=True)
-    focal, (width, _) = float(views.cameras.K[0, 0, 0]), views.cameras.size(0)
-    if format == "npz":
-        images, c2w = views.images.numpy(), views.cameras.c2w.numpy()
-        np.savez(
-            folder / "s.npz",
-            images_train=images[3:],
-            c2ws_train=c2w[3:],
-            images_val=images[:3],
-            c2ws_val=c2w[:3],
-            focal=focal,
-        )
-        return folder / "s.npz"
-    names = photos(folder / "images", views)
-    if format == "colmap":
-        write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
-    elif format == "llff":
-        write_llff(folder / "poses_bounds.npy", views)
-    elif format == "transforms":
-        write_transforms(folder / "transforms.json", views, [f"images/{name}" for name in names])
-    else:
-        opengl = (views.cameras.c2w * torch.tensor([1.0, -1, -1, 1])).tolist()
-        frames = [{"file_path": f"images/{n[:-4]}", "transform_matrix": m} for n, m in zip(names, opengl, strict=True)]
-        for split, part in (("train", frames[3:]), ("val", frames[:3])):
-            content = {"camera_angle_x": 2 * float(np.arctan(0.5 * width / focal)), "frames": part}
-            (folder / f"transforms_{split}.json").write_text(json.dumps(content))
-    return folder
 
 
 def with_background(views: Views, alpha: int | None) -> Views:
