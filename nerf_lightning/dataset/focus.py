@@ -124,23 +124,3 @@ class Focus:
             getattr(self, name).copy_(state[name])
         self.noted = int(state["noted"])
         self._set_chances()
-
-
-def checked_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A `Focus.state_dict` from a file, or nothing.
-
-    Raises:
-        ArithmeticError, LookupError, RuntimeError, TypeError, ValueError: where it is something else.
-    """
-    kept = dict(state)
-    if not kept:
-        return {}
-    found = {name: torch.as_tensor(kept[name]) for name in KEPT}
-    sums, counts, new_sums, new_counts = found.values()
-    noted = int(kept["noted"])
-    errors = (sums >= 0) & (sums <= 1.01 * counts) & (counts < 2**31)  # none is more than 1
-    news = (new_sums >= 0) & (new_sums <= WHOLE * new_counts) & (new_counts < 2**31)
-    alike = sums.ndim == 1 and len({one.shape for one in found.values()}) == 1
-    if not (alike and bool((errors & news).all()) and 0 <= noted < 2**62):
-        raise ValueError("something else than the errors of tiles")
-    return {**found, "noted": torch.tensor(noted)}

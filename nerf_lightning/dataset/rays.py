@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.dataset.focus import Focus, checked_state
+from nerf_lightning.dataset.focus import Focus
 from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
@@ -237,7 +237,7 @@ class RayDataModule(StepDataModule[Views]):
         return {"rays": self.rays, "batch": self.batch, "focus": focus}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._focus, self._focus_state = None, checked_state(state_dict.get("focus", {}))
+        self._focus, self._focus_state = None, dict(state_dict["focus"])
         before = count(state_dict.get("batch", 1))  # perhaps of another device
         rays = count(state_dict["rays"]) * self.batch // before
         self.rays = max(1, min(self.first_rays * self.MOST_RAYS, rays))

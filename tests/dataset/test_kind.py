@@ -56,7 +56,7 @@ SHOWN: dict[str, tuple[Callable[[Views], Views], bool, int, str]] = {
 
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize("shown", SHOWN)
-def test_every_format_is_decided_alike(shown: str, format: str, ball_views: Views, tmp_path: Path):
+def test_open_scene_kind_is_the_same_in_every_format(shown: str, format: str, ball_views: Views, tmp_path: Path):
     edit, bounded, channels, reason = SHOWN[shown]
     scene = open_scene(str(write_scene(format, tmp_path / "s", edit(ball_views))))
     assert scene.bounds.unbounded is not bounded and scene.train.channels == channels
@@ -72,7 +72,7 @@ def test_every_format_is_decided_alike(shown: str, format: str, ball_views: View
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_all_formats_of_a_place_give_one_frame(format: str, ball_views: Views, tmp_path: Path):
+def test_open_scene_frame_is_the_same_in_every_format(format: str, ball_views: Views, tmp_path: Path):
     views = with_background(ball_views, None)
     scene = open_scene(str(write_scene(format, tmp_path / "s", views)))
     assert float(scene.train.cameras.centres.norm(dim=1).median()) == pytest.approx(1, rel=0.02)
@@ -83,7 +83,7 @@ def test_all_formats_of_a_place_give_one_frame(format: str, ball_views: Views, t
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_the_user_may_know_better(format: str, ball_views: Views, tmp_path: Path):
+def test_open_scene_bounded_option_rules(format: str, ball_views: Views, tmp_path: Path):
     path = str(write_scene(format, tmp_path / "s", with_background(ball_views, None)))
     scene = open_scene(path, reading=Reading(bounded="true"))
     assert not scene.bounds.unbounded and "dataset.bounded=true" in scene.kind
@@ -93,7 +93,7 @@ def test_the_user_may_know_better(format: str, ball_views: Views, tmp_path: Path
         Reading(bounded="maybe")
 
 
-def test_nothing_visible_is_refused(ball_views: Views, tmp_path: Path):
+def test_open_scene_nothing_visible_raises(ball_views: Views, tmp_path: Path):
     hidden = replace(ball_views, pixels=ball_views.pixels * torch.tensor([1, 1, 1, 0], dtype=torch.uint8))
     with pytest.raises(InputError, match="alpha is 0 everywhere"):
         open_scene(str(write_scene("transforms", tmp_path / "a", hidden)))
@@ -105,7 +105,7 @@ def test_nothing_visible_is_refused(ball_views: Views, tmp_path: Path):
         open_scene(str(folder))
 
 
-def test_a_stated_box_rules(ball: Scene, tmp_path: Path):
+def test_open_scene_stated_box_rules(ball: Scene, tmp_path: Path):
     save_npz(replace(ball, bounds=replace(ball.bounds, unbounded=True)), tmp_path / "s.npz")
     scene = open_scene(str(tmp_path / "s.npz"))
     assert scene.bounds.unbounded and torch.equal(scene.bounds.aabb, ball.bounds.aabb) and "box" in scene.kind
