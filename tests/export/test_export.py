@@ -79,12 +79,6 @@ def test_export_html_all_shows_the_runs_of_a_folder_side_by_side(sweep: Path, ca
     assert (sweep / "second/field.html").stat().st_mtime_ns == before, "a page that is there is kept"
 
 
-def test_export_html_all_without_runs_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="found no run in it"):
-        export_html(tmp_path, all=True)
-    assert not (tmp_path / "gallery.html").exists()
-
-
 def test_export_shapes_and_photos_are_written_by_their_suffix(planes: Path, tmp_path: Path):
     box = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
     given: dict[str, Any] = {"resolution": 12, "device": "cpu"}

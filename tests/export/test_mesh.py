@@ -102,17 +102,6 @@ def test_volume_of_box_cuts_georeferenced_cells_where_it_is():
     assert near.density.shape == (40, 33, 27), "the box, in cells of the scene"
 
 
-def test_points_file_holds_the_meshs_vertices():
-    run = ball_run(to_source())
-    volume = sample_volume(run.system, RESOLUTION)
-    cloud = trimesh.load(io.BytesIO(points_file(run, run.orbit, volume, None).content), file_type="ply")
-    written = io.BytesIO(mesh_file(run, run.orbit, volume, None, ".ply").content)
-    mesh = trimesh.load(written, file_type="ply", process=False)
-    assert isinstance(cloud, trimesh.PointCloud)
-    np.testing.assert_allclose(np.asarray(cloud.vertices), mesh.vertices, atol=1e-6)
-    assert np.array_equal(cloud.colors, mesh.visual.vertex_colors)
-
-
 def test_voxels_file_holds_density_colour_and_place():
     run = ball_run(to_source())
     with np.load(io.BytesIO(voxels_file(run, sample_volume(run.system, RESOLUTION)).content)) as file:

@@ -140,21 +140,15 @@ PATH = '{"width": 4, "height": 4, "K": [[%s,0,2],[0,1,2],[0,0,1]], "c2w": %s}'
     ("content", "message"),
     [
         ("no json", "Expecting value"),
-        ("[]", "expected width"),
         ('{"width": 4}', "no 'c2w'"),
         (PATH % (1, "[]"), "0 views"),
-        (PATH % (1, "[[1,2]]"), "invalid for input"),
         (PATH % ("NaN", "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "not finite"),
         (PATH.replace("4", "10000000") % (1, "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "pixels that take at least"),
         (PATH % (0, "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "K or fov: found"),
-        (PATH % ("1e9", "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "K or fov.*a focal length of"),
         ('{"render_width": 1e999, "render_height": 4, "camera_path": []}', "cannot convert float infinity"),
         (THEIRS % (4, 0), "division by zero"),
-        (THEIRS % (10**30, 90), "path.json: found"),
         (PATH % (1, "[[-1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"), "no rotation"),
         ('{"path": [{"R": [0,0,0,0], "T": [0,0,0], "fov": 50}]}', "zero norm"),
-        ('{"path": []}', "expected width"),
-        (PATH % (1, "[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]"), "no rotation"),
     ],
 )
 def test_read_path_damaged_file_is_refused(content: str, message: str, tmp_path: Path):

@@ -1,6 +1,5 @@
 """Frames become videos, and interrupted ones continue."""
 
-import sys
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -87,9 +86,3 @@ def test_check_output_refuses_what_cannot_be_written(name: str, transparent: boo
     (tmp_path / "folder.gif").mkdir()
     with pytest.raises(InputError, match=message):
         check_output(tmp_path / name, transparent)
-
-
-def test_check_output_without_pyav_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[video\]'"):
-        check_output(tmp_path / "film.mp4", False)

@@ -10,7 +10,6 @@ import torch
 from nerf_lightning.cameras import Bounds, Cameras, Rays, pixel_to_camera, transform
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.view.drawing import (
-    box_edges,
     frusta,
     overview,
     path_segments,
@@ -102,14 +101,6 @@ def test_ray_figure_missing_rays_are_a_stump_without_samples():
     np.testing.assert_allclose(figure.approach, [[[0, 0, -5], [0, 0, -1]], [[0, 0, -5], [0, 2.5, -5]]])
     np.testing.assert_allclose(figure.inside, [[[0, 0, -1], [0, 0, 1]]])
     np.testing.assert_allclose(figure.samples, [[0, 0, -2 / 3], [0, 0, 0], [0, 0, 2 / 3]], atol=1e-6)
-
-
-def test_box_edges_are_the_box():
-    edges = box_edges(torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]))
-    along = np.abs(edges[:, 1] - edges[:, 0])
-    assert sorted(along.sum(1).tolist()) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
-    assert ((along > 0).sum(1) == 1).all()
-    assert len(np.unique(edges.reshape(-1, 3), axis=0)) == 8
 
 
 def test_path_segments_close_a_ring_not_a_sweep(scene: Scene):

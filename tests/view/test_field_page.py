@@ -73,13 +73,6 @@ def test_painter_stops_when_no_longer_wanted(painter: Painter):
     assert torch.equal(painter.system.renderer.colour, torch.zeros(3)), "the run's own background is back"
 
 
-def test_painter_size_follows_the_speed(painter: Painter):
-    painter.rate = 10_000.0
-    assert painter.side_within(wish(aspect=1.0, most=500), 0.25) == 50
-    assert painter.side_within(wish(aspect=4.0, most=500), 0.25) == 100
-    assert painter.side_within(wish(aspect=1.0, most=30), 0.25) == 30
-
-
 class Browser(viser.ClientHandle):
     """What Viser knows of one, with a camera that a test moves and the pictures it got."""
 

@@ -5,7 +5,6 @@ import http.client
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -95,14 +94,6 @@ def test_view_without_viser_names_the_extra(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[view\]'"):
         view(Path("any.npz"))
-
-
-def test_scene_page_takes_the_next_port_where_one_is_taken(scene: Scene):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        page = ScenePage(scene, "127.0.0.1", port)
-        page.stop()
-    assert page.port > port
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "", "no such host"])
