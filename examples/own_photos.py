@@ -25,4 +25,4 @@ if __name__ == "__main__":
     views = [run.render(run.orbit[i]).rgb for i in range(len(run.orbit))]
     frames = [(255 * view).round().byte().numpy() for view in views]
     imageio.imwrite("orbit.webp", frames, plugin="pillow", duration=50, loop=0)
-    run.export("field.npz")
+    run.export.compact(output="field.npz")

@@ -11,7 +11,7 @@ from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.run import Capture
 from nerf_lightning.capture.tags.detect import Mark, Sighting
 from nerf_lightning.dataset.placing.photos import natural
-from nerf_lightning.utils.evenly import evenly
+from nerf_lightning.utils.text import subsample
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,6 @@ def subsample_photos(statuses: Sequence[PhotoStatus], most: int) -> list[PhotoSt
     if len(statuses) <= most:
         return list(statuses)
     left_out, used = [s for s in statuses if s.reason], [s for s in statuses if not s.reason]
-    shown = [left_out[i] for i in evenly(len(left_out), most // 2)]
-    shown += [used[i] for i in evenly(len(used), most - len(shown))]
+    shown = [left_out[i] for i in subsample(len(left_out), most // 2)]
+    shown += [used[i] for i in subsample(len(used), most - len(shown))]
     return sorted(shown, key=lambda s: s.number)

@@ -13,8 +13,8 @@ from jaxtyping import Float, UInt8
 from nerf_lightning.capture.tags.layout import SQUARE
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.evenly import evenly
 from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.text import subsample
 
 COMMON = (
     "DICT_4X4_50",
@@ -130,7 +130,7 @@ def guess_family(paths: Sequence[Path], photos: int = 4) -> str:
     Raises:
         InputError: where none of the common families is found.
     """
-    chosen = [paths[i] for i in evenly(len(paths), photos)]
+    chosen = [paths[i] for i in subsample(len(paths), photos)]
     small = []
     for path in chosen:
         grey = read_grey(path)
