@@ -4,7 +4,7 @@ import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, ParamSpec, TypeVar
+from typing import Annotated, ParamSpec, TypeVar, get_args, get_type_hints
 
 from cyclopts import Parameter
 
@@ -24,16 +24,20 @@ Device = Annotated[str, Parameter(help="auto, cpu, cuda or mps; auto takes the b
 
 
 def command(function: Callable[P, T]) -> Callable[P, T]:
-    """Makes a function check its arguments against its annotations, wherever it is called from.
+    """Makes a function check its arguments against its annotations, wherever it is called from; text stands for a path.
 
     Raises:
         InputError: by the function, for a value that its annotation excludes.
     """
-    signature = inspect.signature(function)
+    signature, hints = inspect.signature(function), get_type_hints(function)
 
     @functools.wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> T:
-        check_options("", function, signature.bind(*args, **kwargs).arguments, source=function.__name__)
-        return function(*args, **kwargs)
+        bound = signature.bind(*args, **kwargs)
+        for key, value in bound.arguments.items():
+            if isinstance(value, str) and Path in get_args(hints[key]) + (hints[key],):
+                bound.arguments[key] = Path(value)
+        check_options("", function, bound.arguments, source=function.__name__.replace("_", "-"))
+        return function(*bound.args, **bound.kwargs)
 
     return checked
