@@ -42,7 +42,7 @@ def measure_accuracy(folder: Path, seed: int) -> list[dict[str, Any]]:
         place, layout = folder / str(number), SHEETS[name]
         truth = write_capture(place, layout, LENS, SHEET_PHOTOS, views, FLAWS, seed, hide=hide)
         found = capture_scene(place / "calibration", place / "photos", SIZE, place / "scene.npz")
-        sheet, to_truth = found.calibration.solved, home(found.solved, layout)
+        sheet = found.calibration.solved
         groups = {
             "sheet": [
                 (inverse(sheet.w2c[i]), s.name) for i, s in zip(sheet.placed, found.calibration.used, strict=True)
