@@ -15,9 +15,8 @@ from benchmarks.methods import train
 from benchmarks.synthetic.photos import write_capture
 from benchmarks.synthetic.tabletop import Tabletop
 from benchmarks.tables import Rows, named
-from nerf_lightning.capture.outputs import Packing
 from nerf_lightning.capture.poses.solve import Solved
-from nerf_lightning.capture.run import capture
+from nerf_lightning.capture.run import capture_scene
 from nerf_lightning.capture.tags.layout import TagLayout
 from nerf_lightning.dataset.bricks.model import bulldozer
 from nerf_lightning.export.mesh import mesh_file, training_views
@@ -116,7 +115,7 @@ def of_capture(seconds: float, output: Path) -> Rows:
     folder = output / "shapes" / "capture"
     layout = SHEETS["six tags"]
     write_capture(folder, layout, LENS, PHOTOS, VIEWS, FLAWS, 0)
-    found = capture(folder / "calibration", folder / "photos", SIZE, Packing(folder / "scene.npz", LONGEST))
+    found = capture_scene(folder / "calibration", folder / "photos", SIZE, folder / "scene.npz", longest=LONGEST)
     given = [f"dataset.path='{folder}/scene.npz'", f"budget.seconds={LONGER * seconds}"]
     trained = train("capture", given, 0, folder / "run")
     rows = size_of_capture(open_scene_run(folder / "run", the_device("auto")), found.solved, layout)

@@ -9,8 +9,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 
 import nerf_lightning as nl
-from nerf_lightning.capture.outputs import Packing
-from nerf_lightning.capture.run import capture
+from nerf_lightning.cli.capture import capture
 
 if __name__ == "__main__":
     parser = ArgumentParser()
@@ -20,10 +19,10 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=180, help="of training")
     parser.add_argument("--pixels", type=int, default=300, help="longest side of the scene's photos")
     given = parser.parse_args()
-    capture(given.sheet, given.photos, given.tag, Packing(Path("scene.npz"), given.pixels))
+    capture(calibration=given.sheet, photos=given.photos, tag_size=given.tag, resize=given.pixels)
     run = nl.train("scene.npz", seconds=given.seconds, options=["+experiment=capture", "callbacks.orbit=null"])
     print(f"{run.psnr:.2f} dB on photos it never saw")
     views = [run.render(run.orbit[i]).rgb for i in range(len(run.orbit))]
     frames = [(255 * view).round().byte().numpy() for view in views]
     imageio.imwrite("orbit.webp", frames, plugin="pillow", duration=50, loop=0)
-    run.export("field.npz")
+    run.export.compact(output="field.npz")

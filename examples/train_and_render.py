@@ -17,4 +17,4 @@ if __name__ == "__main__":
     shown = run.render(scene.val.cameras[0]).rgb
     photo = scene.val.images[0, ..., :3].float() / 255
     imageio.imwrite("view.png", (255 * torch.cat([shown, photo], dim=1)).round().byte().numpy())
-    run.export("field.npz")
+    run.export.compact(output="field.npz")

@@ -175,7 +175,8 @@ def test_viewer_on_device_paints_each_channel(device: torch.device, run: Path):
 
 @pytest.mark.long
 def test_rightsize_on_device_finds_smallest(device: torch.device, tmp_path: Path):
-    rightsize = pytest.importorskip("nerf_lightning.cli.rightsize").rightsize
+    from nerf_lightning.cli.rightsize import rightsize
+
     save_npz(make_scene(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
     rungs = [{"density_components": 8, "colour_components": 8, "coarsest": 4, "finest": side} for side in (4, 8)]
     ladder = {"rungs": rungs, "samplers": [{"samples": 32, "resolution": 8}]}

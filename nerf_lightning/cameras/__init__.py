@@ -5,8 +5,6 @@ from nerf_lightning.cameras.cameras import Cameras, Rays, has_panoramas
 from nerf_lightning.cameras.layout import Layout, classify_layout, gaze_point
 from nerf_lightning.cameras.lenses import Distortion, Lenses, Projection
 from nerf_lightning.cameras.orbit import (
-    axes_meet,
-    focus_point,
     look_at,
     orbit_around,
     typical_view,
@@ -16,7 +14,6 @@ from nerf_lightning.cameras.paths import orbit_like, pivot_of, resample_path, sp
 from nerf_lightning.cameras.transforms import (
     in_other_frame,
     pixel_to_camera,
-    pixel_to_ray,
     transform,
     transform_directions,
 )
@@ -31,9 +28,7 @@ __all__ = [
     "Lenses",
     "Projection",
     "Rays",
-    "axes_meet",
     "classify_layout",
-    "focus_point",
     "gaze_point",
     "has_panoramas",
     "held",
@@ -42,7 +37,6 @@ __all__ = [
     "orbit_around",
     "orbit_like",
     "pixel_to_camera",
-    "pixel_to_ray",
     "pivot_of",
     "resample_path",
     "spiral_like",

@@ -160,7 +160,7 @@ class Cameras:
 
     @cached_property
     def pixel_axes(self) -> Float[Tensor, "V 3 3"]:
-        """World vectors a, b, c of each pinhole view: pixel (u, v) looks along u a + v b + c, as in `pixel_to_ray`."""
+        """World vectors a, b, c of each pinhole view: pixel (u, v) looks along u a + v b + c."""
         K, rotation = self.K.cpu().double(), self.c2w[:, :3, :3].cpu().double()  # not every device has doubles
         identity = torch.eye(3, dtype=torch.float64).expand_as(K)
         inverse = torch.linalg.solve_triangular(K, identity, upper=True)

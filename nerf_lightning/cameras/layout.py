@@ -2,8 +2,10 @@
 
 from enum import StrEnum
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.optimize import least_squares
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -142,8 +144,7 @@ def gaze_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
     """The point in front of the cameras that is nearest to their axes by angle; far away where axes do not converge.
 
     Maximises the mean cosine between axes and directions to the point, each view weighted by how few others look from
-    its direction. For cameras all around that are framed to one side alike, that is the middle of their circle; the point
-    nearest to the axes' lines (`focus_point`) may be behind cameras, and follows the views' density.
+    its direction. For cameras all around that are framed to one side alike, that is the middle of their circle.
     """
     c2w = c2w.double().clone()
     middle = c2w[:, :3, 3].mean(0)
@@ -164,28 +165,15 @@ def gaze_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
     return middle + size * point
 
 
-def _climb(
-    c2w: Float[Tensor, "V 4 4"], point: Float[Tensor, "3"], weights: Float[Tensor, "V"], steps: int = 40
-) -> Float[Tensor, "3"]:
+def _climb(c2w: Float[Tensor, "V 4 4"], point: Float[Tensor, "3"], weights: Float[Tensor, "V"]) -> Float[Tensor, "3"]:
     """The nearest maximum of the weighted mean cosine, by Levenberg-Marquardt on the chords between directions and axes."""
-    centres, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
-    eye = torch.eye(3, dtype=point.dtype, device=point.device)
-    damping, value = 1e-3, float(gaze(c2w, point[None])[0] @ weights)
-    for _ in range(steps):
-        offset = point - centres
-        distance = offset.norm(dim=1).clamp_min(1e-12)
-        toward = offset / distance[:, None]
-        J = (eye - toward[:, :, None] * toward[:, None, :]) / distance[:, None, None]
-        normal = (weights[:, None, None] * (J.mT @ J)).sum(0)
-        slope = (weights[:, None] * (J @ axes[:, :, None])[:, :, 0]).sum(0)
-        step = torch.linalg.solve(normal + (damping * normal.trace() + 1e-18) * eye, slope)
-        new = float(gaze(c2w, (point + step)[None])[0] @ weights)
-        if new > value:
-            point, value, damping = point + step, new, damping / 4
-            if float(step.norm()) < 1e-9 * float(distance.mean()):
-                break
-        else:
-            damping = 10 * max(damping, 1e-6)
-            if damping > 1e6:
-                break
-    return point
+    centres, axes = c2w[:, :3, 3].cpu().numpy(), normalize(c2w[:, :3, 2], dim=1).cpu().numpy()
+    root = weights.sqrt()[:, None].cpu().numpy()
+
+    def chords(place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "R"]:
+        offset = place - centres
+        return (root * (offset / np.linalg.norm(offset, axis=1, keepdims=True).clip(1e-12) - axes)).ravel()
+
+    start = point.cpu().numpy()
+    found = least_squares(chords, start, method="lm", xtol=1e-12, ftol=1e-14, gtol=1e-14, max_nfev=400).x
+    return torch.from_numpy(found).to(point)

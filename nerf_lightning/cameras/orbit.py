@@ -8,9 +8,6 @@ from torch import Tensor
 
 from nerf_lightning.cameras.cameras import Cameras
 
-MEETING = 0.25
-"""See `axes_meet`."""
-
 
 def look_at(
     eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "3"]
@@ -29,33 +26,6 @@ def look_at(
     c2w = torch.eye(4, dtype=eye.dtype, device=eye.device).repeat(*eye.shape[:-1], 1, 1)
     c2w[..., :3, :] = torch.stack([right, down, forward, eye], dim=-1)
     return c2w
-
-
-def focus_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
-    """The point nearest to all optical axes in the least-squares sense: what the cameras look at.
-
-    Solves sum_v (I - d_v d_v^T) (x - o_v) = 0; a small ridge pulls toward the mean centre, so that parallel axes
-    (one view, a flat sweep) still give a finite point.
-    """
-    centres = c2w[:, :3, 3].double()
-    axes = torch.nn.functional.normalize(c2w[:, :3, 2].double(), dim=-1)
-    eye = torch.eye(3, dtype=torch.float64, device=c2w.device)
-    projectors = eye - axes[:, :, None] * axes[:, None, :]
-    mean = centres.mean(0)
-    A = projectors.mean(0) + 1e-8 * eye
-    b = (projectors @ (centres - mean)[:, :, None]).mean(0)[:, 0]
-    return (mean + torch.linalg.solve(A, b)).to(c2w.dtype)
-
-
-def axes_meet(c2w: Float[Tensor, "V 4 4"]) -> bool:
-    """Whether the optical axes meet in `focus_point`: they pass it, on average, within a share of the cameras' distance to it.
-
-    They do not in a panorama or a fly-through.
-    """
-    offset = focus_point(c2w) - c2w[:, :3, 3]
-    axes = torch.nn.functional.normalize(c2w[:, :3, 2], dim=1)
-    beside = (offset - (offset * axes).sum(1, keepdim=True) * axes).norm(dim=1)
-    return float(beside.mean()) <= MEETING * float(offset.norm(dim=1).mean())
 
 
 def orbit_around(

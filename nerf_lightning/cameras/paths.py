@@ -22,8 +22,6 @@ MIN_DENSITY = 0.15
 """An azimuth was photographed where the kernel density is at least this share of its mean: gaps of 90 degrees do."""
 INSIDE = 0.7
 """Share of the views that lie within a loop before the subject."""
-RIDGE = 0.1
-"""Of the surface through forward-facing cameras, in squared half-axes of their loop."""
 MAX_DETOUR = 2.0
 """Photos are not in the order of a walk where it is that many times longer than going to the nearest one each time."""
 WALK_SAMPLES = 512
@@ -67,19 +65,7 @@ def orbit_like(
     K, (width, height) = one.K[0], one.size(0)
     if int(sides[typical]) % 2 == 1:  # it lies on its side
         K, width, height = on_its_side(K, width, height), height, width
-    return Cameras.of_size(K.repeat(frames, 1, 1), rigid(poses).to(cameras.c2w), width, height)
-
-
-def rigid(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
-    """The same poses.
-
-    Raises:
-        AssertionError: a pose is no rotation and finite translation. Nothing could read a run with such a path again.
-    """
-    R = c2w[:, :3, :3]
-    assert torch.isfinite(c2w).all() and (torch.linalg.det(R) > 0).all(), "a path with a degenerate pose"
-    assert (R @ R.mT - torch.eye(3).to(R)).abs().amax() < 1e-4, "a path with a pose that is no rotation"
-    return c2w
+    return Cameras.of_size(K.repeat(frames, 1, 1), poses.to(cameras.c2w), width, height)
 
 
 def turn_around(
@@ -151,7 +137,7 @@ def _wrapped(angle: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
 def loop_before(
     c2w: Float[Tensor, "V 4 4"], centre: Float[Tensor, "3"], up: Float[Tensor, "3"], frames: int
 ) -> Float[Tensor, "frames 4 4"]:
-    """An ellipse on the quadratic surface through the centres of forward-facing cameras, that holds most of them."""
+    """An ellipse across the view of forward-facing cameras, around most of their centres."""
     middle = c2w[:, :3, 3].mean(0)
     offset = c2w[:, :3, 3] - middle
     ahead = normalize(c2w[:, :3, 2].mean(0), dim=0)
@@ -163,18 +149,9 @@ def loop_before(
     second = torch.linalg.cross(ahead, first)
     places = torch.stack([flat @ first, flat @ second], dim=1)
     axes = places.abs().quantile(INSIDE, dim=0)
-    unit = float(axes.max()) or 1.0
-
-    def terms(at: Float[Tensor, "N 2"]) -> Float[Tensor, "N 6"]:
-        x, y = (at / unit).unbind(1)
-        return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
-
-    A = terms(places)
-    ridge = RIDGE * torch.diag(torch.tensor([0.0, 1, 1, 1, 1, 1]).to(A))
-    surface = torch.linalg.solve(A.mT @ A + ridge, A.mT @ (offset @ ahead))
     turn = torch.arange(frames, dtype=up.dtype, device=up.device) * (2 * math.pi / frames)
     at = axes * torch.stack([torch.cos(turn), torch.sin(turn)], dim=1)
-    eye = middle + at[:, :1] * first + at[:, 1:] * second + (terms(at) @ surface)[:, None] * ahead
+    eye = middle + at[:, :1] * first + at[:, 1:] * second
     return look_at(eye, centre, up)
 
 
@@ -274,7 +251,7 @@ def spiral_like(orbit: Cameras, frames: int = 60) -> Cameras:
     build = wind_up if float(flat.mean(0).norm()) < ONE_SIDED else wind_in
     poses = build(offset, up, frames)
     poses[:, :3, 3] += centre
-    return Cameras.of_size(orbit.K[:1].repeat(frames, 1, 1), rigid(poses), orbit.width, orbit.height)
+    return Cameras.of_size(orbit.K[:1].repeat(frames, 1, 1), poses, orbit.width, orbit.height)
 
 
 def wind_up(offset: Float[Tensor, "V 3"], up: Float[Tensor, "3"], frames: int) -> Float[Tensor, "frames 4 4"]:

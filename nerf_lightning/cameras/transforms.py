@@ -38,16 +38,3 @@ def pixel_to_camera(
     y = (uv[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
     x = (uv[..., 0] - K[..., 0, 2] - K[..., 0, 1] * y) / K[..., 0, 0]
     return torch.stack([x * depth, y * depth, depth.expand_as(x)], dim=-1)
-
-
-def pixel_to_ray(
-    K: Float[Tensor, "*#batch 3 3"], c2w: Float[Tensor, "*#batch 4 4"], uv: Float[Tensor, "*#batch 2"]
-) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
-    """Casts a ray through each pixel.
-
-    Returns:
-        Origins (the camera centres) and unit directions, both in the world frame.
-    """
-    camera = pixel_to_camera(K, uv, torch.ones_like(uv[..., 0]))
-    directions = torch.nn.functional.normalize(transform_directions(c2w, camera), dim=-1)
-    return c2w[..., :3, 3].expand_as(directions), directions

@@ -2,6 +2,7 @@
 
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 LEVEL, TINY = 2.0, 1e-6
@@ -53,19 +54,6 @@ def held(c2w: Float[Tensor, "V 4 4"]) -> tuple[Float[Tensor, "3"], Int[Tensor, "
 
 
 def turn_upright(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation that takes `up`, a unit vector, to (0, 0, 1) (Rodrigues' formula)."""
-    dtype, up = up.dtype, up.double()
-    axis = torch.stack([up[1], -up[0], torch.zeros_like(up[0])])  # up x z
-    cosine = up[2]
-    if float(cosine) < -1 + 1e-9:
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=dtype, device=up.device))
-    zero = torch.zeros_like(cosine)
-    cross = torch.stack(
-        [
-            torch.stack([zero, -axis[2], axis[1]]),
-            torch.stack([axis[2], zero, -axis[0]]),
-            torch.stack([-axis[1], axis[0], zero]),
-        ]
-    )
-    eye = torch.eye(3, dtype=torch.float64, device=up.device)
-    return (eye + cross + cross @ cross / (1 + cosine)).to(dtype)
+    """The smallest rotation that takes `up`, a unit vector, to (0, 0, 1)."""
+    turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], up[None].double().cpu().numpy())
+    return torch.from_numpy(turn.as_matrix()).to(up)

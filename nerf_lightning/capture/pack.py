@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from nerf_lightning.cameras import Bounds, Cameras, orbit_around
+from nerf_lightning.cameras import Bounds, Cameras
+from nerf_lightning.cameras.paths import orbit_like
 from nerf_lightning.dataset.extent import visible_cube
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.dataset.lens import Lens, Rectification, rectify
@@ -19,13 +20,12 @@ from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
-SUBJECT = 0.5
+SUBJECT_WIDTH_FRACTION = 0.5
 """The box's share of the width that photos show at the subject. The tags around an object may lie outside the box, where a
 field has less detail the farther out."""
-FRAMES = 60
 
 
-def pinhole_photo(path: Path, rectification: Rectification, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+def rectify_photo(path: Path, rectification: Rectification, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
     """A photo, upright, its distortion undone, averaged down to a size."""
     image = rectification.apply(np.ascontiguousarray(read_pixels(path, upright=True)[..., :3]))
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
@@ -39,7 +39,6 @@ def pack(
     source: str,
     longest: int | None = 300,
     holdout: int = 10,
-    orbit: str | None = None,
 ) -> Scene:
     """Makes a scene of placed photos.
 
@@ -54,21 +53,17 @@ def pack(
         name, source: see `Scene`.
         longest: side of the scene's photos in pixels; None keeps their size.
         holdout: every N-th photo is held out.
-        orbit: name of the photo through whose camera the orbit goes; None takes one at medium height.
 
     Raises:
-        InputError: fewer than two photos, or no photo of that name.
+        InputError: fewer than two photos.
     """
     if len(paths) < 2:
         raise InputError(source, "", f"{len(paths)} placed photos", "at least 2: one to train on, one to hold out")
-    if orbit is not None and orbit not in [path.name for path in paths]:
-        raise InputError("config", "orbit", orbit, f"a placed photo, such as {paths[0].name}")
     rectification = rectify(lens)
     width, height = fit_size(lens.width, lens.height, longest)
-    images = torch.from_numpy(np.stack([pinhole_photo(path, rectification, width, height) for path in paths]))
-    poses = torch.from_numpy(c2w).float()
+    images = torch.from_numpy(np.stack([rectify_photo(path, rectification, width, height) for path in paths]))
     K = torch.from_numpy(rectification.K).float().repeat(len(paths), 1, 1)
-    cameras = Cameras.of_size(K, poses, lens.width, lens.height).resized((width, height))
+    cameras = Cameras.of_size(K, torch.from_numpy(c2w).float(), lens.width, lens.height).resized((width, height))
     held = torch.zeros(len(paths), dtype=torch.bool)
     held[holdout // 2 :: holdout] = True
     if not held.any():
@@ -76,25 +71,13 @@ def pack(
     train = Views.of(images[~held], cameras[~held])
     region = find_region(train.cameras.c2w)
     centre = region.centre.float()
-    distances = (train.cameras.centres - centre).norm(dim=1)
-    if orbit is not None:
-        through = poses[[path.name for path in paths].index(orbit), :3, 3]
-    else:  # the camera nearest to the medians of distance and height
-        heights = poses[~held, 2, 3]
-        off = (distances - distances.median()).abs() + (heights - heights.median()).abs()
-        through = train.cameras.centres[off.argmin()]
-    offset = through - centre
-    radius = float(offset.norm())
-    elevation = float(torch.asin((offset[2] / max(radius, 1e-9)).clamp(-0.99, 0.99)))
-    circle = orbit_around(centre, torch.tensor([0.0, 0.0, 1.0]), radius, elevation, FRAMES)
-    near = NEAR * min(region.unit, float(distances.min()))
-    cube = torch.from_numpy(visible_cube(train.cameras)).float()
-    aabb = centre + SUBJECT * (cube - centre)
+    nearest = float((train.cameras.centres - centre).norm(dim=1).min())
+    aabb = centre + SUBJECT_WIDTH_FRACTION * (torch.from_numpy(visible_cube(train.cameras)).float() - centre)
     return Scene(
         name=name,
         source=source,
         train=train,
         val=Views.of(images[held], cameras[held]),
-        orbit=Cameras.of_size(train.cameras.K[:1].repeat(FRAMES, 1, 1), circle, width, height),
-        bounds=Bounds(aabb, unbounded=True, near=near),
+        orbit=orbit_like(train.cameras, layout=region.layout, centre=centre),
+        bounds=Bounds(aabb, unbounded=True, near=NEAR * min(region.unit, nearest)),
     )

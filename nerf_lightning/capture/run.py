@@ -5,26 +5,46 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
+from jaxtyping import Float
 
-from nerf_lightning.capture.outputs import Packing, Placed, write_scene
-from nerf_lightning.capture.photos import of_one_size
-from nerf_lightning.capture.poses.calibrate import Calibration, calibrate, off_by, without
+from nerf_lightning.capture.pack import pack
+from nerf_lightning.capture.photos import find_wrong_sizes
+from nerf_lightning.capture.poses.calibrate import Calibration, calibrate, drop_tag, reprojection_message
 from nerf_lightning.capture.poses.geometry import inverse
-from nerf_lightning.capture.poses.solve import Solved, misfits, solve
+from nerf_lightning.capture.poses.solve import Pose, Solved, misfits, solve
 from nerf_lightning.capture.poses.texture import HINT, place_by_texture
 from nerf_lightning.capture.tags.board import Board, board_detector
-from nerf_lightning.capture.tags.detect import Sighting, guess_family, sight, tag_detector
+from nerf_lightning.capture.tags.detect import Sighting, detect_in_photos, guess_family, tag_detector
 from nerf_lightning.capture.tags.layout import read_layout
+from nerf_lightning.dataset.formats.npz import save_npz
+from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import atomic, write_json
 
 log = logging.getLogger(__name__)
 
-NEAREST, FARTHEST = 0.03, 30.0
-"""Plausible distances of cameras from tags, metres; others mean that the size was given in another unit."""
+MIN_DISTANCE_M, MAX_DISTANCE_M = 0.03, 30.0
+"""Plausible median distance of cameras from tags; others mean that the size was given in another unit."""
+
+
+@dataclass(frozen=True)
+class PlacedPhoto:
+    """A photo with its camera, or the reason why it has none."""
+
+    name: str
+    reason: str = ""
+    """Why it was left out; "" if it was placed."""
+    c2w: Float[np.ndarray, "4 4"] | None = None
+    """OpenCV frame, metres."""
+    reprojection_px: float | None = None
+    by: str = ""
+    """"texture" if it shows no tag, and was placed against the photos that do; "" if as the others."""
 
 
 @dataclass(frozen=True)
@@ -35,124 +55,171 @@ class Capture:
     sightings: list[Sighting]
     """Of the photos to be placed that have the calibrated size."""
     solved: Solved
-    photos: list[Placed]
+    photos: list[PlacedPhoto]
     scene: Scene
 
 
-def capture(
+def capture_scene(
     calibration: Path,
     photos: Path,
-    size: float,
-    packing: Packing,
+    tag_size: float,
+    output: Path,
+    *,
     dictionary: str = "auto",
-    layout: str = "auto",
+    layout: Path | None = None,
     board: Board | None = None,
+    longest: int | None = 300,
+    holdout: int = 10,
 ) -> Capture:
-    """Calibrates, places the photos, and writes the scene, `cameras.json` and `calibration.yaml` beside it.
+    """Calibrates, places the photos, and writes the scene, `cameras.json` and `calibration.yaml`; see `command.capture`.
 
     Args:
-        calibration: folder of photos of the tags.
-        photos: folder of photos of the subject, with tags in view.
-        size: side of a tag's black square, metres.
-        packing: the scene to write.
-        dictionary: of the tags, or "auto".
-        layout: "auto" finds from the photos where the tags lie; otherwise a YAML file says it (see `read_layout`).
+        calibration, photos, tag_size, output, dictionary, layout, holdout: see there.
         board: a ChArUco board instead of tags on their own.
+        longest: side of the scene's photos in pixels; None keeps their size.
 
     Raises:
-        InputError: whatever is wrong with the options or photos.
+        InputError: the options or photos are no good.
     """
-    if not 0 < size < 10:
-        raise InputError("config", "tags.size", f"{size:g}", "the side of a tag's black square in metres, such as 0.06")
     sheets, views = find_photos(calibration, "calibration"), find_photos(photos, "photos")
-    packing.check(views)
     family = guess_family(sheets) if dictionary == "auto" else dictionary
-    known = None if layout == "auto" or board else read_layout(Path(layout), family, size).poses
-    detector = board_detector(family, size, board) if board else tag_detector(family, size)
-    log.info("%s: looking for tags of %s in %d photos", calibration, family, len(sheets))
-    seen = sight(sheets, detector)
-    wrong = of_one_size(calibration, {s.name: (s.width, s.height) for s in seen})
-    kept = [s for s in seen if s.name not in wrong]
-    log.info("%s: looking for tags in %d photos", photos, len(views))
-    sightings = sight(views, detector)
-    turned = of_one_size(photos, {s.name: (s.width, s.height) for s in sightings}, (kept[0].width, kept[0].height))
-    usable = [s for s in sightings if s.name not in turned]
+    known = None if layout is None or board else read_layout(layout, family, tag_size).poses
+    detector = board_detector(family, tag_size, board) if board else tag_detector(family, tag_size)
+    log.info("looking for tags of %s in %s and %s", family, calibration, photos)
+    of_sheet, of_views = detect_in_photos(sheets, detector), detect_in_photos(views, detector)
+    wrong = find_wrong_sizes(calibration, of_sheet)
+    of_sheet = [s for s in of_sheet if s.name not in wrong]
+    reasons = find_wrong_sizes(photos, of_views, (of_sheet[0].width, of_sheet[0].height))
+    usable = [s for s in of_views if s.name not in reasons]
     if not any(s.marks for s in usable):
         raise InputError(
             photos,
             "",
             f"no tag of {family} in {len(usable)} photos",
             "photos with at least one whole tag in view",
-            "are the folders swapped, or is tags.dictionary another one?",
+            "are the folders swapped, or is the dictionary another one?",
         )
-    lens_found = calibrate(calibration, kept, known)
-    lens_found.dropped.update(wrong)
-    for text in lens_found.warnings:
-        log.warning("calibration: %s", text)
-    for left_out, reason in lens_found.dropped.items():
-        log.warning("%s left out of the calibration: %s", left_out, reason)
-    lens = lens_found.lens
-    log.info("focal length %.1f pixels, reprojection error %.2f pixels", lens.fx, lens_found.rms)
-    solved, reasons = _place(usable, lens_found, known)
-    # A wrong unit of the size, mostly.
-    distance = float(np.median([np.linalg.norm(inverse(w2c)[:3, 3]) for w2c in solved.w2c.values()]))
-    if not NEAREST < distance < FARTHEST:
-        raise InputError(
-            "config",
-            "tags.size",
-            f"{size:g}, which puts the cameras of {photos} {distance:.3g} m away from the tags",
-            f"{NEAREST} to {FARTHEST:g} m",
-            "give the side of the black square in metres: 6 cm are 0.06",
-        )
-    errors = {usable[i].name: float(rms) for i, rms in zip(solved.placed, solved.refined.rms, strict=True)}
-    w2c = {usable[i].name: pose for i, pose in solved.w2c.items()}
-    placed = {name: Placed(name, "", inverse(pose), errors[name]) for name, pose in w2c.items()}
-    untagged = [s.name for s in usable if not s.marks]
-    if untagged and importlib.util.find_spec("pycolmap") is None:
-        reasons |= {name: reasons[name] + HINT for name in untagged}
-    elif untagged:
-        found, more = place_by_texture([s.path for s in usable], lens, w2c, untagged)
-        reasons |= more
-        placed |= {name: Placed(name, "", inverse(f.w2c), f.reprojection_px, "texture") for name, f in found.items()}
-    reasons |= turned
-    results = [placed[s.name] if s.name in placed else Placed(s.name, reasons[s.name]) for s in sightings]
-    details = {
-        "standard_deviations": lens_found.deviations,
-        "reprojection_px": lens_found.rms,
-        "photos_used": [s.name for s in lens_found.used],
-        "photos_left_out": lens_found.dropped,
-        "coverage": lens_found.coverage,
-        "largest_tilt_degrees": float(np.degrees(lens_found.tilt)),
-        "warnings": lens_found.warnings,
-        "tags": {
-            "dictionary": family,
-            "size": size,
-            "to_world": {tag: pose.tolist() for tag, pose in solved.tags.items()},
-        },
-    }
-    scene = write_scene(photos, results, lens, packing, details)
-    return Capture(lens_found, usable, solved, results, scene)
+    found = calibrate(calibration, of_sheet, known)
+    found.dropped.update(wrong)
+    _log(found)
+    solved, left_out = place_by_tags(usable, found.lens, known)
+    _check_distance(solved, photos, tag_size)
+    textured, still_left_out = _place_untagged(usable, found.lens, solved, left_out)
+    placed = {photo.name: photo for photo in [*_placed_by_tags(usable, solved), *textured]}
+    reasons |= still_left_out
+    results = [placed.get(s.name) or PlacedPhoto(s.name, reasons[s.name]) for s in of_views]
+    for photo in results:
+        if photo.c2w is None:
+            log.warning("%s left out: %s", photo.name, photo.reason)
+    c2w = {photos / photo.name: photo.c2w for photo in results if photo.c2w is not None}
+    scene = pack(list(c2w), np.stack(list(c2w.values())), found.lens, output.stem, str(photos), longest, holdout)
+    save_npz(scene, output)
+    _write_cameras(output.with_name("cameras.json"), results, scene)
+    tags = {"dictionary": family, "size": tag_size, "to_world": {tag: p.tolist() for tag, p in solved.tags.items()}}
+    _write_calibration(output.with_name("calibration.yaml"), found, tags)
+    return Capture(found, usable, solved, results, scene)
 
 
-def _place(
-    usable: Sequence[Sighting], found: Calibration, known: dict[int, np.ndarray] | None
+def place_by_tags(
+    sightings: Sequence[Sighting], lens: Lens, layout: dict[int, Pose] | None
 ) -> tuple[Solved, dict[str, str]]:
-    """Places photos without the tags and photos that contradict the others; returns the reasons for those left out too."""
-    reasons = {s.name: "no tag found" for s in usable if not s.marks}
-    left = list(usable)
+    """Places photos; leaves out those without tags and those that contradict the others.
+
+    Returns:
+        Tags and cameras, and why each photo that was left out was, by name.
+
+    Raises:
+        InputError: no photo can be placed.
+    """
+    reasons = {s.name: "no tag found" for s in sightings if not s.marks}
+    left = list(sightings)
     while True:
-        solved = solve(found.lens, [{} if s.name in reasons else s.marks for s in left], known)
+        solved = solve(lens, [{} if s.name in reasons else s.marks for s in left], layout)
         if solved is None:
             raise InputError(
-                usable[0].path.parent, "", "tags that fit no camera", "photos of flat tags, of the size given"
+                sightings[0].path.parent, "", "tags that fit no camera", "photos of flat tags, of the size given"
             )
         off = misfits(solved)
-        lost = {
-            s.name: "its tags are not linked to those of the other photos"
-            for i, s in enumerate(usable)
-            if i not in solved.w2c and s.name not in reasons
-        }
         if not off.photos and not off.marks:
-            return solved, reasons | lost
-        reasons |= {usable[i].name: off_by(error, off.usual) for i, error in off.photos.items()}
-        left = [without(s, off.marks.get(i)) for i, s in enumerate(left)]
+            unlinked = {s.name for i, s in enumerate(sightings) if i not in solved.w2c} - set(reasons)
+            return solved, reasons | dict.fromkeys(unlinked, "its tags are not linked to those of the other photos")
+        reasons |= {sightings[i].name: reprojection_message(error, off.usual) for i, error in off.photos.items()}
+        left = [drop_tag(s, off.marks.get(i)) for i, s in enumerate(left)]
+
+
+def _placed_by_tags(sightings: Sequence[Sighting], solved: Solved) -> list[PlacedPhoto]:
+    return [
+        PlacedPhoto(sightings[i].name, "", inverse(solved.w2c[i]), float(rms))
+        for i, rms in zip(solved.placed, solved.refined.rms, strict=True)
+    ]
+
+
+def _place_untagged(
+    sightings: Sequence[Sighting], lens: Lens, solved: Solved, reasons: dict[str, str]
+) -> tuple[list[PlacedPhoto], dict[str, str]]:
+    """Places photos without tags by their texture, and tells why each that is still left out is."""
+    untagged = [s.name for s in sightings if not s.marks]
+    if not untagged:
+        return [], reasons
+    if importlib.util.find_spec("pycolmap") is None:
+        return [], reasons | {name: reasons[name] + HINT for name in untagged}
+    known = {sightings[i].name: pose for i, pose in solved.w2c.items()}
+    found, lost = place_by_texture([s.path for s in sightings], lens, known, untagged)
+    placed = [PlacedPhoto(name, "", inverse(f.w2c), f.reprojection_px, "texture") for name, f in found.items()]
+    return placed, reasons | lost
+
+
+def _check_distance(solved: Solved, photos: Path, tag_size: float) -> None:
+    distance = float(np.median([np.linalg.norm(inverse(w2c)[:3, 3]) for w2c in solved.w2c.values()]))
+    if not MIN_DISTANCE_M < distance < MAX_DISTANCE_M:
+        raise InputError(
+            "capture",
+            "tag_size",
+            f"{tag_size:g}, which puts the cameras of {photos} {distance:.3g} m away from the tags",
+            f"{MIN_DISTANCE_M} to {MAX_DISTANCE_M:g} m",
+            "give the side of the black square in metres: 6 cm are 0.06",
+        )
+
+
+def _log(found: Calibration) -> None:
+    for text in found.warnings:
+        log.warning("calibration: %s", text)
+    for name, reason in found.dropped.items():
+        log.warning("%s left out of the calibration: %s", name, reason)
+    log.info("focal length %.1f pixels, reprojection error %.2f pixels", found.lens.fx, found.rms)
+
+
+def _write_cameras(file: Path, photos: Sequence[PlacedPhoto], scene: Scene) -> None:
+    K = scene.train.cameras.K[0].tolist()  # of the undistorted, resized photos
+    entries = [
+        {
+            "name": photo.name,
+            "status": "left out" if photo.c2w is None else "placed",
+            "reason": photo.reason,
+            "K": None if photo.c2w is None else K,
+            "c2w": None if photo.c2w is None else photo.c2w.tolist(),
+            "reprojection_px": photo.reprojection_px,
+            **({"by": photo.by} if photo.by else {}),
+        }
+        for photo in photos
+    ]
+    write_json(file, {"photos": entries})
+
+
+def _write_calibration(file: Path, found: Calibration, tags: dict[str, Any]) -> None:
+    lens = found.lens
+    content = {
+        **{key: getattr(lens, key) for key in ("width", "height")},
+        **{key: float(getattr(lens, key)) for key in ("fx", "fy", "cx", "cy")},
+        "distortion": dict(zip(("k1", "k2", "p1", "p2", "k3"), map(float, lens.distortion), strict=True)),
+        "standard_deviations": found.deviations,
+        "reprojection_px": found.rms,
+        "photos_used": [s.name for s in found.used],
+        "photos_left_out": found.dropped,
+        "coverage": found.coverage,
+        "largest_tilt_degrees": float(np.degrees(found.tilt)),
+        "warnings": found.warnings,
+        "tags": tags,
+    }
+    with atomic(file) as temporary:
+        temporary.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")

@@ -5,12 +5,13 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from cyclopts import App, Parameter
 from cyclopts.exceptions import CycloptsError
 
 from nerf_lightning import __version__
+from nerf_lightning.cli.capture import capture, print_tags
 from nerf_lightning.cli.check import check
 from nerf_lightning.cli.compare import compare
 from nerf_lightning.cli.evaluate import evaluate
@@ -39,9 +40,24 @@ app = App(
     result_action="return_value",
 )
 _help = f"{inspect.cleandoc(train.__doc__ or '')}\n{describe_groups()}"
-app.command(train, help=_help, help_format="plaintext", usage="Usage: nerf_lightning train KEY=VALUE...\n")
-for _command in (check, view, render, evaluate, export, compare, rightsize, stability):
-    app.command(_command)
+_commands: tuple[Any, ...] = (
+    print_tags,
+    capture,
+    check,
+    train,
+    view,
+    render,
+    evaluate,
+    export,
+    compare,
+    rightsize,
+    stability,
+)
+for _command in _commands:
+    if _command is not train:
+        app.command(_command)
+        continue
+    app.command(train, help=_help, help_format="plaintext", usage="Usage: nerf_lightning train KEY=VALUE...\n")
 for _number, _name in enumerate(app.resolved_commands()):
     app[_name].sort_key = _number
 app.register_install_completion_command()

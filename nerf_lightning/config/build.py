@@ -252,7 +252,7 @@ def build_logger(cfg: DictConfig, folder: Path) -> Logger:
     if isinstance(logger, TensorBoardLogger):
         from torch.utils.tensorboard import SummaryWriter
 
-        own = {"_target_", *inspect.signature(TensorBoardLogger).parameters}
+        own = {"_target_", *inspect.signature(type(logger)).parameters}
         check_options("logger", SummaryWriter, {k: v for k, v in resolved(cfg.logger).items() if k not in own})
     if isinstance(logger, CSVLogger | TensorBoardLogger):
         output_path(logger.log_dir)

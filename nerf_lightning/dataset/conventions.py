@@ -1,7 +1,7 @@
 """Whether photos and cameras belong together, by the matches between photos: wrong conventions, orders and units are named."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 
 from nerf_lightning.cameras import Cameras, Lenses, has_panoramas, in_other_frame
-from nerf_lightning.dataset.evidence import MAX_TRAIN_PHOTOS, MAX_VAL_PHOTOS, find_pairs, verified
+from nerf_lightning.dataset.evidence import MAX_TRAIN_PHOTOS, MAX_VAL_PHOTOS, Pair, find_pairs, verified
 from nerf_lightning.dataset.hypotheses import ZOOMS, Hypothesis, Matches, convention_hypotheses, explained
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Runs, Views
@@ -47,77 +47,80 @@ HELD_OUT = 0.35
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What matches say against the cameras."""
+class Doubt:
+    """A problem with the data that will spoil the result."""
 
-    found: str
-    todo: str
-    certain: bool
+    text: str
+    todo: str = "see the file's convention"
+    hopeless: bool = False
+    """Whether training cannot work at all."""
     inexact: bool = False
     """Whether correcting the poses may help."""
+    far_off: bool = False
+    """Whether it is certain that they are wrong."""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What the matches between photos say about the cameras."""
-
-    findings: tuple[Finding, ...] = ()
-    fits: bool = False
-    """Whether they confirm the poses: then no look at their geometry is needed."""
-
-
-def judge_cameras(scene: Scene) -> Verdict:
+def judge_cameras(scene: Scene) -> tuple[list[Doubt], bool]:
     """Compares the cameras of a scene, and what people often mistake them for, with matches between its photos.
 
     Without enough matches, as between tiny or plain photos, nothing is found and nothing is confirmed; nor is it of photos
     of all directions.
+
+    Returns:
+        What matches say against the cameras, and whether they confirm the poses: then no look at their geometry is needed.
     """
     if has_panoramas(scene.train.cameras):
-        return Verdict()
+        return [], False
     train, val = subsample(len(scene.train), MAX_TRAIN_PHOTOS), subsample(len(scene.val), MAX_VAL_PHOTOS)
     views = join_views(scene.train[torch.tensor(train)], scene.val[torch.tensor(val, dtype=torch.long)])
-    c2w = in_other_frame(torch.cat([scene.train.cameras.c2w, scene.val.cameras.c2w]), scene.to_source).numpy()
+    every = in_other_frame(torch.cat([scene.train.cameras.c2w, scene.val.cameras.c2w]), scene.to_source).numpy()
     kept = np.array([*train, *(len(scene.train) + i for i in val)])
+    c2w = every[kept]
     pairs = find_pairs(views)
     trained = [pair for pair in pairs if max(pair.first, pair.second) < len(train)]
-    if len(trained) < MIN_PAIRS or sum(len(pair.places) for pair in trained) < MIN_MATCHES:
-        return Verdict()
+    tested = [pair for pair in pairs if max(pair.first, pair.second) >= len(train)]
+    if not has_evidence(trained):
+        return [], False
     matches = Matches.of(trained, views.cameras)
-    given = share_explained(matches, c2w[kept])
+    given = share_explained(matches, c2w)
     longest = int(views.cameras.sizes.max())
     free = float(np.concatenate([verified(pair, longest) for pair in trained]).mean())
-    zoomed = focal_hypothesis(matches, c2w[kept], float(views.cameras.K[:, 0, 0].median()))
-    chance = 0.0
+    zoomed = focal_hypothesis(matches, c2w, float(views.cameras.K[:, 0, 0].median()))
+    chance = needed = 0.0
+    doubt = None
     if given < DOUBTED:
-        shuffled = shuffled_shares(matches, c2w[kept], len(train))
+        shuffled = shuffled_shares(matches, c2w, len(train))
         chance = float(shuffled.mean())
         needed = max(chance + MIN_DEVIATIONS * float(shuffled.std()), MIN_SHARE, free - MAX_GAP)
-        hypotheses = [*convention_hypotheses(c2w[kept]), *order_hypotheses(scene, c2w, kept), zoomed]
-        finding = wrong_convention(matches, given, needed, hypotheses)
-        finding = finding or wrong_focal(matches, c2w[kept], zoomed, free)
-        if finding is None and free >= SURE:
-            finding = wrong_poses(matches, c2w[kept], len(train))
-        elif finding is None and given < needed and len(trained) >= MANY_PAIRS:
-            found = f"poses that explain {given:.0%} of the matches between photos, shuffled ones {chance:.0%}"
-            finding = Finding(found, "check which pose belongs to which photo", False, inexact=True)
-        if finding is not None or given < needed:
-            return Verdict(() if finding is None else (finding,))
-    elif (finding := wrong_focal(matches, c2w[kept], zoomed, free)) is not None:
-        return Verdict((finding,))
-    if given >= REFUTED and (lost := misplaced(matches, c2w[kept], HELD_OUT * given)):
+        hypotheses = [*convention_hypotheses(c2w), *order_hypotheses(scene, every, kept), zoomed]
+        doubt = wrong_convention(matches, given, needed, hypotheses)
+    doubt = doubt or wrong_focal(matches, c2w, zoomed, free)
+    if doubt is None and given < DOUBTED and free >= SURE:
+        doubt = wrong_poses(matches, c2w, len(train))
+    elif doubt is None and given < needed and len(trained) >= MANY_PAIRS:
+        found = f"poses that explain {given:.0%} of the matches between photos, shuffled ones {chance:.0%}"
+        doubt = Doubt(found, "check which pose belongs to which photo", inexact=True)
+    if doubt is not None or given < needed:
+        return ([] if doubt is None else [doubt]), False
+    if given >= REFUTED and (lost := misplaced(matches, c2w, HELD_OUT * given)):
         named = join_truncated([scene.train.name(train[view]) for view in lost], MAX_NAMES)
-        found = f"{len(lost)} training photos whose poses do not fit the others: {named}"
-        return Verdict((Finding(found, "", False, inexact=True),), fits=True)
-    tested = [pair for pair in pairs if max(pair.first, pair.second) >= len(train)]
-    if len(tested) < MIN_PAIRS or sum(len(pair.places) for pair in tested) < MIN_MATCHES:
-        return Verdict(fits=True)
-    held_out = share_explained(Matches.of(tested, views.cameras), c2w[kept])
+        return [
+            Doubt(f"{len(lost)} training photos whose poses do not fit the others: {named}", "", inexact=True)
+        ], True
+    if not has_evidence(tested):
+        return [], True
+    held_out = share_explained(Matches.of(tested, views.cameras), c2w)
     if held_out - chance >= HELD_OUT * (given - chance):
-        return Verdict(fits=True)
+        return [], True
     found = f"held-out photos whose poses explain {held_out:.0%} of the matches, those of training photos {given:.0%}"
     # Where few matches are right, those of a few held-out photos may all be wrong.
-    certain = given >= REFUTED
-    return Verdict((Finding(found, "check which photos and poses each split has", certain, inexact=True),), fits=True)
+    is_sure = given >= REFUTED
+    return [Doubt(found, "check which photos and poses each split has", is_sure, True, is_sure)], True
+
+
+def has_evidence(pairs: Sequence[Pair]) -> bool:
+    """Whether there are enough matches to say anything."""
+    return len(pairs) >= MIN_PAIRS and sum(len(pair.places) for pair in pairs) >= MIN_MATCHES
 
 
 def focal_hypothesis(matches: Matches, c2w: Float[np.ndarray, "V 4 4"], focal: float) -> Hypothesis:
@@ -131,7 +134,7 @@ def focal_hypothesis(matches: Matches, c2w: Float[np.ndarray, "V 4 4"], focal: f
     )
 
 
-def wrong_focal(matches: Matches, c2w: Float[np.ndarray, "V 4 4"], zoomed: Hypothesis, free: float) -> Finding | None:
+def wrong_focal(matches: Matches, c2w: Float[np.ndarray, "V 4 4"], zoomed: Hypothesis, free: float) -> Doubt | None:
     """Another focal length, if it explains clearly more.
 
     Args:
@@ -145,7 +148,7 @@ def wrong_focal(matches: Matches, c2w: Float[np.ndarray, "V 4 4"], zoomed: Hypot
     return None if share < least else refuted(zoomed, share, given)
 
 
-def wrong_convention(matches: Matches, given: float, needed: float, hypotheses: Iterable[Hypothesis]) -> Finding | None:
+def wrong_convention(matches: Matches, given: float, needed: float, hypotheses: Iterable[Hypothesis]) -> Doubt | None:
     """The first of the hypotheses that explain matches best, if it explains what the cameras as read do not."""
     best, quality = None, 0.0
     for hypothesis in hypotheses:
@@ -159,17 +162,17 @@ def wrong_convention(matches: Matches, given: float, needed: float, hypotheses: 
     return None if best is None or share < needed else refuted(best, share, given)
 
 
-def refuted(hypothesis: Hypothesis, share: float, given: float) -> Finding | None:
+def refuted(hypothesis: Hypothesis, share: float, given: float) -> Doubt | None:
     """That the cameras as read explain too little beside a hypothesis, if they do."""
     if given >= DOUBTED * share:
         return None
     found = (
         f"{hypothesis.found}: that explains {share:.0%} of the matches between photos, the cameras as read {given:.0%}"
     )
-    return Finding(found, hypothesis.todo, given < REFUTED * share)
+    return Doubt(found, hypothesis.todo, given < REFUTED * share)
 
 
-def wrong_poses(matches: Matches, c2w: Float[np.ndarray, "V 4 4"], count: int) -> Finding | None:
+def wrong_poses(matches: Matches, c2w: Float[np.ndarray, "V 4 4"], count: int) -> Doubt | None:
     """Poses that explain little more than those of other photos would."""
     strict, loose = (
         (share_explained(matches, c2w, tolerance=slack), shuffled_shares(matches, c2w, count, slack).mean())
@@ -182,7 +185,8 @@ def wrong_poses(matches: Matches, c2w: Float[np.ndarray, "V 4 4"], count: int) -
         f"poses that explain {strict[0]:.0%} of the matches between photos, while shuffled ones explain {strict[1]:.0%}:"
         " they belong to other photos, or are inexact"
     )
-    return Finding(found, "check which pose belongs to which photo", bool(loose_skill < UNRELATED), inexact=True)
+    unrelated = bool(loose_skill < UNRELATED)
+    return Doubt(found, "check which pose belongs to which photo", unrelated, True, unrelated)
 
 
 def misplaced(matches: Matches, c2w: Float[np.ndarray, "V 4 4"], least: float) -> list[int]:

@@ -75,11 +75,6 @@ class Matches:
             bent = (cameras.lenses.projection == Projection.FISHEYE).numpy()
         return cls(views, pair, first, second, tolerance[pair], bent[views[pair, 1]])
 
-    def __getitem__(self, kept: Bool[np.ndarray, "M"]) -> "Matches":
-        """Some of the matches."""
-        parts = (x[kept] for x in (self.pair, self.first, self.second, self.tolerance, self.fisheye))
-        return Matches(self.views, *parts)
-
 
 def directions(cameras: Cameras, view: Int[np.ndarray, "M"], places: Float[Tensor, "M 2"]) -> Float[np.ndarray, "M 3"]:
     """Unit directions, camera frame, of places in photos, pixels."""

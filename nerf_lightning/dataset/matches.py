@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset.evidence import detect_in_view, match
+from nerf_lightning.dataset.hypotheses import directions
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.utils.text import subsample
@@ -25,7 +26,6 @@ MAX_ERROR = 2.0
 """Largest reprojection error of a point, pixels of the reduced photos."""
 MIN_PARALLAX = 0.005
 """Least angle between two rays, radians, that tells a depth; farther points are put where it would be that."""
-SUBPIXELS = 16
 
 
 def match_points(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor, "M 3"]:
@@ -48,8 +48,8 @@ def match_points(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor,
         places = match(detect_in_view(views, first), detect_in_view(views, second))
         if len(places):
             pair = torch.tensor([first, second])
-            shares = places / views.cameras.sizes[pair].numpy()
-            found.append(triangulate(cameras[pair].resized(sizes[pair]), shares[:, 0], shares[:, 1]))
+            reduced = places * (sizes[pair] / views.cameras.sizes[pair]).numpy()
+            found.append(triangulate(cameras[pair].resized(sizes[pair]), reduced[:, 0], reduced[:, 1]))
     points = torch.cat(found)
     log.info("%d points from matches between %d pairs of photos", len(points), len(found) - 1)
     return points.double() + origin
@@ -77,16 +77,13 @@ def triangulate(
 
     Args:
         cameras: two.
-        one, other: places in their photos, as shares of width and height.
+        one, other: places in their photos, pixels.
     """
-    fine = cameras.scaled(SUBPIXELS)  # rays go through the middles of pixels
-    rays = []
-    for view, places in enumerate((one, other)):
-        width, height = fine.size(view)
-        across, down = (torch.from_numpy(places) * torch.tensor([width, height])).long().unbind(1)
-        view_index = torch.full_like(across, view)
-        rays.append(fine.rays(view_index, down.clamp(0, height - 1), across.clamp(0, width - 1)))
-    a, b = (ray.directions.double() for ray in rays)
+    a, b = (
+        torch.from_numpy(directions(cameras, np.full(len(places), view), torch.from_numpy(places).float()))
+        @ cameras.c2w[view, :3, :3].double().T
+        for view, places in enumerate((one, other))
+    )
     baseline = (cameras.centres[1] - cameras.centres[0]).double()
     # Least squares for s a - t b = baseline; the angle is held above the least that tells a depth.
     sine = torch.linalg.cross(a, b).norm(dim=1)
@@ -99,6 +96,6 @@ def triangulate(
     kept = torch.ones(len(points), dtype=torch.bool)
     for view, places in enumerate((one, other)):
         pixels, _, seen = cameras.project(points.float(), view)
-        off = (pixels.double() - torch.from_numpy(places) * cameras.sizes[view]).norm(dim=1)
+        off = (pixels.double() - torch.from_numpy(places)).norm(dim=1)
         kept &= seen & (off < MAX_ERROR)
     return points[kept].float()

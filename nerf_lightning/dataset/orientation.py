@@ -8,8 +8,8 @@ from nerf_lightning.dataset.formats.header import read_header
 
 log = logging.getLogger(__name__)
 
-MAX_ASPECT_ERROR = 0.01
-"""Most relative difference of two shapes that count as one: reduced photos are rounded to whole pixels."""
+MAX_ROUNDING_PX = 1.5
+"""By how much a side may differ from that of the same photo at another size: sides are rounded to whole pixels."""
 
 
 class OrientationChooser:
@@ -67,7 +67,7 @@ class OrientationChooser:
 
 
 def has_shape(size: tuple[float, float], stated: tuple[float, float]) -> bool:
-    """Whether two sizes have one ratio of width to height."""
+    """Whether a photo of one size may be that of another size, enlarged or reduced."""
     (width, height), (other_width, other_height) = size, stated
-    tolerance = MAX_ASPECT_ERROR + 1 / min(*size, *stated)
-    return abs(width * other_height / (height * other_width) - 1) <= tolerance
+    off = max(abs(other_width * height / other_height - width), abs(other_height * width / other_width - height))
+    return off <= MAX_ROUNDING_PX

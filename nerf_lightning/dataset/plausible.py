@@ -1,17 +1,15 @@
 """Data that can be read but cannot be learned from: wrong poses, wrong background, a box that is too small."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from nerf_lightning.cameras import Bounds, Cameras, Layout, axes_meet, classify_layout, focus_point, gaze_point
-from nerf_lightning.dataset.conventions import judge_cameras
+from nerf_lightning.cameras import Bounds, Cameras, Layout
+from nerf_lightning.cameras.layout import find_convergence
+from nerf_lightning.dataset.conventions import Doubt, judge_cameras
 from nerf_lightning.dataset.extent import (
     MAX_VIEWS,
     border_colour,
@@ -20,8 +18,8 @@ from nerf_lightning.dataset.extent import (
     visible_cube,
     visual_hull,
 )
-from nerf_lightning.dataset.hypotheses import Hypothesis, convention_hypotheses
 from nerf_lightning.dataset.kind import check_visible
+from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
@@ -42,8 +40,6 @@ Exact poses of the built-in scene and of Lego explain all; ones off by 2 degrees
 degrees and 5 % 47 to 57 %; three of others among a hundred 98 %. Shuffled ones may explain 86 %, of content that is much alike
 from all sides.
 """
-LIKELIEST = 3
-"""Hypotheses that silhouettes are held against."""
 IN_BOX = 0.9
 """Coverage inside the box below which content lies outside it, provided the hull without the box fits well."""
 AROUND, OFF_CENTRE = 0.35, 0.5
@@ -51,22 +47,10 @@ AROUND, OFF_CENTRE = 0.35, 0.5
 distance."""
 FAR_OFF = 8.0
 """Largest distance of cameras from the box's centre, in its half-sizes, in an unbounded scene."""
+BACKWARD = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+"""Turns a camera around."""
 CUT = 0.02
 """Mean share of a ray's way through the box that near or far may cut off."""
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """A problem with the data that will spoil the result."""
-
-    text: str
-    hopeless: bool = False
-    """Whether training cannot work at all."""
-    inexact: bool = False
-    """Whether correcting the poses may help."""
-    far_off: bool = False
-    """Whether it is certain that they are wrong."""
-    todo: str = "see the file's convention"
 
 
 def check_scene(scene: Scene, corrected: bool = False) -> list[Doubt]:
@@ -109,15 +93,16 @@ def are_alike(views: Views) -> bool:
 
 def cameras(scene: Scene) -> Iterator[Doubt]:
     """Cameras that do not fit the photos, by the matches between these; without matches, ones that look away."""
-    verdict = judge_cameras(scene)
-    for finding in verdict.findings:
-        yield Doubt(finding.found, finding.certain, finding.inexact, finding.inexact and finding.certain, finding.todo)
+    doubts, fits = judge_cameras(scene)
+    yield from doubts
     c2w = scene.train.cameras.c2w
-    if verdict.fits or verdict.findings or len(c2w) < 3 or not axes_meet(c2w):
-        return
-    behind = float((((focus_point(c2w) - c2w[:, :3, 3]) * c2w[:, :3, 2]).sum(1) < 0).float().mean())
-    if behind > 0:
-        yield Doubt(f"{behind:.0%} of the cameras with their backs to the point where their axes meet")
+    if (
+        not (doubts or fits)
+        and len(c2w) > 2
+        and find_convergence(c2w) is None
+        and find_convergence(c2w @ BACKWARD) is not None
+    ):
+        yield Doubt("cameras with their backs to the point where their axes meet")
 
 
 def border(scene: Scene) -> Iterator[Doubt]:
@@ -148,9 +133,6 @@ def misfits(scene: Scene) -> Iterator[Doubt]:
     if explained < IN_BOX and hull_coverage(masks, views.cameras, everything) >= FITS_WELL:
         text = f"content beyond the box: the box explains {explained:.0%} of what the photos show"
         yield Doubt(text, hopeless=explained < FITS)
-    elif (mistake := outlined_by(masks, views.cameras.c2w.double().numpy(), views.cameras)) is not None:
-        text = f"{mistake.found}: so the outlines are those of one body, and as read {explained:.0%} of one"
-        yield Doubt(text, hopeless=explained < FITS_BADLY, todo=mistake.todo)
     else:
         text = (
             f"outlines that no body has: the photos together can explain {explained:.0%} of what each shows."
@@ -160,35 +142,19 @@ def misfits(scene: Scene) -> Iterator[Doubt]:
 
 
 def off_centre(scene: Scene) -> Iterator[Doubt]:
-    """Cameras that stand far off the middle of the box, which holds the detail."""
-    cameras, middle = scene.train.cameras, scene.bounds.aabb.mean(0)
-    distance = float((cameras.centres - middle).norm(dim=1).median())
-    off = float((cameras.centres - middle).mean(0)[:2].norm())
-    layout = classify_layout(cameras.c2w)
-    around = float(normalize(cameras.centres - gaze_point(cameras.c2w).float(), dim=1)[:, :2].mean(0).norm())
-    if layout == Layout.INWARD and around < AROUND and off > OFF_CENTRE * distance:
+    """A stated box, which holds the detail, beside what cameras all around look at, or far too small for it."""
+    bounds, cameras = scene.bounds, scene.train.cameras
+    region = find_region(cameras.c2w)
+    off, size = float((region.centre - bounds.centre)[:2].norm()), bounds.longest
+    toward = torch.nn.functional.normalize(cameras.centres - region.centre.float(), dim=1)
+    around = region.layout == Layout.INWARD and float(toward[:, :2].mean(0).norm()) < AROUND
+    if around and off > OFF_CENTRE * region.unit:
         yield Doubt(
-            f"cameras stand around a place {off:.2g} beside the box's centre, at a distance of {distance:.2g}: the box"
+            f"cameras stand around a place {off:.2g} beside the box's centre, at a distance of {region.unit:.2g}: the box"
             " misses what they look at"
         )
-    elif scene.bounds.unbounded and distance > FAR_OFF * scene.bounds.longest:
-        yield Doubt(
-            f"cameras stand {distance / scene.bounds.longest:.2g} times the box's half-size off its centre: what they see is"
-            " small in the box, or beside it"
-        )
-
-
-def outlined_by(
-    masks: Sequence[Bool[np.ndarray, "_ _"]], c2w: Float[np.ndarray, "V 4 4"], cameras: Cameras
-) -> Hypothesis | None:
-    """The first of the likeliest mistakes without which some body has all silhouettes."""
-    for mistake in islice(convention_hypotheses(c2w), LIKELIEST):
-        mended = replace(cameras, c2w=torch.from_numpy(mistake.c2w).float())
-        box = Bounds(torch.from_numpy(visible_cube(mended)).float())
-        # Cameras that look in all directions share no view: each silhouette would have a body of its own.
-        if hull_coverage(masks, mended, box, least=0.5 * len(masks)) >= FITS_WELL:
-            return mistake
-    return None
+    elif bounds.unbounded and float((cameras.centres - bounds.centre).norm(dim=1).median()) > FAR_OFF * size:
+        yield Doubt(f"cameras stand more than {FAR_OFF:g} times the box's half-size of {size:.2g} off its centre")
 
 
 def hull_coverage(

@@ -30,6 +30,7 @@ from nerf_lightning.dataset.region import Region, find_region
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import Reading, Shot, read_shots
 from nerf_lightning.dataset.views import Views
+from nerf_lightning.errors import InputError
 
 log = logging.getLogger(__name__)
 
@@ -157,7 +158,6 @@ def assemble_scene(
     back. A bounded scene with `hints.keep_frame` stays where it is instead.
     """
     check_visible(source, train.views)
-    checks.told_apart(source, train.c2w)
     kind = decide_kind(train.views, reading.bounded, reading.masked, hints.alpha_background)
     if hints.bounds is not None and reading.bounded == "auto":
         kind = replace(kind, bounded=not hints.bounds.unbounded, reason="the file states a box")
@@ -166,13 +166,19 @@ def assemble_scene(
     poses = viewing_poses(train.views.cameras, train.c2w)
     points = None if hints.points is None else torch.from_numpy(hints.points)
     region = find_region(poses, points, lambda: match_points(train.views, train.c2w))
+    if not checks.NEAREST <= region.unit <= checks.FARTHEST:
+        expected = f"a distance of {checks.NEAREST:g} to {checks.FARTHEST:g}"
+        found = f"cameras {region.unit:.3g} from what they look at"
+        raise InputError(source, "poses", found, expected, "take another unit")
     text = "%s: taken as %s, since %s (dataset.bounded overrides); %s cameras"
     log.info(text, name, "bounded" if kind.bounded else "unbounded", kind.reason, region.layout)
     if not region.known and not kind.bounded:
         log.warning("%s: %s", source, region.doubt)
     splits = {"train": train, "val": val} | ({} if test is None else {"test": test})
-    focal = train.views.cameras.K[:, 0, 0].double().numpy()
-    if hints.bounds is not None or (hints.keep_frame and kind.bounded and checks.is_precise(train.c2w, focal)):
+    # Single precision tells pixels apart in the file's frame unless its origin is far away, as of georeferenced files.
+    rounding = checks.STEP * float(np.abs(train.c2w[:, :3, 3]).max())
+    is_precise = rounding <= region.unit / float(train.views.cameras.K[:, 0, 0].median())
+    if hints.bounds is not None or (hints.keep_frame and kind.bounded and is_precise):
         to_source = torch.eye(4, dtype=torch.float64)
     else:
         _, to_source = normalize_poses(torch.from_numpy(train.c2w), torch.arange(len(train.c2w)), region)

@@ -1,14 +1,12 @@
 """Area-average resizing, also of pictures with alpha."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
@@ -54,10 +52,3 @@ def resize_views(views: Views, longest: int | None) -> Views:
     images = [area_resize(views.image(i).numpy(), *size) for i, size in enumerate(sizes.tolist())]
     pixels = np.concatenate([image.reshape(-1, views.channels) for image in images])
     return Views(torch.from_numpy(pixels), cameras.resized(sizes))
-
-
-def resize_scene(scene: Scene, longest: int | None) -> Scene:
-    """The scene on a smaller pixel grid; world, bounds and poses stay."""
-    train, val = resize_views(scene.train, longest), resize_views(scene.val, longest)
-    orbit = scene.orbit.resized(fit_size(scene.orbit.width, scene.orbit.height, longest))
-    return replace(scene, train=train, val=val, orbit=orbit)

@@ -18,6 +18,7 @@ from nerf_lightning.dataset.formats.exif import stated_exposure
 from nerf_lightning.dataset.lens import Lens, rectify
 from nerf_lightning.dataset.masks import KEPT, SURE, cut_out, read_mask, seem_inverted
 from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.dataset.orientation import has_shape
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.size import AutoResize, choose_resize, find_reduced
 from nerf_lightning.dataset.views import Runs, Views
@@ -33,8 +34,8 @@ BOUNDED = ("auto", "true", "false")
 ORIENTATIONS = ("auto", "stored", "exif")
 ROOM = 0.8
 """Share of the free memory that photos may take."""
-SMALLEST = 16
-"""A photo may be reduced that many times against its camera's size."""
+MAX_REDUCTION = 16
+"""Of a photo against its camera's size."""
 LOOKED, LOOKED_SIDE_PX = 8, 1000
 """Photos, evenly chosen, that tell what their masks mean, and the size at which that shows."""
 
@@ -101,7 +102,11 @@ def read_shots(source: Path, shots: Sequence[Shot], reading: Reading) -> Views:
     sizes, alpha = [], False
     for shot in shots:
         width, height, has_alpha = image_header(shot.photo, shot.upright)
-        _check_shape(source, shot, width, height)
+        stated = shot.optics.width, shot.optics.height
+        if min(width, height) < 2 or MAX_REDUCTION * width < stated[0] or not has_shape((width, height), stated):
+            expected = f"{stated[0]}x{stated[1]}, the size of its camera, or the same reduced"
+            found, todo = f"{width}x{height} pixels", f"are these the photos of {source}?"
+            raise InputError(shot.photo, "", found, expected, todo)
         sizes.append((width, height))
         alpha |= has_alpha
     masked = what_masks_mean(shots, reading)
@@ -192,18 +197,6 @@ def what_masks_mean(shots: Sequence[Shot], reading: Reading) -> str | None:
     share = 1 - float(np.mean([one.mean() for one in kept]))
     log.info("masks leave out about %.0f %% of the pixels: taken as %s", 100 * share, meaning)
     return meaning
-
-
-def _check_shape(source: Path, shot: Shot, width: int, height: int) -> None:
-    """The photo may be the camera's at another size, but not of another shape."""
-    optics = shot.optics
-    if min(width, height) < 2:
-        raise InputError(shot.photo, "", f"{width}x{height} pixels", "a photo")
-    off = max(abs(optics.width * height / optics.height - width), abs(optics.height * width / optics.width - height))
-    if off > 1.5 or SMALLEST * width < optics.width:
-        found = f"{width}x{height} pixels"
-        expected = f"{optics.width}x{optics.height}, the size of its camera, or the same reduced"
-        raise InputError(shot.photo, "", found, expected, f"are these the photos of {source}?")
 
 
 def _pinhole(source: Path, shot: Shot, size: tuple[int, int]) -> Lens:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from nerf_lightning.dataset.formats.decode import image_header
+from nerf_lightning.dataset.orientation import has_shape
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.device import CPU
@@ -124,7 +125,6 @@ def find_reduced(photo: Path, size: tuple[int, int], upright: bool) -> Path:
             if not file.is_file():
                 continue
             w, h, has_alpha = image_header(file, upright)
-            same_shape = abs(w * height / width - h) <= 1.5
-            if w >= size[0] and h >= size[1] and same_shape and has_alpha == alpha:
+            if w >= size[0] and h >= size[1] and has_shape((w, h), (width, height)) and has_alpha == alpha:
                 return file
     return photo

@@ -5,11 +5,12 @@ import os
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.owner import MARKER
 from nerf_lightning.utils.files import user_path
 
 OUTPUTS = Path("outputs")
 """Where training puts runs."""
+MARKER = ".nerf_lightning"
+"""In a folder that was new or empty when a run was put there, so that all in it is this package's own."""
 LATEST = "latest"
 """The link beside the runs of one name to the one that began last."""
 log = logging.getLogger(__name__)

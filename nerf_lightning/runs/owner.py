@@ -9,10 +9,11 @@ from filelock import FileLock, Timeout
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.runs.find import MARKER
 from nerf_lightning.utils.files import remove, remove_empty
 
-LOCK, MARKER = ".lock", ".nerf_lightning"
-"""In a folder that is or was written; and in one that was new or empty then, so that all in it is this package's own."""
+LOCK = ".lock"
+"""In a folder that is or was written."""
 RUN = ("config.yaml", "results.json", "checkpoints")
 """Any of these says that a folder holds a run."""
 

@@ -13,7 +13,7 @@ TRUST = "NERF_LIGHTNING_TRUST"
 """Environment variable: further packages, comma-separated, whose classes a run folder may name."""
 TARGETS = {
     "lightning": ("Trainer",),
-    "lightning.pytorch.loggers": ("CSVLogger", "TensorBoardLogger"),
+    "lightning.pytorch.loggers": ("CSVLogger",),
     "nerf_lightning.callbacks": (
         *("Baselines", "Checkpoints", "Enlarge", "Guard", "HeldOut", "Live", "Orbit", "PictureCharts", "Progress"),
         *("Snapshots", "Throughput", "TrainingGif"),

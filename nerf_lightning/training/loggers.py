@@ -25,7 +25,14 @@ class TensorBoard(TensorBoardLogger):
     """TensorBoard with one event file a run, and times that are seconds of training.
 
     Figures logged with `TRAIN_SECONDS` are dated by it: on TensorBoard's axis RELATIVE they run over training time.
+
+    Args:
+        save_dir: the run's folder, which holds the file.
+        writer: options of torch's SummaryWriter, such as `flush_secs`.
     """
+
+    def __init__(self, save_dir: str | Path, **writer: Any):
+        super().__init__(save_dir, name="", version="", default_hp_metric=False, **writer)
 
     @functools.cached_property
     def began(self) -> float:

@@ -25,6 +25,13 @@ def intrinsics(*batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
     return K.to(dtype)
 
 
+def cast_ray(K: Tensor, c2w: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Origin and unit direction, world frame, of the ray through a pixel: a reference."""
+    pixel = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1)[..., None]
+    directions = (c2w[..., :3, :3] @ torch.linalg.inv(K) @ pixel)[..., 0]
+    return c2w[..., :3, 3].expand_as(directions), torch.nn.functional.normalize(directions, dim=-1)
+
+
 @pytest.fixture
 def random_poses() -> Callable[..., Tensor]:
     return poses

@@ -1,9 +1,8 @@
-from dataclasses import replace
-
 import pytest
 import torch
 
-from nerf_lightning.cameras import Cameras, pixel_to_ray
+from nerf_lightning.cameras import Cameras
+from tests.cameras.conftest import cast_ray
 
 
 @pytest.fixture
@@ -11,7 +10,7 @@ def cameras(random_K, random_poses) -> Cameras:
     return Cameras.of_size(random_K(3), random_poses(3), width=7, height=5)
 
 
-def test_the_centre_pixel_of_an_odd_picture_looks_along_z():
+def test_rays_centre_pixel_looks_along_z():
     K = torch.tensor([[[10.0, 0, 2.5], [0, 10.0, 1.5], [0, 0, 1]]])
     cameras = Cameras.of_size(K, torch.eye(4)[None], width=5, height=3)
     rays = cameras.rays(torch.tensor([0]), torch.tensor([1]), torch.tensor([2]))
@@ -21,45 +20,29 @@ def test_the_centre_pixel_of_an_odd_picture_looks_along_z():
     assert below[1] > 0 and below[0] == 0
 
 
-def test_rays_of_pixels_are_rays_through_their_centres(cameras):
+def test_rays_pass_pixel_centres(cameras):
     view, row, col = torch.tensor([2, 0, 1, 2]), torch.tensor([4, 0, 3, 1]), torch.tensor([6, 0, 2, 5])
     rays = cameras.rays(view, row, col)
     for i in range(4):
         uv = torch.tensor([col[i] + 0.5, row[i] + 0.5], dtype=torch.float64)
-        origin, direction = pixel_to_ray(cameras.K[view[i]], cameras.c2w[view[i]], uv)
+        origin, direction = cast_ray(cameras.K[view[i]], cameras.c2w[view[i]], uv)
         torch.testing.assert_close(rays.origins[i], origin, rtol=0, atol=1e-14)
         torch.testing.assert_close(rays.directions[i], direction, rtol=0, atol=1e-14)
     torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(4).double())
 
 
-def test_view_rays_go_row_by_row(cameras):
-    everything = cameras.view_rays(1)
-    assert len(everything) == 35
-    for row in range(5):
-        for col in range(7):
-            one = cameras.rays(*(torch.tensor([i]) for i in (1, row, col)))
-            torch.testing.assert_close(one.directions[0], everything.directions[row * 7 + col], rtol=1e-12, atol=1e-12)
-            assert torch.equal(one.origins[0], everything.origins[row * 7 + col])
-
-
 @pytest.mark.parametrize(("width", "height"), [(14, 10), (3, 5), (70, 1), (7, 5)])
-def test_resizing_keeps_the_ray_of_every_place_in_the_picture(cameras, width, height):
+def test_resized_keeps_rays(cameras, width, height):
     small = cameras.resized((width, height))
     share = torch.rand(3, 2, dtype=torch.float64)
-    before = pixel_to_ray(cameras.K, cameras.c2w, share * torch.tensor([7, 5]))
-    after = pixel_to_ray(small.K, small.c2w, share * torch.tensor([width, height]))
+    before = cast_ray(cameras.K, cameras.c2w, share * torch.tensor([7, 5]))
+    after = cast_ray(small.K, small.c2w, share * torch.tensor([width, height]))
     torch.testing.assert_close(after, before)
     assert (small.width, small.height) == (width, height)
     assert torch.equal(small.K[:, 2], cameras.K[:, 2])
 
 
-def test_a_third_of_the_size_sees_what_the_middle_of_three_by_three_pixels_saw(cameras):
-    fine = replace(cameras, sizes=torch.tensor([[9, 6]]).repeat(len(cameras), 1))
-    coarse = fine.resized((3, 2)).view_rays(0).directions.view(2, 3, 3)
-    torch.testing.assert_close(coarse, fine.view_rays(0).directions.view(6, 9, 3)[1::3, 1::3])
-
-
-def test_indexing_picks_views_and_rays(cameras):
+def test_getitem_picks_views_and_rays(cameras):
     picked = cameras[torch.tensor([2, 0])]
     assert len(picked) == 2 and torch.equal(picked.centres, cameras.c2w[[2, 0], :3, 3])
     assert torch.equal(picked.K, cameras.K[[2, 0]]) and (picked.width, picked.height) == (7, 5)

@@ -24,7 +24,7 @@ EVERY = [
 
 
 @pytest.mark.parametrize(("c2w", "layout"), [case[1:] for case in EVERY], ids=[case[0] for case in EVERY])
-def test_layouts_do_not_depend_on_frame_and_unit(c2w: torch.Tensor, layout: Layout):
+def test_classify_layout_any_frame_and_unit(c2w: torch.Tensor, layout: Layout):
     assert classify_layout(c2w) == layout
     moved = torch.eye(4).double()
     moved[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.7, -1.1, 0.4]).as_matrix())
@@ -35,13 +35,13 @@ def test_layouts_do_not_depend_on_frame_and_unit(c2w: torch.Tensor, layout: Layo
 
 
 @pytest.mark.parametrize("yaw", [0, 10, 20])
-def test_cameras_around_gaze_at_the_middle_whatever_side_they_are_framed_to(yaw: int):
+def test_gaze_point_ring_is_its_middle(yaw: int):
     assert (gaze_point(ring(yaw=yaw)) - CENTRE).norm() < 0.05 * RADIUS
     dense_half = torch.cat([torch.arange(32), torch.arange(32, 64, 4)])
     assert (gaze_point(ring(64, yaw)[dense_half]) - CENTRE).norm() < 0.1 * RADIUS
 
 
-def test_points_tell_a_hand_held_pan_from_a_walk():
+def test_classify_layout_points_tell_pan_from_walk():
     """The same poses at a table's and at a valley's distance."""
     c2w = pan(0.3)
     around = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)).double()

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from nerf_lightning.cameras import Cameras, classify_layout, orbit_like, pivot_of, spiral_like
-from nerf_lightning.cameras.paths import rigid, walking_order
+from nerf_lightning.cameras import Cameras, orbit_like, pivot_of, spiral_like
+from nerf_lightning.cameras.paths import walking_order
 from tests.cameras.captures import CENTRE, RADIUS, UP, corridor, dome, forward, pan, ring, walk
 
 CAPTURES = {
@@ -37,13 +37,15 @@ def cameras_at(c2w: torch.Tensor) -> Cameras:
 
 @pytest.mark.parametrize("frames", [1, 7, 60])
 @pytest.mark.parametrize("c2w", CAPTURES.values(), ids=CAPTURES.keys())
-def test_paths_stay_where_photos_were_taken(c2w: torch.Tensor, frames: int):
+def test_orbit_like_and_spiral_stay_near_the_photos(c2w: torch.Tensor, frames: int):
     cameras = cameras_at(c2w)
     orbit = orbit_like(cameras, frames)
     spiral = spiral_like(orbit, frames)
     for path in (orbit, spiral):
         assert len(path) == frames
-        rigid(path.c2w)
+        R = path.c2w[:, :3, :3]
+        torch.testing.assert_close(R @ R.mT, torch.eye(3).expand_as(R), atol=1e-4, rtol=0)
+        assert (torch.linalg.det(R) > 0).all() and path.c2w.isfinite().all()
         assert (path.c2w[:, :3, 1] @ UP.float()).max() < 0.1, "upright"
     apart = torch.cdist(orbit.centres, cameras.centres)
     spacing = torch.cdist(cameras.centres, cameras.centres).fill_diagonal_(math.inf).amin(1)
@@ -60,7 +62,7 @@ def test_paths_stay_where_photos_were_taken(c2w: torch.Tensor, frames: int):
 
 
 @pytest.mark.parametrize("yaw", [0, 20])
-def test_a_ring_gives_a_full_turn_that_looks_at_the_middle(yaw: int):
+def test_orbit_like_ring_is_a_full_turn(yaw: int):
     orbit = orbit_like(cameras_at(ring(yaw=yaw)), 8)
     offset = orbit.centres - CENTRE.float()
     torch.testing.assert_close(offset.norm(dim=1), torch.full((8,), RADIUS), atol=0.05, rtol=0)
@@ -71,7 +73,7 @@ def test_a_ring_gives_a_full_turn_that_looks_at_the_middle(yaw: int):
     torch.testing.assert_close(pivot_of(orbit), CENTRE.float(), atol=0.05, rtol=0)
 
 
-def test_an_arc_gives_a_swing_between_its_ends():
+def test_orbit_like_arc_is_a_swing():
     orbit = orbit_like(cameras_at(ring(24, degrees=150)), 60)
     offset = orbit.centres - CENTRE.float()
     turn = torch.atan2(offset[:, 1], offset[:, 0]).rad2deg()
@@ -79,21 +81,14 @@ def test_an_arc_gives_a_swing_between_its_ends():
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.02, rtol=0)
 
 
-def test_a_stray_camera_does_not_turn_an_arc_into_a_full_turn():
-    c2w = torch.cat([ring(40, degrees=150), ring(8)[6:7]])  # at 270 degrees
-    offset = orbit_like(cameras_at(c2w), 60).centres - CENTRE.float()
-    turn = torch.atan2(offset[:, 1], offset[:, 0]).rad2deg()
-    assert turn.min() > -15 and turn.max() < 165
-
-
-def test_half_a_pan_turns_to_and_fro():
+def test_orbit_like_half_pan_turns_to_and_fro():
     orbit = orbit_like(cameras_at(pan(degrees=150)), 60)
     turn = torch.atan2(orbit.c2w[:, 1, 2], orbit.c2w[:, 0, 2]).rad2deg()
     assert turn.min() == pytest.approx(0, abs=1) and turn.max() == pytest.approx(150 * 23 / 24, abs=1)
     assert float((orbit.centres - CENTRE.float()).abs().max()) < 1e-6
 
 
-def test_a_shuffled_walk_is_walked_in_its_own_order():
+def test_walking_order_shuffled_walk_is_sorted():
     shuffled = torch.randperm(40, generator=torch.Generator().manual_seed(0))
     assert walking_order(walk()[:, :3, 3]) == list(range(40))
     order = shuffled[torch.tensor(walking_order(walk()[shuffled][:, :3, 3]))]
@@ -103,27 +98,10 @@ def test_a_shuffled_walk_is_walked_in_its_own_order():
     torch.testing.assert_close(path[1:31], path[31:].flip(0), atol=1e-1, rtol=0)  # there and back
 
 
-@pytest.mark.parametrize("name", ["ring", "short arc", "diverging", "pan", "walk"])
-def test_an_orbit_has_the_layout_of_its_cameras(name: str):
-    layout = classify_layout(CAPTURES[name])
-    assert classify_layout(orbit_like(cameras_at(CAPTURES[name])).c2w) == layout
-
-
-def test_a_spiral_on_one_side_winds_in_to_the_middle_of_its_loop():
+def test_spiral_like_arc_winds_in():
     orbit = orbit_like(cameras_at(ring(24, degrees=150)), 60)
     spiral = spiral_like(orbit, 60)
     offset, middle = spiral.centres - CENTRE.float(), normalize(orbit.centres.mean(0) - CENTRE.float(), dim=0)
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.05, rtol=0)
     away = torch.acos(normalize(offset, dim=1) @ middle).rad2deg()
     assert away[:8].max() > 50 and away[25:36].max() < 25
-
-
-def test_degenerate_paths_are_not_handed_on():
-    for pose in (
-        torch.zeros(4, 4),
-        torch.eye(4) * torch.nan,
-        2 * torch.eye(4),
-        torch.diag(torch.tensor([-1.0, 1, 1, 1])),
-    ):
-        with pytest.raises(AssertionError):
-            rigid(pose[None])

@@ -26,21 +26,21 @@ def ring(elevation: float = 0.5, share: float = 1.0, frames: int = 40) -> torch.
 @pytest.mark.parametrize(
     ("quarters", "share", "degrees"), [(0, 1, 2), (1, 1, 2), (3, 1, 2), (0, 0.5, 5), (1, 0.5, 5), (0, 0.2, 15)]
 )
-def test_up_is_found_however_the_photos_lie(quarters: int, share: float, degrees: float):
+def test_held_up_is_found(quarters: int, share: float, degrees: float):
     c2w = rolled(ring(share=share), torch.full((int(40 * share),), quarters), wobble=0.03)
     up, side = held(c2w)
     assert math.degrees(math.acos(float(up @ UP))) < degrees
     assert (side == {0: 0, 1: 3, 3: 1}[quarters]).all()
 
 
-def test_portrait_and_landscape_in_one_capture():
+def test_held_portrait_and_landscape():
     quarters = torch.tensor([0, 1, 0, 3, 0] * 8)
     up, side = held(rolled(ring(), quarters, wobble=0.03))
     assert math.degrees(math.acos(float(up @ UP))) < 2
     assert side.tolist() == [{0: 0, 1: 3, 3: 1}[int(q)] for q in quarters]
 
 
-def test_the_rotation_takes_up_to_z():
+def test_turn_upright_takes_up_to_z():
     for up in (UP, torch.tensor([0.0, 0.0, 1.0]), torch.tensor([0.0, 0.0, -1.0])):
         turn = turn_upright(up)
         torch.testing.assert_close(turn @ up, torch.tensor([0.0, 0.0, 1.0]), atol=1e-6, rtol=0)
@@ -48,7 +48,7 @@ def test_the_rotation_takes_up_to_z():
         assert float(torch.linalg.det(turn)) == pytest.approx(1)
 
 
-def test_orbits_of_photos_on_their_side_stand_upright_and_are_portrait():
+def test_orbit_like_sideways_photos_are_portrait():
     K = torch.tensor([[100.0, 0, 44], [0, 110, 31], [0, 0, 1]]).repeat(40, 1, 1)
     cameras = Cameras.of_size(K, rolled(ring(), torch.ones(40)), 80, 60)
     orbit = orbit_like(cameras, 8)

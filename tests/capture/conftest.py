@@ -7,8 +7,7 @@ from capture.views import SIZE
 from once import once
 
 from benchmarks.synthetic.photos import Truth
-from nerf_lightning.capture.outputs import Packing
-from nerf_lightning.capture.run import Capture, capture
+from nerf_lightning.capture.run import Capture, capture_scene
 
 
 @pytest.fixture(scope="session")
@@ -16,7 +15,7 @@ def packed(made: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -
     """What a capture of it writes, in a folder, and returns."""
 
     def make(folder: Path) -> tuple[Path, Capture]:
-        packing = Packing(folder / "scene.npz", longest=200, holdout=4)
-        return folder, capture(made[0] / "calibration", made[0] / "photos", SIZE, packing)
+        photos = made[0] / "calibration", made[0] / "photos"
+        return folder, capture_scene(*photos, SIZE, folder / "scene.npz", longest=200, holdout=4)
 
     return once(tmp_path_factory, "packed", make)

@@ -13,8 +13,8 @@ COMMANDS = [name for name in app.resolved_commands() if not name.startswith("-")
 
 
 def test_help_imports_nothing_heavy():
-    probe = "import sys; from nerf_lightning.cli.app import main\n"
-    probe += f"for name in {COMMANDS}: \n  main([name, '--help'])\n"
+    probe = "import sys; from nerf_lightning.cli.app import app\n"
+    probe += f"for name in {COMMANDS}: \n  app([name, '--help'])\n"
     probe += "print(sorted({'torch', 'lightning', 'cv2', 'hydra', 'pandas', 'scipy', 'numpy'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", probe], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.stdout.endswith("[]\n"), done.stdout[-200:] + done.stderr
@@ -43,8 +43,8 @@ def test_without_arguments_lists_commands_in_the_order_of_the_work(inside):
         (["evaluate", "--worst", "x"], "--worst"),
         (["evaluate", "--worst", "0"], "worst: found 0, expected a whole number at least 1"),
         (["evaluate", "--split", "all"], "val"),
-        (["evaluate", "nowhere (1), ü=2"], "nowhere (1), ü=2: found no run"),
-        (["evaluate"], "outputs: found no run"),
+        (["evaluate", "nowhere (1), ü=2"], "nowhere (1), ü=2: found nothing there"),
+        (["evaluate"], "outputs: found nothing there"),
     ],
 )
 def test_wrong_arguments_give_one_line_and_exit_code_2(arguments: list[str], words: str, inside):

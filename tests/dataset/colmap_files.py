@@ -1,4 +1,4 @@
-"""Writes posed photos as other programs do: COLMAP, binary and text, LLFF, and transforms.json."""
+"""Writes posed photos as other programs do: COLMAP, binary and text, LLFF, transforms.json, Blender, and .npz."""
 
 import json
 import struct
@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import imageio.v3 as imageio
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from nerf_lightning.dataset import Views
@@ -97,6 +98,37 @@ def write_transforms(path: Path, views: Views, names: list[str], **more: object)
         matrix = (pose * [1, -1, -1, 1]).tolist()
         frames.append({"file_path": name, "transform_matrix": matrix, **own, **more})
     path.write_text(json.dumps({"frames": frames}), encoding="utf-8")
+
+
+def write_scene(format: str, folder: Path, views: Views) -> Path:
+    """All views in a format; the first three are held out where it has a split."""
+    folder.mkdir(exist_ok=True)
+    focal, (width, _) = float(views.cameras.K[0, 0, 0]), views.cameras.size(0)
+    if format == "npz":
+        images, c2w = views.images.numpy(), views.cameras.c2w.numpy()
+        np.savez(
+            folder / "s.npz",
+            images_train=images[3:],
+            c2ws_train=c2w[3:],
+            images_val=images[:3],
+            c2ws_val=c2w[:3],
+            focal=focal,
+        )
+        return folder / "s.npz"
+    names = photos(folder / "images", views)
+    if format in ("colmap", "text"):
+        write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views), format == "text")
+    elif format == "llff":
+        write_llff(folder / "poses_bounds.npy", views)
+    elif format == "transforms":
+        write_transforms(folder / "transforms.json", views, [f"images/{name}" for name in names])
+    else:
+        opengl = (views.cameras.c2w * torch.tensor([1.0, -1, -1, 1])).tolist()
+        frames = [{"file_path": f"images/{n[:-4]}", "transform_matrix": m} for n, m in zip(names, opengl, strict=True)]
+        for split, part in (("train", frames[3:]), ("val", frames[:3])):
+            content = {"camera_angle_x": 2 * float(np.arctan(0.5 * width / focal)), "frames": part}
+            (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+    return folder
 
 
 def rotated(image: np.ndarray) -> np.ndarray:

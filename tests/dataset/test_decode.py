@@ -1,6 +1,5 @@
 """Decoding: JPEG at reduced scale, legal oddities, files cut short, headers."""
 
-import os
 from pathlib import Path
 
 import cv2
@@ -29,7 +28,7 @@ def save(path: Path, pixels: np.ndarray, orientation: int = 1) -> Path:
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("upright", [False, True])
-def test_a_jpeg_at_reduced_scale_is_its_area_average(orientation: int, upright: bool, tmp_path: Path):
+def test_read_pixels_reduced_jpeg_is_the_area_average(orientation: int, upright: bool, tmp_path: Path):
     path = save(tmp_path / "a.jpg", photo(160, 96), orientation)
     whole = read_pixels(path, upright)
     size = (40, 24) if whole.shape == (96, 160, 3) else (24, 40)
@@ -52,11 +51,11 @@ def test_a_jpeg_at_reduced_scale_is_its_area_average(orientation: int, upright: 
         ((4032, 3024), (4032, 3024), 1),
     ],
 )
-def test_scale_of_decoding(size: tuple[int, int], wanted: tuple[int, int], factor: int):
+def test_draft_scale_keeps_enough_pixels(size: tuple[int, int], wanted: tuple[int, int], factor: int):
     assert draft_scale(*size, wanted) == factor
 
 
-def test_fill_bytes_before_markers_are_legal(tmp_path: Path):
+def test_read_pixels_fill_bytes_are_skipped(tmp_path: Path):
     """ITU-T T.81, B.1.1.2: any marker may be preceded by any number of bytes 0xFF."""
     path = save(tmp_path / "a.jpg", photo(32, 16))
     before, data = read_pixels(path), path.read_bytes()
@@ -66,7 +65,7 @@ def test_fill_bytes_before_markers_are_legal(tmp_path: Path):
 
 
 @pytest.mark.parametrize("size", [None, (32, 16)])
-def test_a_jpeg_cut_anywhere_is_refused_in_a_line(size: tuple[int, int] | None, tmp_path: Path):
+def test_read_pixels_truncated_jpeg_raises(size: tuple[int, int] | None, tmp_path: Path):
     path = save(tmp_path / "a.jpg", photo(64, 32))
     data = path.read_bytes()
     for kept in np.linspace(3, len(data) - 3, 40).astype(int):
@@ -77,17 +76,9 @@ def test_a_jpeg_cut_anywhere_is_refused_in_a_line(size: tuple[int, int] | None, 
 
 
 @pytest.mark.parametrize("mode", ["L", "CMYK"])
-def test_jpegs_of_other_colours(mode: str, tmp_path: Path):
+def test_read_pixels_grey_and_cmyk_become_rgb(mode: str, tmp_path: Path):
     Image.fromarray(photo(32, 16)).convert(mode).save(tmp_path / "a.jpg", quality=95)
     whole, reduced = read_pixels(tmp_path / "a.jpg"), read_pixels(tmp_path / "a.jpg", size=(16, 8))
     expected = Image.fromarray(photo(32, 16)).convert(mode).convert("RGB")
     assert np.abs(whole.astype(int) - np.asarray(expected)).mean() < 4
     assert np.abs(reduced.astype(int) - area_resize(whole, 16, 8)).mean() < 4
-
-
-def test_a_header_is_read_again_when_its_file_changes(tmp_path: Path):
-    path = save(tmp_path / "a.jpg", photo(32, 16))
-    assert image_header(path)[:2] == (32, 16)
-    save(path, photo(16, 32))
-    os.utime(path, ns=(0, 1))
-    assert image_header(path)[:2] == (16, 32)

@@ -1,5 +1,4 @@
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,7 +6,6 @@ import torch
 
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import Views, estimate_bounds, load_blender, load_npz
-from nerf_lightning.dataset.extent import silhouettes
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
@@ -30,7 +28,7 @@ def assert_snug(box: torch.Tensor, truth: torch.Tensor, slack: float) -> None:
 
 
 @pytest.mark.parametrize("kind", ["alpha", "black", "white"])
-def test_silhouettes_carve_a_snug_box(kind: str, views: Views, ball_box: torch.Tensor):
+def test_estimate_bounds_silhouettes_give_a_snug_box(kind: str, views: Views, ball_box: torch.Tensor):
     if kind != "alpha":
         views = over(views, 0 if kind == "black" else 255)
     bounds = estimate_bounds(views, WHITE if kind == "white" else BLACK, near=1.0, far=7.0)
@@ -39,13 +37,13 @@ def test_silhouettes_carve_a_snug_box(kind: str, views: Views, ball_box: torch.T
     assert not bounds.unbounded and (bounds.near, bounds.far) == (1.0, 7.0)
 
 
-def test_a_few_broken_silhouettes_are_forgiven(ball_views_of: Callable[..., Views], ball_box: torch.Tensor):
+def test_estimate_bounds_one_broken_silhouette_is_forgiven(ball_views_of: Callable[..., Views], ball_box: torch.Tensor):
     views = ball_views_of(10)
     views.images[7] = 0
     assert_snug(estimate_bounds(views, BLACK).aabb, ball_box, 1.23)
 
 
-def test_silhouettes_that_disagree_carve_nothing(ball_views_of: Callable[..., Views]):
+def test_estimate_bounds_disagreeing_silhouettes_carve_nothing(ball_views_of: Callable[..., Views]):
     views = ball_views_of(10)
     views.images[::3] = 0  # the ball is missing from a third of the views: no voxel convinces enough of them
     torch.testing.assert_close(estimate_bounds(views, BLACK).aabb, cube(1.6), atol=1e-4, rtol=0)
@@ -55,23 +53,14 @@ def cube(half: float) -> torch.Tensor:
     return torch.tensor([[-half] * 3, [half] * 3])
 
 
-def test_without_silhouettes_the_box_is_what_the_cameras_see(views: Views):
+def test_estimate_bounds_noise_gives_what_cameras_see(views: Views):
     noise = torch.randint(0, 256, (*views.images.shape[:3], 3), generator=torch.manual_seed(0)).to(torch.uint8)
     bounds = estimate_bounds(Views.of(noise, views.cameras), BLACK)
     # Cameras 4 away from the origin, half of 48 pixels wide at a focal length of 60.
     torch.testing.assert_close(bounds.aabb, cube(4 * 24 / 60), atol=1e-4, rtol=0)
 
 
-def test_another_flat_background_is_no_silhouette(views: Views):
-    assert silhouettes(over(views, 0), WHITE) is None
-
-
-def test_nothing_kept_falls_back_to_the_cube(views: Views):
-    empty = replace(views, pixels=torch.zeros_like(views.pixels))
-    torch.testing.assert_close(estimate_bounds(empty, BLACK).aabb, cube(1.6), atol=1e-4, rtol=0)
-
-
-def test_one_spot_to_look_from_still_gives_a_box():
+def test_estimate_bounds_one_spot_gives_a_box():
     c2w = torch.eye(4).repeat(2, 1, 1)
     c2w[:, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
     K = torch.tensor([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]).repeat(2, 1, 1)
@@ -82,7 +71,7 @@ def test_one_spot_to_look_from_still_gives_a_box():
 
 @pytest.mark.real_data
 @pytest.mark.parametrize("kind", ["course", "blender"])
-def test_lego(kind: str, real_data: Path):
+def test_estimate_bounds_lego_is_snug(kind: str, real_data: Path):
     course, blender = real_data / "lego_200x200.npz", real_data / "nerf_synthetic/lego"
     scene = load_npz(course) if kind == "course" else load_blender(blender)
     truth = torch.tensor([[-0.64, -1.16, -0.56], [0.64, 1.18, 1.04]])

@@ -6,7 +6,6 @@ from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import RayDataModule, Views
 from nerf_lightning.dataset.focus import EVERY, SIDE, Focus
 from nerf_lightning.dataset.views import Runs
-from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.objects import MARBLE, make_scene
 
 SIZES = [(40, 20), (16, 16), (7, 33)]
@@ -38,7 +37,7 @@ def taught(views: Views, errors: Tensor, share: float = 0.5, steps: int = 2 * EV
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_weights_make_up_for_the_draw(masked: bool):
+def test_focus_weights_make_the_draw_unbiased(masked: bool):
     views = photos(masked)
     known = views.mask.double()
     errors = torch.rand(len(known), generator=seeded()) ** 4
@@ -52,7 +51,7 @@ def test_weights_make_up_for_the_draw(masked: bool):
         torch.testing.assert_close(share[part].sum(), known[part].sum() / known.sum(), rtol=0.05, atol=0)
 
 
-def test_pixels_are_drawn_where_the_error_is():
+def test_focus_draws_where_the_error_is():
     views = photos()
     errors = torch.zeros(len(views.pixels))
     errors[800:1056] = 0.5  # the second photo, which is one tile
@@ -64,7 +63,7 @@ def test_pixels_are_drawn_where_the_error_is():
     torch.testing.assert_close(weights, torch.ones_like(weights), rtol=1e-5, atol=0)
 
 
-def test_tiles_hold_their_pixels():
+def test_focus_tiles_hold_their_pixels():
     focus = Focus(photos(), 0.5)
     assert focus.known.tolist() == [256, 256, 128, 64, 64, 32, 256, 112, 112, 7]
     places, _ = focus.draw(50_000, seeded())
@@ -76,7 +75,7 @@ def test_tiles_hold_their_pixels():
     assert width.max() == height.max() == SIDE
 
 
-def test_it_goes_on_as_it_was_whatever_the_order_of_errors():
+def test_focus_state_resumes_exactly():
     views = photos()
     errors = torch.rand(len(views.pixels), generator=seeded())
     whole = taught(views, errors, steps=EVERY + 5)
@@ -92,16 +91,7 @@ def test_it_goes_on_as_it_was_whatever_the_order_of_errors():
     assert all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), other.state_dict().values(), strict=True))
 
 
-def test_an_error_that_was_not_measured_does_not_count():
-    focus = Focus(photos(), 0.5)
-    focus.draw(100, seeded())
-    focus.note(torch.full((100,), 0.5), torch.arange(100) < 30)
-    assert focus.new_counts.sum() == 30
-    focus.note(torch.full((100,), torch.nan))
-    assert focus.new_sums.sum() == (30 * 0.5 + 100) * 2**30, "what is not a number is looked at"
-
-
-def test_data_looks_where_steps_were_wrong_and_starts_again():
+def test_ray_data_follows_noted_errors():
     scene = make_scene(MARBLE, size=32, views=4, held_out=1)
     data = RayDataModule(scene, rays=500, samples=None)
     first = data.draw(0)
@@ -117,9 +107,3 @@ def test_data_looks_where_steps_were_wrong_and_starts_again():
     alike = RayDataModule(scene, rays=500, focus=0)
     alike.note_errors(torch.ones(500))
     assert alike.draw(0).weights is None
-
-
-@pytest.mark.parametrize("focus", [-0.1, 1.0])
-def test_a_share_that_leaves_nothing_to_the_others_is_refused(focus: float):
-    with pytest.raises(InputError, match="dataset.focus"):
-        RayDataModule(make_scene(MARBLE, size=8, views=3, held_out=1), focus=focus)

@@ -1,7 +1,6 @@
 import logging
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import av
 import cv2
@@ -11,8 +10,7 @@ import pytest
 
 from benchmarks.synthetic.video import FPS, with_blurs, write_video
 from nerf_lightning.dataset.placing import frames as module
-from nerf_lightning.dataset.placing import video as decoding
-from nerf_lightning.dataset.placing.choose import MOST, choose, motion, sharpness, suitable_count
+from nerf_lightning.dataset.placing.choose import MOST, choose, suitable_count
 from nerf_lightning.dataset.placing.frames import frames_of, kept_frames
 from nerf_lightning.errors import InputError
 
@@ -46,7 +44,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_blurred_frames_are_rejected_and_the_way_is_covered_evenly(video: Path, tmp_path: Path):
+def test_frames_of_video_takes_sharp_evenly_spread_frames(video: Path, tmp_path: Path):
     photos = frames_of(video, tmp_path / "photos", 30)
     indices = [round(float(photo.stem.removesuffix("s")) * FPS) for photo in photos]
     assert indices == sorted(indices) and 28 <= len(indices) <= 30
@@ -57,7 +55,7 @@ def test_blurred_frames_are_rejected_and_the_way_is_covered_evenly(video: Path, 
     assert np.argmin([np.abs(first - picture).mean() for picture in pictures]) == indices[0]
 
 
-def test_a_count_follows_from_the_motion(video: Path, tmp_path: Path):
+def test_suitable_count_follows_the_motion(video: Path, tmp_path: Path):
     motions, _ = module.measure(video)
     assert suitable_count(motions) == (1 + np.count_nonzero(np.diff(SHIFTS))) // 3
     assert suitable_count(np.full(100_000, 0.01)) == MOST
@@ -65,7 +63,7 @@ def test_a_count_follows_from_the_motion(video: Path, tmp_path: Path):
     assert suitable_count(np.full(50, 0.002)) == 10
 
 
-def test_fast_stretches_offer_a_choice_too():
+def test_choose_fast_stretch_offers_a_choice():
     motions, sharp = np.concatenate([np.full(60, 0.001), np.full(12, 0.1)]), np.zeros(72)
     sharp[1::3] = -0.2
     chosen = choose(motions, sharp, 12)
@@ -75,16 +73,8 @@ def test_fast_stretches_offer_a_choice_too():
     assert choose(np.zeros(4), np.zeros(4), 4) == [0, 1, 2, 3]
 
 
-def test_motion_is_a_share_of_the_side_and_sharpness_knows_no_exposure():
-    wall = texture(120, 200)[..., 0]
-    assert motion(wall[:, :160], wall[:, 4:164]) == pytest.approx(4 / 160, rel=0.1)
-    assert motion(wall, wall) == 0
-    assert sharpness(wall // 2) == pytest.approx(sharpness(wall), abs=0.02)
-    assert sharpness(cv2.GaussianBlur(wall, (0, 0), 0.7)) < sharpness(wall) - 0.1
-
-
 @pytest.mark.parametrize("turns", [1, 2, 3])
-def test_a_phones_rotation_is_applied(turns: int, tmp_path: Path):
+def test_frames_of_rotated_video_are_upright(turns: int, tmp_path: Path):
     picture = np.zeros((64, 96, 3), np.uint8)
     picture[:32, 48:], picture[32:, :48] = (255, 0, 0), (0, 0, 255)
     write_video(tmp_path / "a.mp4", [picture] * 3, turns)
@@ -92,7 +82,7 @@ def test_a_phones_rotation_is_applied(turns: int, tmp_path: Path):
     assert np.abs(upright.astype(int) - np.rot90(picture, turns)).mean() < 5
 
 
-def test_frames_are_kept_beside_their_video(tmp_path: Path, monkeypatch, caplog):
+def test_kept_frames_are_made_once(tmp_path: Path, monkeypatch, caplog):
     video = tmp_path / "wall.mp4"
     write_video(video, pan(SHIFTS[:12]))
     folder = kept_frames(video)
@@ -136,7 +126,7 @@ def cut(file: Path) -> None:
         (lambda file: write_video(file, pan(SHIFTS[:1])), "found 1 frame, expected at least 3"),
     ],
 )
-def test_a_broken_video_is_told_in_a_line(make, message: str, tmp_path: Path):
+def test_frames_of_broken_video_raises(make, message: str, tmp_path: Path):
     video = tmp_path / "broken.mp4"
     make(video)
     for attempt in (kept_frames, lambda video: frames_of(video, tmp_path / "photos")):
@@ -144,8 +134,3 @@ def test_a_broken_video_is_told_in_a_line(make, message: str, tmp_path: Path):
             attempt(video)
         assert str(video) in str(raised.value) and "\n" not in str(raised.value)
     assert [path for path in tmp_path.iterdir() if path != video] == []
-
-
-def test_a_damaged_frame_is_passed_over(video: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(decoding, "tracked", lambda decoded, *_: [SimpleNamespace(is_corrupt=i == 2) for i in range(5)])
-    assert len(list(decoding.frames(video, ""))) == 4

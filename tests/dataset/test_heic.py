@@ -25,7 +25,7 @@ def write(file: Path) -> np.ndarray:
 
 
 @installed
-def test_photos_of_phones_are_read_upright_with_their_tags(tmp_path: Path):
+def test_read_pixels_heic_is_upright(tmp_path: Path):
     picture = write(tmp_path / "a.HEIC")
     for upright in (True, False):
         found = read_pixels(tmp_path / "a.HEIC", upright)
@@ -34,14 +34,14 @@ def test_photos_of_phones_are_read_upright_with_their_tags(tmp_path: Path):
 
 
 @installed
-def test_a_truncated_one_is_told(tmp_path: Path):
+def test_read_pixels_truncated_heic_raises(tmp_path: Path):
     write(tmp_path / "a.heic")
     (tmp_path / "a.heic").write_bytes((tmp_path / "a.heic").read_bytes()[:-20])
     with pytest.raises(InputError, match="found an unreadable image .*, expected a whole HEIC photo; copy it again"):
         read_pixels(tmp_path / "a.heic")
 
 
-def test_the_package_that_reads_them_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_read_pixels_heic_without_package_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x1cftypheic" + bytes(100))
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     with pytest.raises(InputError, match=r"no such package, .* HEIC photos; pip install 'nerf_lightning\[heic\]'"):

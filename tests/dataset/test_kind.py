@@ -1,6 +1,5 @@
 """What is bounded is decided by the photos, the same for every file format."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import torch
 from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.dataset import Reading, Scene, Views, open_scene, save_npz
 from nerf_lightning.errors import InputError
-from tests.dataset.colmap_files import cameras_of, photos, write_colmap, write_llff, write_transforms
+from tests.dataset.colmap_files import write_scene
 
 FORMATS = ("npz", "blender", "transforms", "colmap", "llff")
 
@@ -21,37 +20,6 @@ FORMATS = ("npz", "blender", "transforms", "colmap", "llff")
 @pytest.fixture(scope="session")
 def ball_views(ball_views_of: Callable[..., Views]) -> Views:
     return ball_views_of(4)
-
-
-def write_scene(format: str, folder: Path, views: Views) -> Path:
-    """All views in a format; the first three are held out where it has a split."""
-    folder.mkdir(exist_ok=True)
-    focal, (width, _) = float(views.cameras.K[0, 0, 0]), views.cameras.size(0)
-    if format == "npz":
-        images, c2w = views.images.numpy(), views.cameras.c2w.numpy()
-        np.savez(
-            folder / "s.npz",
-            images_train=images[3:],
-            c2ws_train=c2w[3:],
-            images_val=images[:3],
-            c2ws_val=c2w[:3],
-            focal=focal,
-        )
-        return folder / "s.npz"
-    names = photos(folder / "images", views)
-    if format == "colmap":
-        write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
-    elif format == "llff":
-        write_llff(folder / "poses_bounds.npy", views)
-    elif format == "transforms":
-        write_transforms(folder / "transforms.json", views, [f"images/{name}" for name in names])
-    else:
-        opengl = (views.cameras.c2w * torch.tensor([1.0, -1, -1, 1])).tolist()
-        frames = [{"file_path": f"images/{n[:-4]}", "transform_matrix": m} for n, m in zip(names, opengl, strict=True)]
-        for split, part in (("train", frames[3:]), ("val", frames[:3])):
-            content = {"camera_angle_x": 2 * float(np.arctan(0.5 * width / focal)), "frames": part}
-            (folder / f"transforms_{split}.json").write_text(json.dumps(content))
-    return folder
 
 
 def with_background(views: Views, alpha: int | None) -> Views:
@@ -88,7 +56,7 @@ SHOWN: dict[str, tuple[Callable[[Views], Views], bool, int, str]] = {
 
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize("shown", SHOWN)
-def test_every_format_is_decided_alike(shown: str, format: str, ball_views: Views, tmp_path: Path):
+def test_open_scene_kind_is_the_same_in_every_format(shown: str, format: str, ball_views: Views, tmp_path: Path):
     edit, bounded, channels, reason = SHOWN[shown]
     scene = open_scene(str(write_scene(format, tmp_path / "s", edit(ball_views))))
     assert scene.bounds.unbounded is not bounded and scene.train.channels == channels
@@ -104,7 +72,7 @@ def test_every_format_is_decided_alike(shown: str, format: str, ball_views: View
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_all_formats_of_a_place_give_one_frame(format: str, ball_views: Views, tmp_path: Path):
+def test_open_scene_frame_is_the_same_in_every_format(format: str, ball_views: Views, tmp_path: Path):
     views = with_background(ball_views, None)
     scene = open_scene(str(write_scene(format, tmp_path / "s", views)))
     assert float(scene.train.cameras.centres.norm(dim=1).median()) == pytest.approx(1, rel=0.02)
@@ -115,7 +83,7 @@ def test_all_formats_of_a_place_give_one_frame(format: str, ball_views: Views, t
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_the_user_may_know_better(format: str, ball_views: Views, tmp_path: Path):
+def test_open_scene_bounded_option_rules(format: str, ball_views: Views, tmp_path: Path):
     path = str(write_scene(format, tmp_path / "s", with_background(ball_views, None)))
     scene = open_scene(path, reading=Reading(bounded="true"))
     assert not scene.bounds.unbounded and "dataset.bounded=true" in scene.kind
@@ -125,7 +93,7 @@ def test_the_user_may_know_better(format: str, ball_views: Views, tmp_path: Path
         Reading(bounded="maybe")
 
 
-def test_nothing_visible_is_refused(ball_views: Views, tmp_path: Path):
+def test_open_scene_nothing_visible_raises(ball_views: Views, tmp_path: Path):
     hidden = replace(ball_views, pixels=ball_views.pixels * torch.tensor([1, 1, 1, 0], dtype=torch.uint8))
     with pytest.raises(InputError, match="alpha is 0 everywhere"):
         open_scene(str(write_scene("transforms", tmp_path / "a", hidden)))
@@ -137,7 +105,7 @@ def test_nothing_visible_is_refused(ball_views: Views, tmp_path: Path):
         open_scene(str(folder))
 
 
-def test_a_stated_box_rules(ball: Scene, tmp_path: Path):
+def test_open_scene_stated_box_rules(ball: Scene, tmp_path: Path):
     save_npz(replace(ball, bounds=replace(ball.bounds, unbounded=True)), tmp_path / "s.npz")
     scene = open_scene(str(tmp_path / "s.npz"))
     assert scene.bounds.unbounded and torch.equal(scene.bounds.aabb, ball.bounds.aabb) and "box" in scene.kind

@@ -31,7 +31,7 @@ def mixed() -> Views:
     return Views(pixels, Cameras(K, torch.eye(4).repeat(3, 1, 1), sizes))
 
 
-def test_photos_of_several_sizes_lie_one_after_the_other():
+def test_views_several_sizes_are_stored_without_padding():
     views = mixed()
     assert [tuple(views.image(i).shape) for i in range(3)] == [(3, 4, 3), (5, 2, 3), (1, 7, 3)]
     assert torch.equal(torch.cat([views.image(i).reshape(-1, 3) for i in range(3)]), views.pixels)
@@ -45,7 +45,7 @@ def test_photos_of_several_sizes_lie_one_after_the_other():
         _ = views.images
 
 
-def test_rays_and_colours_of_several_sizes_belong_together():
+def test_draw_rays_several_sizes_match_their_colours():
     views = mixed()
     batch = draw_rays(views, 2000, torch.Generator().manual_seed(0))
     seen = set()
@@ -58,7 +58,7 @@ def test_rays_and_colours_of_several_sizes_belong_together():
     assert len(seen) == 29, "each pixel is drawn"
 
 
-def test_masked_pixels_are_never_drawn_and_not_scored():
+def test_draw_rays_masked_pixels_are_never_drawn():
     views = mixed()
     known = torch.ones(29, dtype=torch.bool)
     known[3:9], known[11:13], known[22:] = False, False, False
@@ -97,7 +97,7 @@ def write_masks(folder: Path, views: Views, ending: str = ".png", side: int = 1,
 
 
 @pytest.mark.parametrize("ending", [".png", ".png.png", "-cut.png", ".jpg"])
-def test_masks_beside_photos_are_found(ending: str, views: Views, tmp_path: Path):
+def test_open_scene_masks_beside_photos_are_found(ending: str, views: Views, tmp_path: Path):
     folder = capture(tmp_path, views)
     write_masks(folder / "masks", views, ending)
     scene = open_scene(str(folder))
@@ -126,7 +126,7 @@ def write_subfolders(folder: Path, views: Views, masked: tuple[str, ...]) -> Pat
     return folder
 
 
-def test_masks_of_equal_names_go_to_the_photos_of_their_folder(views: Views, tmp_path: Path):
+def test_open_scene_masks_in_subfolders_match_their_photos(views: Views, tmp_path: Path):
     scene = open_scene(str(write_subfolders(tmp_path / "both", views, ("front", "back"))))
     for part in (scene.train, scene.val):
         for view, name in enumerate(part.names):
@@ -137,7 +137,7 @@ def test_masks_of_equal_names_go_to_the_photos_of_their_folder(views: Views, tmp
     assert hidden == {"back": 0, "front": 40}, "the other camera's masks are not taken"
 
 
-def test_one_mask_for_two_photos_is_ambiguous(views: Views, tmp_path: Path):
+def test_open_scene_one_mask_for_two_photos_raises(views: Views, tmp_path: Path):
     folder = write_subfolders(tmp_path, views, ())
     (folder / "masks").mkdir()
     imageio.imwrite(folder / "masks/0000.png", np.full((40, 48), 255, np.uint8))
@@ -145,7 +145,7 @@ def test_one_mask_for_two_photos_is_ambiguous(views: Views, tmp_path: Path):
         open_scene(str(folder))
 
 
-def test_masks_of_another_size_and_inverted_ones(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_open_scene_inverted_masks_warn(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     folder = capture(tmp_path, views)
     write_masks(folder / "masks", views, side=2, invert=True)
     with caplog.at_level(logging.INFO):
@@ -155,7 +155,7 @@ def test_masks_of_another_size_and_inverted_ones(views: Views, tmp_path: Path, c
     assert torch.equal(turned.train.mask, ~straight.train.mask)
 
 
-def test_what_is_masked_may_be_empty(views: Views, tmp_path: Path):
+def test_open_scene_masked_empty_cuts_out(views: Views, tmp_path: Path):
     folder = capture(tmp_path / "a", views)
     write_masks(folder / "masks", views)
     scene = open_scene(str(folder), reading=Reading(masked="empty"))
@@ -171,15 +171,7 @@ def test_what_is_masked_may_be_empty(views: Views, tmp_path: Path):
     assert open_scene(str(cut), reading=Reading(masked="unknown")).train.channels == 3
 
 
-def test_alpha_may_be_unknown(views: Views, tmp_path: Path):
-    names = photos(tmp_path / "images", views)
-    write_colmap(tmp_path / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
-    scene = open_scene(str(tmp_path), reading=Reading(masked="unknown"))
-    assert scene.train.channels == 3 and scene.bounds.unbounded
-    assert torch.equal(scene.train.mask_of(0), views.image(1)[..., 3] >= 250)
-
-
-def test_masks_follow_resizing(views: Views, tmp_path: Path):
+def test_open_scene_masks_follow_resizing(views: Views, tmp_path: Path):
     folder = capture(tmp_path, views)
     write_masks(folder / "masks", views)
     small = open_scene(str(folder), reading=Reading(resize=24)).train
@@ -187,9 +179,7 @@ def test_masks_follow_resizing(views: Views, tmp_path: Path):
     assert torch.equal(small.mask_of(0), whole), "known where all of a pixel is"
 
 
-def test_views_that_are_masked_entirely_are_not_held_out(
-    views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
+def test_open_scene_fully_masked_view_is_not_held_out(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     folder = capture(tmp_path, views)
     write_masks(folder / "masks", views)
     imageio.imwrite(folder / "masks" / "0008.png", np.zeros((40, 48), np.uint8))
@@ -198,7 +188,7 @@ def test_views_that_are_masked_entirely_are_not_held_out(
     assert "1 held-out photos are masked entirely, 0008.png first" in caplog.text
 
 
-def test_a_scene_of_portrait_and_landscape(views: Views, tmp_path: Path):
+def test_open_scene_several_sizes_keep_their_rays(views: Views, tmp_path: Path):
     """Photos are cropped to several sizes; the field's rays stay those of the whole photos."""
     names = photos(tmp_path / "images", views)
     cameras = cameras_of(views)
@@ -217,7 +207,7 @@ def test_a_scene_of_portrait_and_landscape(views: Views, tmp_path: Path):
     torch.testing.assert_close(scene.train.cameras.view_rays(1).directions, expected, atol=1e-5, rtol=0)
 
 
-def test_too_many_photos_are_told_before_they_are_read(views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_open_scene_too_many_photos_raise_a_size(views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = capture(tmp_path, views)
 
     class Memory:
@@ -227,8 +217,3 @@ def test_too_many_photos_are_told_before_they_are_read(views: Views, tmp_path: P
     with pytest.raises(InputError, match="dataset.resize=42 would fit"):
         open_scene(str(folder))
     assert open_scene(str(folder), reading=Reading(resize=42)).train.cameras.size(0) == (42, 35)
-
-
-def test_words_for_masks():
-    with pytest.raises(InputError, match="dataset.masked: found 'white', expected auto, unknown or empty"):
-        Reading(masked="white")

@@ -39,7 +39,7 @@ FOUND = {
 
 
 @pytest.mark.parametrize("case", FOUND)
-def test_names_mean_the_one_file_that_fits(case: str, tmp_path: Path):
+def test_image_finder_name_means_the_one_file(case: str, tmp_path: Path):
     cafe = unicodedata.normalize("NFD", "images/café.png")
     others = ("images/._a.png", "images/.DS_Store", "masks/a.png", "images_4/a.png", "images/10.png")
     root = make_files(tmp_path, "images/a.png", "images/b  c.png", cafe, *others)
@@ -47,7 +47,7 @@ def test_names_mean_the_one_file_that_fits(case: str, tmp_path: Path):
     assert find(root, name) == (None if expected is None else root / expected)
 
 
-def test_folders_decide_between_files_of_one_name(tmp_path: Path):
+def test_image_finder_folders_decide(tmp_path: Path):
     root = make_files(tmp_path, "images/front/0.png", "images/back/0.png")
     assert find(root, "/data/Front/0.PNG") == root / "images/front/0.png"
     with pytest.raises(
@@ -56,11 +56,11 @@ def test_folders_decide_between_files_of_one_name(tmp_path: Path):
         find(root, "0.jpg")
 
 
-def test_reduced_copies_count_where_nothing_else_has_the_name(tmp_path: Path):
+def test_image_finder_reduced_copy_is_last(tmp_path: Path):
     assert find(make_files(tmp_path, "images_4/0.png", "masks/1.png"), "images/0.png") == tmp_path / "images_4/0.png"
 
 
-def test_a_file_is_taken_for_one_name(tmp_path: Path):
+def test_image_finder_file_has_one_name(tmp_path: Path):
     """Test poses whose photos are not there must not take the training photos of the same numbers."""
     finder = ImageFinder(make_files(tmp_path, "images_train/1.png"))
     assert finder.find("images_train/1.png", "train", "") == tmp_path / "images_train/1.png"
@@ -71,7 +71,7 @@ def test_a_file_is_taken_for_one_name(tmp_path: Path):
         moved.find("images_train/1.png", "train", "")
 
 
-def test_substitutions_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_image_finder_substitutions_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     finder = ImageFinder(make_files(tmp_path, "a.png", "b.png", "c.png"))
     for name in ("a.PNG", "b.PNG", ".\\c.png"):
         finder.find(name, "file", "key")

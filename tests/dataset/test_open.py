@@ -45,7 +45,7 @@ def formats(ball: Scene, tmp_path: Path) -> dict[str, Path]:
 @pytest.mark.parametrize(
     ("format", "name"), [("npz", "ball"), ("blender", "blender"), ("studio", "studio"), ("json", "other")]
 )
-def test_every_format_gives_the_same_scene(format: str, name: str, formats: dict[str, Path], ball: Scene):
+def test_open_scene_formats_give_the_same_scene(format: str, name: str, formats: dict[str, Path], ball: Scene):
     scene = open_scene(str(formats[format]))
     assert scene.name == name and scene.source == str(formats[format])
     assert scene.sha256() == ball.sha256()
@@ -58,7 +58,7 @@ def test_every_format_gives_the_same_scene(format: str, name: str, formats: dict
 
 
 @pytest.mark.parametrize("format", ["npz", "blender", "studio"])
-def test_name_resize_and_distances(format: str, formats: dict[str, Path]):
+def test_open_scene_options_reach_every_format(format: str, formats: dict[str, Path]):
     scene = open_scene(str(formats[format]), reading=Reading(resize=24), name="mine", near=0.5, far=2.0)
     assert scene.name == "mine" and scene.resolution == (24, 20)
     assert scene.train.images.shape[1:3] == scene.val.images.shape[1:3] == (20, 24)
@@ -67,24 +67,6 @@ def test_name_resize_and_distances(format: str, formats: dict[str, Path]):
     torch.testing.assert_close(scene.val.cameras.K[0], K)
     torch.testing.assert_close(scene.orbit.K[0], K)
     assert (scene.bounds.near, scene.bounds.far) == (0.5, 2.0)
-
-
-def test_resized_npz_and_blender_agree(formats: dict[str, Path]):
-    a, b = (open_scene(str(formats[format]), reading=Reading(resize=30)) for format in ("npz", "blender"))
-    assert a.sha256() == b.sha256()
-
-
-def test_one_distance_keeps_the_other(formats: dict[str, Path]):
-    bounds = open_scene(str(formats["npz"]), far=3.0).bounds
-    assert (bounds.near, bounds.far) == (None, 3.0)
-
-
-def test_holdout_reaches_the_capture(formats: dict[str, Path]):
-    path = formats["json"]
-    content = json.loads(path.read_text())
-    del content["val_filenames"]
-    path.write_text(json.dumps(content))
-    assert len(open_scene(str(path), reading=Reading(holdout=3)).val) == 4
 
 
 WRONG = {
@@ -98,7 +80,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("kind", WRONG)
-def test_what_cannot_be_opened(kind: str, formats: dict[str, Path], tmp_path: Path, says: Callable):
+def test_open_scene_unknown_path_raises(kind: str, formats: dict[str, Path], tmp_path: Path, says: Callable):
     make, words = WRONG[kind]
     path = make(tmp_path)
     with pytest.raises(InputError) as caught:
@@ -115,12 +97,9 @@ def test_what_cannot_be_opened(kind: str, formats: dict[str, Path], tmp_path: Pa
         (float("nan"), None, "near: found nan"),
     ],
 )
-def test_impossible_distances(near: float, far: float | None, words: str, formats: dict[str, Path], says: Callable):
+def test_open_scene_impossible_distances_raise(
+    near: float, far: float | None, words: str, formats: dict[str, Path], says: Callable
+):
     with pytest.raises(InputError) as caught:
         open_scene(str(formats["npz"]), near=near, far=far)
     says(caught.value, formats["npz"], words)
-
-
-def test_resize_below_one_pixel(formats: dict[str, Path]):
-    with pytest.raises(InputError, match="resize: found 0"):
-        open_scene(str(formats["npz"]), reading=Reading(resize=0))

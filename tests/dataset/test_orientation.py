@@ -33,7 +33,7 @@ def write_sideways(format: str, folder: Path, views: Views) -> Path:
 
 
 @pytest.mark.parametrize("format", ["colmap", "llff", "transforms"])
-def test_photos_are_turned_where_that_fits_their_cameras(
+def test_open_scene_exif_orientation_that_fits_is_applied(
     format: str, ball_views_of: Callable[..., Views], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
     views = ball_views_of(3)
@@ -48,7 +48,7 @@ def test_photos_are_turned_where_that_fits_their_cameras(
         open_scene(str(folder), reading=Reading(orientation="stored"))
 
 
-def test_square_photos_are_taken_as_stored_unless_told(
+def test_open_scene_square_photos_stay_as_stored(
     ball_views_of: Callable[..., Views], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
     views = ball_views_of(3)

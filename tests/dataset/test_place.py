@@ -70,7 +70,7 @@ def own(photos: Path, placed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     return folder, calls
 
 
-def test_photos_of_two_cameras_are_placed_upright_and_in_full_size(placed, made: tuple[Path, Truth], tmp_path: Path):
+def test_reconstruct_two_cameras_gives_full_size_upright_model(placed, made: tuple[Path, Truth], tmp_path: Path):
     placed[0].write_binary(tmp_path)
     model = pycolmap.Reconstruction(tmp_path)
     images = {image.name: image for image in model.images.values() if image.has_pose}
@@ -95,7 +95,7 @@ def test_photos_of_two_cameras_are_placed_upright_and_in_full_size(placed, made:
     assert np.median(off / np.linalg.norm(truth[:, :3, 3], axis=-1)) < 0.05
 
 
-def test_cameras_start_from_the_focal_length_that_photos_tell(placed):
+def test_reconstruct_exif_focal_is_the_prior(placed):
     with pycolmap.Database.open(placed[1] / "database.db") as content:
         cameras = {camera.width: camera for camera in content.read_all_cameras()}
         counts = [image.camera_id for image in content.read_all_images()]
@@ -105,11 +105,11 @@ def test_cameras_start_from_the_focal_length_that_photos_tell(placed):
     assert cameras[380].mean_focal_length() == pytest.approx(1.2 * 380)
 
 
-def test_the_same_photos_are_placed_once(own, caplog: pytest.LogCaptureFixture):
+def test_place_same_photos_are_placed_once(own, caplog: pytest.LogCaptureFixture):
     folder, calls = own
     caplog.set_level(logging.INFO)
     assert place(folder) == folder / "placed" / "sparse" / "0" == place(folder) and calls == [8]
-    assert "as an earlier run placed them" in caplog.text and "of 8 photos placed" in caplog.text
+    assert "kept from an earlier run" in caplog.text and "of 8 photos placed" in caplog.text
     assert pycolmap.Reconstruction(place(folder)).num_reg_images() >= 7
     caplog.clear()
     shutil.copy(folder / "7.jpg", folder / "8.jpg")
@@ -137,7 +137,7 @@ def refusing(*folders: Path) -> Callable[..., str]:
     return mkdtemp
 
 
-def test_a_folder_that_cannot_be_written_is_placed_in_the_cache(own, tmp_path, monkeypatch, caplog):
+def test_place_unwritable_folder_uses_the_cache(own, tmp_path, monkeypatch, caplog):
     folder, calls = own
     monkeypatch.setenv("NERF_LIGHTNING_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(tempfile, "mkdtemp", refusing(folder))
@@ -151,7 +151,7 @@ def test_a_folder_that_cannot_be_written_is_placed_in_the_cache(own, tmp_path, m
         place(folder)
 
 
-def test_a_folder_of_that_name_that_is_the_users_own_stays(own):
+def test_place_foreign_folder_raises(own):
     folder, calls = own
     (folder / "placed").mkdir()
     (folder / "placed" / "mine.txt").write_text("a", encoding="utf-8")
@@ -160,7 +160,7 @@ def test_a_folder_of_that_name_that_is_the_users_own_stays(own):
     assert (folder / "placed" / "mine.txt").exists() and calls == []
 
 
-def test_photos_that_do_not_hang_together(own, monkeypatch: pytest.MonkeyPatch):
+def test_place_disconnected_photos_raise(own, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "reconstruct", lambda photos, workspace: None)
     with pytest.raises(InputError, match="0 of 8 photos that hang together, expected at least 3; take more photos"):
         place(own[0])
@@ -170,7 +170,7 @@ def test_photos_that_do_not_hang_together(own, monkeypatch: pytest.MonkeyPatch):
         place(own[0])
 
 
-def test_many_photos_are_compared_with_their_neighbours_and_across():
+def test_pairs_many_photos_are_neighbours_and_landmarks():
     assert len(structure.pairs(150)) == 150 * 149 // 2
     some = structure.pairs(1000)
     assert len(some) == len(set(some)) < 25_000 and all(0 <= i < j < 1000 for i, j in some)

@@ -11,7 +11,6 @@ import torch
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset import Scene, Views, load_npz, plausible, save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
-from nerf_lightning.dataset.conventions import Verdict
 from nerf_lightning.dataset.extent import border_colour
 from nerf_lightning.dataset.plausible import check_scene, off_centre
 from nerf_lightning.dataset.views import Runs
@@ -21,11 +20,6 @@ from nerf_lightning.synthetic.objects import MARBLE, PILE, ROD, make_scene
 
 WHITE = (1.0, 1.0, 1.0)
 Change = Callable[[Scene], Scene]
-
-
-def upside_down(c2w: torch.Tensor) -> torch.Tensor:
-    c2w[:, :3, :2] *= -1
-    return c2w
 
 
 def limited(near: float | None, far: float | None) -> Change:
@@ -49,7 +43,7 @@ def pile() -> Scene:
     ],
     ids=["pile", "alpha", "white", "rod", "few", "bricks"],
 )
-def test_good_scenes_raise_no_doubt(scene: Callable[[], Scene]):
+def test_check_scene_good_scene_has_no_doubt(scene: Callable[[], Scene]):
     assert check_scene(scene()) == []
 
 
@@ -67,33 +61,28 @@ HOPELESS: list[tuple[Change, str]] = [
     HOPELESS,
     ids=["opengl", "flag", "far", "near", "box"],
 )
-def test_hopeless_scenes_are_refused(change: Change, words: str, pile: Scene):
+def test_check_scene_hopeless_scene_raises(change: Change, words: str, pile: Scene):
     with pytest.raises(InputError, match=words):
         check_scene(change(pile))
 
 
-def test_photos_that_do_not_fit_are_refused(pile: Scene):
+def test_check_scene_shuffled_poses_raise(pile: Scene):
     with pytest.raises(InputError, match="belong to other photos"):
         check_scene(shuffle_poses(pile, 0))
-
-
-def test_photos_upside_down_are_warned_of_by_their_outlines(pile: Scene):
-    doubts = check_scene(replace(pile, train=change_poses(pile.train, upside_down)))
-    assert any("outlines that no body has" in doubt.text for doubt in doubts)
 
 
 @pytest.fixture
 def no_matches(monkeypatch: pytest.MonkeyPatch) -> None:
     """As between photos without texture."""
-    monkeypatch.setattr(plausible, "judge_cameras", lambda scene: Verdict())
+    monkeypatch.setattr(plausible, "judge_cameras", lambda scene: ([], False))
 
 
 @pytest.mark.usefixtures("no_matches")
-def test_outlines_tell_where_matches_do_not(pile: Scene, monkeypatch: pytest.MonkeyPatch):
+def test_check_scene_without_matches_judges_outlines(pile: Scene, monkeypatch: pytest.MonkeyPatch):
     assert check_scene(pile) == []
-    with pytest.raises(InputError, match="axes of the other convention.*outlines"):
+    with pytest.raises(InputError, match="outlines that no body has"):
         check_scene(flip_axes(pile, 0))
-    with pytest.raises(InputError, match="world-to-camera matrices.*outlines"):
+    with pytest.raises(InputError, match="outlines that no body has"):
         check_scene(replace(pile, train=change_poses(pile.train, torch.linalg.inv)))
 
     inexact = shuffle_poses(pile, 0)
@@ -109,17 +98,11 @@ def test_outlines_tell_where_matches_do_not(pile: Scene, monkeypatch: pytest.Mon
     assert doubt.far_off
 
 
-def test_hopeless_scenes_are_refused_where_poses_are_corrected_too(pile: Scene):
-    for change, words in (HOPELESS[0], HOPELESS[-1]):
-        with pytest.raises(InputError, match=words):
-            check_scene(change(pile), corrected=True)
-
-
 @pytest.mark.usefixtures("no_matches")
-def test_axes_that_meet_behind_are_only_doubted_without_other_evidence(pile: Scene):
+def test_check_scene_cameras_looking_away_are_doubted(pile: Scene):
     away = flip_axes(replace(pile, bounds=Bounds(pile.bounds.aabb, unbounded=True)), 0)
     (doubt,) = check_scene(away)
-    assert "100% of the cameras with their backs to the point" in doubt.text and not doubt.hopeless
+    assert "cameras with their backs to the point" in doubt.text and not doubt.hopeless
 
 
 def filled(value: int) -> Change:
@@ -155,12 +138,12 @@ def masked(scene: Scene) -> Scene:
     ],
     ids=["one", "black", "white", "transparent", "masked", "alike"],
 )
-def test_empty_data_is_refused(change: Change, words: str, pile: Scene):
+def test_check_scene_empty_data_raises(change: Change, words: str, pile: Scene):
     with pytest.raises(InputError, match=words):
         check_scene(change(pile), corrected=True)
 
 
-def test_doubtful_scenes_are_warned_of(pile: Scene):
+def test_check_scene_doubtful_scene_warns(pile: Scene):
     (doubt,) = check_scene(limited(3.6, None)(pile))
     assert "near=3.6 cuts" in doubt.text
     assert check_scene(limited(0.1, 40.0)(pile)) == [], "wider than the box: the box decides"
@@ -177,7 +160,7 @@ def test_doubtful_scenes_are_warned_of(pile: Scene):
     assert "1 of 4 held-out photos are trained on as well" in doubt.text
 
 
-def test_the_border_tells_the_background(pile: Scene, tmp_path: Path):
+def test_border_colour_is_the_background(pile: Scene, tmp_path: Path):
     assert border_colour(pile.train) == (0.0, 0.0, 0.0)
     assert border_colour(make_scene(PILE, WHITE, size=32).train) == WHITE
     assert border_colour(make_scene(PILE, None, size=32).train) is None
@@ -194,11 +177,11 @@ def test_the_border_tells_the_background(pile: Scene, tmp_path: Path):
     assert load_npz(path).background == WHITE, "also where the file does not say"
 
 
-def test_a_box_beside_what_cameras_look_at_is_told(pile: Scene):
+def test_off_centre_box_beside_the_subject_is_doubted(pile: Scene):
     aside = replace(pile.bounds, aabb=pile.bounds.aabb + torch.tensor([3.0, 0, 0]))
     (text,) = (doubt.text for doubt in off_centre(replace(pile, bounds=aside)))
     assert "cameras stand around a place 3 beside the box's centre" in text
     tiny = replace(pile.bounds, aabb=0.1 * pile.bounds.aabb, unbounded=True)
     (text,) = (doubt.text for doubt in off_centre(replace(pile, bounds=tiny)))
-    assert "times the box's half-size off its centre" in text
+    assert "times the box's half-size" in text
     assert not list(off_centre(replace(pile, bounds=replace(pile.bounds, unbounded=True))))

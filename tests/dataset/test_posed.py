@@ -20,7 +20,7 @@ UP = torch.tensor([0.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize("some", [slice(None), slice(0, 4)])
-def test_any_frame_is_turned_upright(some: slice):
+def test_normalize_poses_any_frame_is_turned_upright(some: slice):
     c2w = orbit_around(torch.zeros(3), UP, 2.0, 0.4, 12)[some].double()
     moved = torch.eye(4).double()
     moved[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.7, -1.1, 0.4]).as_matrix())
@@ -35,7 +35,7 @@ def test_any_frame_is_turned_upright(some: slice):
     np.testing.assert_allclose(back[:, :3, 3], elsewhere[:, :3, 3], atol=1e-4)
 
 
-def test_held_out_photos_do_not_move_the_frame():
+def test_normalize_poses_held_out_do_not_move_the_frame():
     c2w = orbit_around(torch.zeros(3), UP, 2.0, 0.4, 12).double()
     far = c2w.clone()
     far[::4, :3, 3] += 30
@@ -45,7 +45,7 @@ def test_held_out_photos_do_not_move_the_frame():
     torch.testing.assert_close(find_region(found[train]).centre, torch.zeros(3).double(), atol=1e-6, rtol=0)
 
 
-def test_a_walk_along_a_wall_is_sampled_from_the_lens_on(tmp_path: Path):
+def test_open_scene_walk_has_no_near(tmp_path: Path):
     """Only where all cameras look at one thing is it known that nothing is near."""
     walk = torch.eye(4).repeat(9, 1, 1)
     walk[:, 0, 3] = torch.linspace(-4, 4, 9)
@@ -60,7 +60,7 @@ def test_a_walk_along_a_wall_is_sampled_from_the_lens_on(tmp_path: Path):
 
 
 @pytest.mark.parametrize("silent", [None, 3])
-def test_photos_state_the_light_that_they_gathered_or_none_does(silent: int | None, tmp_path: Path):
+def test_open_scene_exposures_come_from_exif(silent: int | None, tmp_path: Path):
     K = torch.tensor([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]]).repeat(9, 1, 1)
     c2w = orbit_around(torch.zeros(3), UP, 2.0, 0.4, 9)
     views = Views.of(torch.zeros(9, 12, 16, 3, dtype=torch.uint8), Cameras.of_size(K, c2w, 16, 12))

@@ -10,7 +10,6 @@ from nerf_lightning.dataset.loader import StepLoader
 from nerf_lightning.dataset.rays import draw_rays, plainness
 from nerf_lightning.errors import InputError
 from nerf_lightning.renderer import over
-from nerf_lightning.utils.seeding import Stream, step_generator
 
 VIEWS, HEIGHT, WIDTH = 3, 4, 6
 
@@ -31,18 +30,7 @@ def scene() -> Scene:
     return Scene("labels", "test", train, val, val.cameras, Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])))
 
 
-def test_a_finer_field_gets_more_samples_a_step_but_a_fixed_number_of_rays_stays(scene: Scene):
-    data, fixed = RayDataModule(scene, 100, samples=6000), RayDataModule(scene, 100, samples=None)
-    for one in (data, fixed):
-        one.finer = 1.5
-    assert data.rays == fixed.rays == 100
-    for _ in range(60):
-        for one in (data, fixed):
-            one.note_samples(10 * one.rays)
-    assert abs(data.rays - 900) <= 2 and fixed.rays == 100
-
-
-def test_drawn_colours_belong_to_drawn_rays(scene: Scene):
+def test_draw_rays_colours_belong_to_their_rays(scene: Scene):
     batch = draw_rays(scene.train, 200, torch.Generator().manual_seed(0))
     assert len(batch.rays) == len(batch.pixels) == 200
     for i, (view, row, col, _) in enumerate(batch.pixels.tolist()):
@@ -53,7 +41,7 @@ def test_drawn_colours_belong_to_drawn_rays(scene: Scene):
         torch.testing.assert_close(batch.rays.directions[i].double(), direction / direction.norm(), atol=1e-6, rtol=0)
 
 
-def test_plain_is_what_looks_alike_on_all_sides():
+def test_plainness_step_and_slope_are_told_apart():
     """One photo with a step of colour and one with a slope, of two sizes: what counts is near by, and within the photo."""
     step, slope = torch.full((20, 160, 3), 90), torch.arange(80).expand(40, 80)[..., None].repeat(1, 1, 3)
     step[:, 100:, 1] = 120
@@ -72,7 +60,7 @@ def test_plain_is_what_looks_alike_on_all_sides():
     torch.testing.assert_close(second, torch.full_like(second, float(torch.tensor(-1 / 2.55).exp())))
 
 
-def test_all_pixels_of_all_views_are_equally_likely(scene: Scene):
+def test_draw_rays_is_uniform_over_all_pixels(scene: Scene):
     pixels = draw_rays(scene.train, 36_000, torch.Generator().manual_seed(0)).pixels.long()
     counts = torch.bincount((pixels[:, 0] * HEIGHT + pixels[:, 1]) * WIDTH + pixels[:, 2])
     assert len(counts) == VIEWS * HEIGHT * WIDTH
@@ -81,7 +69,7 @@ def test_all_pixels_of_all_views_are_equally_likely(scene: Scene):
     assert abs(chi_square - 71) < 5 * (2 * 71) ** 0.5  # 71 degrees of freedom
 
 
-def test_a_batch_depends_on_seed_and_step_alone(scene: Scene):
+def test_ray_data_batch_depends_on_seed_and_step_alone(scene: Scene):
     def pixels(seed: int, step: int) -> list:
         return RayDataModule(scene, rays=50, seed=seed).draw(step).pixels.tolist()
 
@@ -89,22 +77,7 @@ def test_a_batch_depends_on_seed_and_step_alone(scene: Scene):
     assert len({str(pixels(seed, step)) for seed in (0, 1) for step in range(20)}) == 40
 
 
-def test_data_and_model_draw_apart(scene: Scene):
-    drawn = RayDataModule(scene, rays=50, seed=2, focus=0).draw(5).pixels
-    assert torch.equal(drawn, draw_rays(scene.train, 50, step_generator(2, Stream.BATCH, 5)).pixels)
-    assert not torch.equal(drawn, draw_rays(scene.train, 50, step_generator(2, Stream.STEP, 5)).pixels)
-
-
-def test_batches_say_how_plain_photos_are_where_that_is_asked_for(scene: Scene):
-    data = RayDataModule(scene, rays=50)
-    assert data.draw(3).plain is None
-    data.plain = True
-    batch = data.draw(3)
-    assert batch.plain is not None and batch.plain.shape == (50,) and (batch.plain < 1).all()
-    assert torch.equal(batch.pixels, RayDataModule(scene, rays=50).draw(3).pixels)
-
-
-def test_held_out_views_come_whole_and_in_order(scene: Scene):
+def test_ray_data_held_out_views_come_whole_and_in_order(scene: Scene):
     data = RayDataModule(scene)
     batches = list(data.test_dataloader())
     assert len(batches) == len(data.test_dataloader()) == data.held_out_views == 2
@@ -115,21 +88,16 @@ def test_held_out_views_come_whole_and_in_order(scene: Scene):
 
 
 @pytest.mark.parametrize(("alpha", "expected"), [(255, 0.2), (0, 0.5), (51, 0.2 * 0.2 + 0.8 * 0.5)])
-def test_the_target_is_the_pixel_over_the_background(alpha: int, expected: float):
+def test_over_alpha_blends_with_background(alpha: int, expected: float):
     rays = Rays(torch.zeros(2, 3), torch.eye(3)[:2])
     batch = RayBatch(rays, torch.tensor([[51, 51, 51, alpha], [255, 0, 0, 255]], dtype=torch.uint8))
     target = over(batch.pixels, torch.full((2, 3), 0.5))
     torch.testing.assert_close(target, torch.tensor([[expected] * 3, [1.0, 0, 0]]))
 
 
-def test_the_target_without_alpha_is_the_pixel():
-    batch = RayBatch(Rays(torch.zeros(1, 3), torch.eye(3)[:1]), torch.tensor([[0, 51, 255]], dtype=torch.uint8))
-    torch.testing.assert_close(over(batch.pixels, torch.ones(1, 3)), torch.tensor([[0, 0.2, 1.0]]))
-
-
 @pytest.mark.parametrize("samples_per_ray", [0.5, 3.0, 40.0])
 @pytest.mark.parametrize("first", [100, 1000])
-def test_the_number_of_rays_settles_where_their_samples_meet_the_aim(first: int, samples_per_ray: float, scene: Scene):
+def test_note_samples_settles_at_the_aim(first: int, samples_per_ray: float, scene: Scene):
     data = RayDataModule(scene, rays=first, samples=6000)
     most = 0
     for _ in range(60):
@@ -141,22 +109,7 @@ def test_the_number_of_rays_settles_where_their_samples_meet_the_aim(first: int,
     assert len(data.draw(0).pixels) == data.rays
 
 
-@pytest.mark.parametrize(("drawn", "end"), [(0, 3200), (10**9, 64)])
-def test_the_number_of_rays_stays_in_bounds(drawn: int, end: int, scene: Scene):
-    data = RayDataModule(scene, rays=100, samples=6000)
-    for _ in range(60):
-        data.note_samples(drawn)
-        assert 64 <= data.rays <= 3200
-    assert abs(data.rays - end) <= 2
-
-
-def test_without_an_aim_the_number_of_rays_stays(scene: Scene):
-    data = RayDataModule(scene, rays=100, samples=None)
-    data.note_samples(10)
-    assert data.rays == 100
-
-
-def test_the_number_of_rays_is_kept_in_checkpoints(scene: Scene):
+def test_ray_data_state_keeps_the_number_of_rays(scene: Scene):
     data, other = (RayDataModule(scene, rays=100, samples=6000) for _ in range(2))
     data.note_samples(500)
     other.load_state_dict(data.state_dict())
@@ -168,23 +121,15 @@ def test_the_number_of_rays_is_kept_in_checkpoints(scene: Scene):
 
 
 @pytest.mark.parametrize(("rays", "samples", "key"), [(0, None, "dataset.rays"), (5, 0, "dataset.samples")])
-def test_less_than_one_is_refused(rays, samples, key, scene: Scene):
+def test_ray_data_less_than_one_raises(rays, samples, key, scene: Scene):
     with pytest.raises(InputError, match=key):
         RayDataModule(scene, rays, samples)
 
 
-def test_the_loader_asks_for_the_step_at_each_batch(scene: Scene):
+def test_step_loader_asks_for_the_step_at_each_batch(scene: Scene):
     steps = iter([0, 1, 5, 5])
     loader = StepLoader(lambda step: step * 10, lambda: next(steps))
     assert list(islice(loader, 4)) == [0, 10, 50, 50]
     assert len(loader) > 10**9
     first = next(iter(RayDataModule(scene, rays=5, seed=1).train_dataloader()))
     assert torch.equal(first.pixels, RayDataModule(scene, rays=5, seed=1).draw(0).pixels)
-
-
-def test_photos_may_lie_in_memory_in_any_order(scene: Scene):
-    """numpy files in Fortran order are read without a copy."""
-    images = scene.train.images
-    turned = Views.of(images.permute(3, 2, 1, 0).contiguous().permute(3, 2, 1, 0), scene.train.cameras)
-    expected = draw_rays(scene.train, 50, torch.Generator().manual_seed(0))
-    assert torch.equal(draw_rays(turned, 50, torch.Generator().manual_seed(0)).pixels, expected.pixels)

@@ -17,8 +17,7 @@ from nerf_lightning.dataset import size as size_module
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.dataset.shots import Reading, Shot, read_shots
-from nerf_lightning.dataset.size import AutoResize, auto_resize, choose_resize, find_reduced, parse_resize
-from nerf_lightning.errors import InputError
+from nerf_lightning.dataset.size import AutoResize, auto_resize, choose_resize, find_reduced
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.scene_file import load_scene, save_scene
@@ -43,20 +42,15 @@ def views(ball_views_of: Callable[..., Views]) -> Views:
         (None, None, 32, 1600),  # 90 s
     ],
 )
-def test_work_decides_the_longest_side(seconds: float | None, steps: int | None, threads: int, longest: int):
+def test_auto_resize_work_decides_the_side(seconds: float | None, steps: int | None, threads: int, longest: int):
     assert auto_resize(seconds, steps, CPU, threads).longest == longest
-
-
-def test_an_accelerator_counts_as_many_cores():
-    found = auto_resize(180, None, torch.device("cuda"), 1)
-    assert found.longest == auto_resize(180, None, CPU, 64).longest and found.budget == "180 s on cuda"
 
 
 @pytest.mark.parametrize(
     ("size", "longest"),
     [((4032, 3024), 1008), ((1080, 1920), 960), ((800, 600), None), ((1440, 1080), None), ((1600, 1200), 800)],
 )
-def test_the_largest_photo_is_divided_by_a_whole_number(
+def test_choose_resize_divides_by_a_whole_number(
     size: tuple[int, int], longest: int | None, caplog: pytest.LogCaptureFixture
 ):
     with caplog.at_level(logging.INFO):
@@ -67,25 +61,15 @@ def test_the_largest_photo_is_divided_by_a_whole_number(
         assert f"{expected}; dataset.resize=null keeps the size" in caplog.text
 
 
-def test_photos_are_smaller_where_the_memory_has_no_room(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-):
+def test_choose_resize_little_memory_reduces_more(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(size_module, "free_memory", lambda: 2.5 * 100 * 3 * 700 * 525)
     with caplog.at_level(logging.INFO):
         assert choose_resize("here", [(4000, 3000)] * 100, 3, AutoResize(1000, "much time")) == 667  # a sixth
     assert "the memory has no room for more" in caplog.text
 
 
-def test_what_is_said_is_what_happens():
-    assert choose_resize("", [(4000, 3000)], 3, 123) == 123
-    assert choose_resize("", [(4000, 3000)], 3, None) is None
-    for wrong in ("automatic", 0.5, {"longest": 3}):
-        with pytest.raises(InputError, match="dataset.resize: found .*, expected auto, null or the longest side"):
-            parse_resize(wrong)
-
-
 @pytest.mark.parametrize("format", ["colmap", "llff", "transforms"])
-def test_reduced_photos_stand_in_for_whole_ones(format: str, views: Views, tmp_path: Path):
+def test_open_scene_reduced_copies_are_used(format: str, views: Views, tmp_path: Path):
     """In any format; where they are large enough, and have alpha too."""
     names = photos(tmp_path / "images", views)
     if format == "colmap":
@@ -104,7 +88,7 @@ def test_reduced_photos_stand_in_for_whole_ones(format: str, views: Views, tmp_p
     torch.testing.assert_close(half.train.cameras.K[0], views.cameras.resized((24, 20)).K[0], atol=1e-4, rtol=0)
 
 
-def test_reduced_photos_are_large_enough_and_have_the_same_channels(tmp_path: Path):
+def test_find_reduced_size_and_channels_fit(tmp_path: Path):
     for folder, factor in (("images", 1), ("images_2", 2), ("images_4", 4)):
         (tmp_path / folder / "left").mkdir(parents=True)
         imageio.imwrite(tmp_path / folder / "left" / "a.png", np.zeros((40 // factor, 48 // factor, 4), np.uint8))
@@ -117,7 +101,7 @@ def test_reduced_photos_are_large_enough_and_have_the_same_channels(tmp_path: Pa
     assert find_reduced(photo, (12, 10), False) == photo, "of another shape"
 
 
-def test_masks_and_colours_of_a_reduced_jpeg_are_averages(tmp_path: Path):
+def test_read_shots_reduced_jpeg_is_averaged(tmp_path: Path):
     """As of a PNG, which is decoded whole."""
     y, x = np.mgrid[:96, :160]
     pixels = np.stack([x, 2 * y, 255 - x], axis=-1).astype(np.uint8)
@@ -137,7 +121,7 @@ def test_masks_and_colours_of_a_reduced_jpeg_are_averages(tmp_path: Path):
     assert (a.pixels.int() - b.pixels.int()).abs().max() <= 8
 
 
-def test_a_run_that_is_opened_again_has_its_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_data_again_keeps_the_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Whatever its budget, the threads and the memory are by then."""
     save_npz(bricks(size=48, train_views=4, val_views=2, cache=""), tmp_path / "scene.npz")
     monkeypatch.setattr(size_module, "MIN_LONGEST_PX", 16)

@@ -8,7 +8,7 @@ from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset, thin
 
 
-def test_strips_are_spread_over_the_height():
+def test_pixel_subset_strips_are_spread():
     rows, columns = PixelSubset(rows=0.5).grid(7, 128)
     assert rows.tolist() == [*range(32), *range(64, 96)] and columns.tolist() == list(range(7))
     assert len(PixelSubset(rows=0.0).grid(7, 128)[0]) == 32, "at least one"
@@ -16,7 +16,7 @@ def test_strips_are_spread_over_the_height():
     assert PixelSubset(rows=0.99).grid(5, 128)[0].tolist() == list(range(128))
 
 
-def test_a_stride_takes_the_middle_of_what_it_leaves_out():
+def test_pixel_subset_stride_takes_the_middle():
     rows, columns = PixelSubset(stride=3).grid(7, 5)
     assert rows.tolist() == [1, 4] and columns.tolist() == [1, 4]
     assert [len(side) for side in PixelSubset(stride=9).grid(3, 2)] == [1, 1], "never nothing"
@@ -31,7 +31,7 @@ def test_thin_leaves_at_most_so_many(pixels: int, most: int, stride: int):
 
 
 @pytest.mark.parametrize("subset", [PixelSubset(stride=3), PixelSubset(rows=0.5)])
-def test_some_pixels_of_a_view_are_those_of_the_whole_one(subset: PixelSubset):
+def test_held_out_subset_is_of_the_whole_view(subset: PixelSubset):
     scene = bricks(size=64, train_views=2, val_views=2, cache="")
     data = RayDataModule(scene)
     whole, some = data.held_out(1), data.held_out(1, subset)
@@ -47,7 +47,7 @@ def test_some_pixels_of_a_view_are_those_of_the_whole_one(subset: PixelSubset):
     assert torch.equal(some.rgb, whole.rgb[expected]) and torch.allclose(some.uv, whole.uv[expected])
 
 
-def test_a_test_may_be_of_strips():
+def test_test_on_strips_gives_strips():
     data = RayDataModule(bricks(size=64, train_views=2, val_views=2, cache=""))
     data.test_on(PixelSubset(rows=0.5))
     assert [batch.height for batch in data.test_dataloader()] == [32, 32]

@@ -5,10 +5,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from nerf_lightning.config import cli
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
-from nerf_lightning.evaluate.__main__ import task as evaluate
 
 SMALL = (
     *("dataset.rays=64", "dataset.samples=null", "budget.steps=2", "callbacks.throughput=null"),
@@ -25,7 +23,7 @@ SMALL = (
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
-def test_a_moved_run_goes_on_and_is_measured(source: list[str], kept: str, inside, verb, tmp_path: Path):
+def test_a_moved_run_goes_on_and_is_measured(source: list[str], kept: str, inside, tmp_path: Path):
     save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), tmp_path / "published.npz")
     code, _, err = inside(*source, *SMALL)
     assert code == 0, err
@@ -39,6 +37,5 @@ def test_a_moved_run_goes_on_and_is_measured(source: list[str], kept: str, insid
     assert (dataset["path"], dataset["rays"]) == (str(tmp_path / "elsewhere.npz"), 64)
     assert config["budget"]["steps"] == 4
     (tmp_path / "elsewhere.npz").rename(tmp_path / "last.npz")
-    given = ["run=moved", "dataset.path=last.npz"]
-    code, out, err = verb(lambda: cli.run("evaluate", evaluate, texts=("run", "output", "dataset.path")), *given)
+    code, out, err = inside("evaluate", "moved", "--photos", "last.npz")
     assert code == 0 and "over 2 held-out views" in out, err

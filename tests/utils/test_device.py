@@ -44,24 +44,6 @@ def test_missing_device_is_refused_before_anything_is_written(device: str, insid
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "given", [["device=cpu,cuda"], ["trainer.accelerator=cuda", "seed=0,1"], ["trainer.accelerator=cpu,cuda"]]
-)
-def test_sweep_with_a_missing_device_starts_no_job(given: list[str], inside, plain_torch: None, tmp_path: Path):
-    code, _, err = inside("-m", "+experiment=smoke_2d", *given)
-    assert code == 2 and err.count("\n") == 1 and "'cuda'" in err, err
-    assert not list(tmp_path.iterdir())
-
-
-def test_devices_of_a_cluster_are_not_checked_here(plain_torch: None, tmp_path: Path):
-    from nerf_lightning.training.sweep_plan import devices_asked
-
-    cfg = composed(["device=cuda"], tmp_path)
-    for launcher, asked in (("BasicLauncher", ["cuda"]), ("LocalLauncher", ["cuda"]), ("SlurmLauncher", [])):
-        hydra = {"launcher": {"_target_": f"launchers.{launcher}"}, "sweeper": {}, "overrides": {"task": ["seed=1,2"]}}
-        assert devices_asked(OmegaConf.merge(cfg, {"hydra": hydra})) == asked
-
-
 def test_resumed_run_may_use_another_device(inside, small_run: Path, plain_torch: None, tmp_path: Path):
     run = tmp_path / "run"
     shutil.copytree(small_run, run)

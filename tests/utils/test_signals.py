@@ -98,7 +98,7 @@ def test_interrupted_write_leaves_nothing(kind, signum: int, tmp_path: Path):
 
 
 def test_import_leaves_handlers_alone():
-    probe = "import signal; before = signal.getsignal(signal.SIGTERM); import nerf_lightning.config.cli;"
+    probe = "import signal; before = signal.getsignal(signal.SIGTERM); import nerf_lightning.cli.app;"
     probe += "assert signal.getsignal(signal.SIGTERM) is before"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", probe], env=environment, check=True)

@@ -1,8 +1,6 @@
-from pathlib import Path
-
 import pytest
 
-from nerf_lightning.utils.text import join_truncated, relative_url, script_data, subsample
+from nerf_lightning.utils.text import join_truncated, subsample
 
 
 @pytest.mark.parametrize(
@@ -15,8 +13,3 @@ def test_subsample_spaces_indices_evenly(total: int, count: int | None, expected
 
 def test_join_truncated_counts_the_rest():
     assert join_truncated(["a", "b", "c"], 2) == "a, b and 1 more" and join_truncated(["a"], 2) == "a"
-
-
-def test_web_helpers_escape():
-    assert "</script>" not in script_data({"a": "</script>"})
-    assert relative_url(Path("a/b"), Path("a/c d/ü.html")) == "../c%20d/%C3%BC.html"

@@ -9,15 +9,14 @@ import cv2
 import numpy as np
 
 from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS
-from nerf_lightning.capture.poses.solve import Pose, Solved, misfits, packed, settle, solve
+from nerf_lightning.capture.poses.solve import Pose, Solved, misfits, packed, select_model, solve
 from nerf_lightning.capture.tags.detect import Mark, Sighting
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.errors import InputError
 
 log = logging.getLogger(__name__)
 
-FEWEST = 3
-"""Photos that a calibration needs."""
+MIN_PHOTOS = 3
 MODELS: tuple[tuple[int, tuple[str, ...]], ...] = (
     (3, ("focal",)),
     (4, ("focal", "k1")),
@@ -36,15 +35,15 @@ ROUNDS = 3
 """Times that the poses are solved before the lens model is chosen."""
 FIRST_FOCAL = (0.7, 1.0, 1.5, 2.2)
 """First guesses of the focal length, in longest sides of the photo."""
-UNSURE, HOPELESS = 0.01, 0.05
+UNSURE, MAX_UNCERTAINTY = 0.01, 0.05
 """Relative standard deviations of the focal length above which there is a warning, and an error."""
-PLAUSIBLE = 0.35, 12.0
+MIN_FOCAL, MAX_FOCAL = 0.35, 12.0
 """Focal lengths in longest sides of the photo: from a very wide angle to a long telephoto lens."""
-COVERED = 0.4
+GOOD_COVERAGE = 0.4
 """Share of the picture that corners should span."""
-FRONTAL, TILTED = np.radians(8.0), np.radians(20.0)
+MIN_TILT_RAD, GOOD_TILT_RAD = np.radians(8.0), np.radians(20.0)
 """How far tags must, and should, be tilted in at least one photo."""
-TILT = "tilt the camera by 20 to 45 degrees in several photos, in different directions"
+TILT_ADVICE = "tilt the camera by 20 to 45 degrees in several photos, in different directions"
 
 
 @dataclass(frozen=True)
@@ -102,72 +101,79 @@ def calibrate(folder: Path, sightings: Sequence[Sighting], layout: dict[int, Pos
     Raises:
         InputError: too few photos with tags, or photos that do not determine the focal length.
     """
-    dropped = {s.name: "no tag found" for s in sightings if not s.marks}
     used = [s for s in sightings if s.marks]
-    if len(used) < FEWEST:
-        raise InputError(
-            folder,
-            "",
-            f"{len(used)} photos with tags of {len(sightings)}",
-            f"at least {FEWEST}",
-            "take more photos of the tags, sharp, from different angles; check tags.dictionary",
-        )
-    tilt = _tilt(used)
-    if tilt < FRONTAL:
-        raise InputError(
-            folder,
-            "",
-            f"photos that all look straight at the tags (tilted by {np.degrees(tilt):.0f} degrees at most)",
-            "tags seen from different angles",
-            TILT,
-        )
+    if len(used) < MIN_PHOTOS:
+        found = f"{len(used)} photos with tags of {len(sightings)}"
+        advice = "take more photos of the tags, sharp, from different angles; check the dictionary"
+        raise InputError(folder, "", found, f"at least {MIN_PHOTOS}", advice)
+    tilt = _max_tilt(used)
+    if tilt < MIN_TILT_RAD:
+        found = f"photos that all look straight at the tags (tilted by {np.degrees(tilt):.0f} degrees at most)"
+        raise InputError(folder, "", found, "tags seen from different angles", TILT_ADVICE)
+    solved, used, dropped = _fit_consistent(folder, used, layout)
+    dropped |= {s.name: "no tag found" for s in sightings if not s.marks}
+    lens, refined = solved.lens, solved.refined
+    corners = np.concatenate([mark.pixels for s in used for mark in s.marks.values()]).astype(np.float32)
+    coverage = float(cv2.contourArea(cv2.convexHull(corners))) / (lens.width * lens.height)
+    uncertainty = refined.deviations.get("focal", 0.0) / lens.fx
+    longest_sides = lens.fx / max(lens.width, lens.height)
+    if not uncertainty < MAX_UNCERTAINTY or not MIN_FOCAL < longest_sides < MAX_FOCAL:
+        found = f"focal length {lens.fx:.0f} pixels, uncertain by {100 * uncertainty:.0f} %"
+        raise InputError(folder, "", found, "tags seen from different angles", TILT_ADVICE)
+    warnings = _warnings(uncertainty, tilt, coverage)
+    return Calibration(lens, refined.deviations, refined.total_rms, solved, used, dropped, coverage, tilt, warnings)
+
+
+def _fit_consistent(
+    folder: Path, used: list[Sighting], layout: dict[int, Pose] | None
+) -> tuple[Solved, list[Sighting], dict[str, str]]:
+    """Fits until no photo contradicts the others.
+
+    Returns:
+        The fit, the photos behind it, and why each of the others was dropped, by name.
+    """
+    dropped: dict[str, str] = {}
     lens = first_lens(used)
     while True:
         solved = _fit(folder, lens, used, layout)
         lens = solved.lens
         off = misfits(solved)
         lost = {i for i in range(len(used)) if i not in solved.w2c}
-        left = [without(s, off.marks.get(i)) for i, s in enumerate(used) if i not in lost | set(off.photos)]
-        if not (off.photos or off.marks or lost) or len(left) < FEWEST:
-            break
-        dropped |= {used[i].name: off_by(error, off.usual) for i, error in off.photos.items()}
+        left = [drop_tag(s, off.marks.get(i)) for i, s in enumerate(used) if i not in lost | set(off.photos)]
+        if not (off.photos or off.marks or lost) or len(left) < MIN_PHOTOS:
+            return solved, used, dropped
+        dropped |= {used[i].name: reprojection_message(error, off.usual) for i, error in off.photos.items()}
         dropped |= {used[i].name: "its tags could not be placed" for i in lost}
         used = left
-    refined = solved.refined
-    corners = np.concatenate([mark.pixels for s in used for mark in s.marks.values()]).astype(np.float32)
-    coverage = float(cv2.contourArea(cv2.convexHull(corners))) / (lens.width * lens.height)
-    share = refined.deviations.get("focal", 0.0) / lens.fx
-    field = lens.fx / max(lens.width, lens.height)
-    if not share < HOPELESS or not PLAUSIBLE[0] < field < PLAUSIBLE[1]:
-        found = f"a focal length of {lens.fx:.0f} pixels, open by {100 * share:.0f} %"
-        raise InputError(folder, "", found, "tags seen from different angles", TILT)
+
+
+def _warnings(uncertainty: float, tilt: float, coverage: float) -> list[str]:
     warnings = []
-    if share > UNSURE:
-        warnings.append(f"the focal length is known to {100 * share:.1f} % only: take more photos from other angles")
-    if tilt < TILTED:
-        warnings.append(f"the tags are tilted by {np.degrees(tilt):.0f} degrees at most: {TILT}")
-    if coverage < COVERED:
-        warnings.append(
+    if uncertainty > UNSURE:
+        text = f"the focal length is uncertain by {100 * uncertainty:.1f} %: take more photos from other angles"
+        warnings.append(text)
+    if tilt < GOOD_TILT_RAD:
+        warnings.append(f"the tags are tilted by {np.degrees(tilt):.0f} degrees at most: {TILT_ADVICE}")
+    if coverage < GOOD_COVERAGE:
+        text = (
             f"the tags cover {100 * coverage:.0f} % of the picture: bring them near its borders in some photos, else "
-            "distortion there is a guess"
         )
-    rms = refined.total_rms
-    return Calibration(lens, refined.deviations, rms, solved, used, dropped, coverage, tilt, warnings)
+        warnings.append(text + "distortion there is a guess")
+    return warnings
 
 
-def without(sighting: Sighting, tag: int | None) -> Sighting:
-    """A sighting without a tag that is half hidden, bent, or mistaken for another."""
+def drop_tag(sighting: Sighting, tag: int | None) -> Sighting:
+    """A sighting without a tag that is half hidden, bent, or mistaken for another; the same for None."""
     if tag is None:
         return sighting
-    log.warning(
-        "%s: tag %d is ignored: it lies elsewhere than in the other photos, or is half hidden", sighting.name, tag
-    )
+    text = "%s: tag %d is ignored: it lies elsewhere than in the other photos, or is half hidden"
+    log.warning(text, sighting.name, tag)
     return replace(sighting, marks={t: mark for t, mark in sighting.marks.items() if t != tag})
 
 
-def off_by(error: float, usual: float) -> str:
+def reprojection_message(error: float, usual: float) -> str:
     """The reason for leaving out a photo."""
-    return f"its tag is {error:.1f} pixels off, where {usual:.2f} are usual"
+    return f"reprojection error {error:.1f} pixels (median {usual:.2f} pixels)"
 
 
 def _fit(folder: Path, lens: Lens, used: list[Sighting], layout: dict[int, Pose] | None) -> Solved:
@@ -182,11 +188,11 @@ def _fit(folder: Path, lens: Lens, used: list[Sighting], layout: dict[int, Pose]
         lens = solved.lens
     assert solved is not None  # ROUNDS is at least 1
     models = [free for needed, free in MODELS if len(solved.placed) >= needed]
-    refined = settle(solved.refined.bundle, models, solved.fixed)
+    refined = select_model(solved.refined.bundle, models, solved.fixed)
     return packed(refined, list(solved.tags), solved.placed, solved.fixed)
 
 
-def _tilt(used: Sequence[Sighting]) -> float:
+def _max_tilt(used: Sequence[Sighting]) -> float:
     """The largest angle from the frontal view, by foreshortening: a frontal square stays a square at any focal length. Each
     photo is judged by its mark nearest to the middle, where distortion is least."""
     angles = []

@@ -3,7 +3,7 @@
 A flat tag seen nearly from the front has two poses of about the same reprojection error, and noise decides between them. But
 photos are taken one after the other, and the directions they look from change little between neighbours. The states are cells
 of a grid of viewing directions, the observations the reprojection errors from there, and a transition is a Gaussian blur of the
-grid, whose width is that of most evidence: photos in no order get a wide one, and say nothing of each other.
+grid, whose width is that of most evidence: photos in no order would need a wide one, and keep their best pose each.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,9 @@ MAX_RADIUS_RAD = 2.4
 """Largest half side of the grid: 100 degrees from its middle on the sphere."""
 MARGIN_RAD = np.radians(10.0)
 """Around the directions of all hypotheses."""
-STEPS_RAD = np.radians([1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 25.0])
-"""Standard deviations of the change of direction between photos, by axis, among which the evidence chooses."""
+STEPS_RAD = np.radians([1.0, 1.5, 2.0, 3.0, 4.5, 7.0])
+"""Standard deviations of the change of direction between photos, by axis, among which the evidence chooses. The last one, and
+whatever is wider, means that the photos are in no order."""
 SMOOTHING_PHOTOS = 1.0
 """Standard deviation of the average over photos from which the drift is taken."""
 JUMP_PROBABILITY = 0.01
@@ -67,10 +68,12 @@ def resolve_flips(
         # The middle of a cell may be farther from a sharp minimum than the noise allows.
         np.minimum.at(squares, chart.cells(place), [h.squares for h in options])
         likelihoods.append(np.exp((squares.min() - squares) / (2 * variance)).reshape(chart.side, chart.side))
-    means = _posterior_means(likelihoods, chart.axis, np.zeros((len(likelihoods) - 1, 2)))
+    means, _ = _posterior_means(likelihoods, chart.axis, np.zeros((len(likelihoods) - 1, 2)))
     # Photographers keep moving the way they move: from the first means it shows which way.
     drift = np.diff(gaussian_filter1d(means, SMOOTHING_PHOTOS, axis=0), axis=0)
-    means = _posterior_means(likelihoods, chart.axis, drift)
+    means, step = _posterior_means(likelihoods, chart.axis, drift)
+    if step == STEPS_RAD[-1]:
+        return [0] * len(hypotheses)
     return [int(np.linalg.norm(p - mean, axis=1).argmin()) for p, mean in zip(places, means, strict=True)]
 
 
@@ -149,9 +152,9 @@ def _squared_errors(
 
 def _posterior_means(
     likelihoods: Sequence[Float[np.ndarray, "S S"]], axis: Float[np.ndarray, "S"], drift: Float[np.ndarray, "N-1 2"]
-) -> Float[np.ndarray, "N 2"]:
-    """Mean direction of each photo given all photos, with the step width of most evidence (the forward-backward algorithm;
-    Rabiner 1989).
+) -> tuple[Float[np.ndarray, "N 2"], float]:
+    """Mean direction of each photo given all photos, with the step width of most evidence, and that width (the
+    forward-backward algorithm; Rabiner 1989).
 
     Args:
         likelihoods: of each cell, by photo.
@@ -179,4 +182,4 @@ def _posterior_means(
         if i:
             backward = predict(backward * likelihoods[i], step, -drift[i - 1])
             backward /= backward.sum()
-    return means
+    return means, float(step)

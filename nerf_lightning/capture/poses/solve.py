@@ -73,7 +73,7 @@ def _consensus(photos: list[list[Pose]]) -> tuple[Pose, int]:
     return poses[best], int(count[best])
 
 
-def arrange(pairs: Mapping[tuple[int, int], tuple[Pose, int]], reference: int) -> dict[int, Pose]:
+def place_tags(pairs: Mapping[tuple[int, int], tuple[Pose, int]], reference: int) -> dict[int, Pose]:
     """Places all tags that are linked to the reference, starting with the links that most photos agree on.
 
     Returns:
@@ -111,7 +111,7 @@ def solve(
         return None
     # The smallest id among the most seen, so that the frame does not depend on the order of photos.
     reference = max(sorted(counts), key=counts.__getitem__)
-    tags = layout if layout is not None else arrange(relative_poses(alone), reference)
+    tags = layout if layout is not None else place_tags(relative_poses(alone), reference)
     options = {i: photo_poses(lens, photo, tags) for i, photo in enumerate(marks)}
     placed = [i for i, found in options.items() if found]
     if not placed:
@@ -129,10 +129,10 @@ def solve(
         np.zeros(len(numbers)),
     )
     fixed = frozenset(row.values()) if layout is not None else frozenset({row[reference]})
-    return packed(settle(bundle, [free_lens], fixed), numbers, placed, fixed)
+    return packed(select_model(bundle, [free_lens], fixed), numbers, placed, fixed)
 
 
-def settle(bundle: Bundle, models: Sequence[tuple[str, ...]], fixed: frozenset[int]) -> Refined:
+def select_model(bundle: Bundle, models: Sequence[tuple[str, ...]], fixed: frozenset[int]) -> Refined:
     """Refines with each lens model and takes the one of lowest BIC whose lens does not fold the picture; then the same with
     twisted tags.
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from nerf_lightning.capture.outcome import Outcome, thinned
+from nerf_lightning.capture.photo_status import PhotoStatus, subsample_photos
 from nerf_lightning.capture.tags.detect import THREADS
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.drawing.contact_sheet import GAP, contact_sheet
@@ -27,7 +27,7 @@ SHIFT = 4
 
 
 def annotated(
-    photo: UInt8[np.ndarray, "H W 3"], outcome: Outcome, width: int, height: int
+    photo: UInt8[np.ndarray, "H W 3"], status: PhotoStatus, width: int, height: int
 ) -> UInt8[np.ndarray, "h w 3"]:
     """A photo (sRGB, upright, at full size) scaled to fit into a box of `width` x `height` pixels: its tags are outlined with
     their ids, and a cross shows where each corner projects to."""
@@ -40,12 +40,12 @@ def annotated(
     def drawn(pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
         return pixels * stretch - 0.5  # OpenCV puts pixel centres at integers
 
-    for tag, mark in outcome.marks.items():
+    for tag, mark in status.marks.items():
         outline = cv2.convexHull(drawn(mark.pixels).astype(np.float32)).reshape(-1, 2)
         _lines(small, [outline], True, rgb(ORANGE), 2)
         _label(small, str(tag), outline.mean(0), float(np.sqrt(cv2.contourArea(outline))))
-    for tag, residuals in outcome.residuals.items():
-        for place in drawn(outcome.marks[tag].pixels + residuals):
+    for tag, residuals in status.residuals.items():
+        for place in drawn(status.marks[tag].pixels + residuals):
             _lines(small, [place + [[-5, 0], [5, 0]], place + [[0, -5], [0, 5]]], False, rgb(SKY), 1)
     return small
 
@@ -72,34 +72,34 @@ def _label(image: UInt8[np.ndarray, "H W 3"], text: str, middle: Float[np.ndarra
         cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, ink, wide, cv2.LINE_AA)
 
 
-def heading(title: str, outcomes: Sequence[Outcome], shown: Sequence[Outcome]) -> str:
+def heading(title: str, statuses: Sequence[PhotoStatus], shown: Sequence[PhotoStatus]) -> str:
     """The line above a folder's photos."""
-    left_out = sum(bool(o.reason) for o in outcomes)
-    text = f"{title}: {len(outcomes)} photos, {left_out or 'none'} left out"
-    return text if len(shown) == len(outcomes) else f"{text}; {len(shown)} evenly chosen ones are shown"
+    left_out = sum(bool(o.reason) for o in statuses)
+    text = f"{title}: {len(statuses)} photos, {left_out or 'none'} left out"
+    return text if len(shown) == len(statuses) else f"{text}; {len(shown)} evenly chosen ones are shown"
 
 
-def tag_sheet(folders: Mapping[str, Sequence[Outcome]], aspect: float) -> UInt8[np.ndarray, "H W 3"]:
+def tag_sheet(folders: Mapping[str, Sequence[PhotoStatus]], aspect: float) -> UInt8[np.ndarray, "H W 3"]:
     """The photos of each folder, one folder below the other; an even choice where there are many.
 
     Args:
-        folders: their outcomes, by title.
+        folders: their statuses, by title.
         aspect: width / height of most photos.
     """
     sheets: list[UInt8[np.ndarray, "H W 3"]] = []
-    for title, outcomes in folders.items():
-        shown = thinned(outcomes, MOST)
+    for title, statuses in folders.items():
+        shown = subsample_photos(statuses, MOST)
         columns = min(6, max(3, ceil(sqrt(1.5 * len(shown)))))
         width = (WIDTH - GAP) // columns - GAP
         with ThreadPoolExecutor(THREADS) as pool:
             small = list(pool.map(partial(_thumbnail, width=width, height=round(width / aspect)), shown))
-        text = heading(title, outcomes, shown) if sheets else f"{KEY}\n{heading(title, outcomes, shown)}"
-        left_out = [i for i, outcome in enumerate(shown) if outcome.reason]
-        captions = [outcome.caption for outcome in shown]
+        text = heading(title, statuses, shown) if sheets else f"{KEY}\n{heading(title, statuses, shown)}"
+        left_out = [i for i, status in enumerate(shown) if status.reason]
+        captions = [status.caption for status in shown]
         sheets.append(contact_sheet(small, captions, columns, WIDTH, left_out, text, TEXT_PX))
     return np.concatenate(sheets)
 
 
-def _thumbnail(outcome: Outcome, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-    photo = np.ascontiguousarray(read_pixels(outcome.path, upright=True)[..., :3])
-    return annotated(photo, outcome, width, height)
+def _thumbnail(status: PhotoStatus, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+    photo = np.ascontiguousarray(read_pixels(status.path, upright=True)[..., :3])
+    return annotated(photo, status, width, height)

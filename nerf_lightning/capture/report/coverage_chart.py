@@ -11,7 +11,7 @@ from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS, lens_vector
 from nerf_lightning.capture.poses.calibrate import Calibration
 from nerf_lightning.capture.poses.geometry import project
 from nerf_lightning.dataset.lens import Lens
-from nerf_lightning.drawing.ink import BLUE, DPI, GREY, SKY, as_picture, magnification
+from nerf_lightning.drawing.ink import BLUE, DPI, SKY, as_picture
 
 UNITS = {"focal": "px", "cx": "px", "cy": "px"}
 
@@ -31,12 +31,12 @@ def coverage_chart(found: Calibration) -> Figure:
     left.set_title(
         f"{len(corners)} corners in {len(found.used)} photos; their hull covers {found.coverage:.0%} of the picture"
     )
-    _distortion(figure, right, lens)
-    figure.supxlabel(parameters(found), fontsize=12)
+    _draw_distortion(figure, right, lens)
+    figure.supxlabel(describe_lens(found), fontsize=12)
     return figure
 
 
-def parameters(found: Calibration) -> str:
+def describe_lens(found: Calibration) -> str:
     """The lens in numbers, each with its standard deviation if it was set free."""
     values = dict(zip(LENS_PARAMETERS, lens_vector(found.lens), strict=True))
     free = []
@@ -53,23 +53,15 @@ def displacement(lens: Lens, pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarr
     return project(lens, np.eye(4), np.column_stack([rays, np.ones(len(rays))])) - pixels
 
 
-def _distortion(figure: Figure, axes: Axes, lens: Lens) -> None:
-    """A straight grid, and how the lens bends it."""
+def _draw_distortion(figure: Figure, axes: Axes, lens: Lens) -> None:
+    """How far, and in which direction, the lens moves points."""
     as_picture(axes, lens.width, lens.height)
     x, y = np.meshgrid(np.linspace(0, lens.width, 97), np.linspace(0, lens.height, 73))
     moved = displacement(lens, np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(*x.shape, 2)
     lengths = np.linalg.norm(moved, axis=-1)
     largest = float(lengths.max())
-    larger = magnification(largest, 0.04 * max(lens.width, lens.height))
-    shades = axes.pcolormesh(
-        x, y, lengths, cmap="cividis", vmin=0, vmax=max(largest, 1e-3), shading="gouraud", alpha=0.55
-    )
+    shades = axes.pcolormesh(x, y, lengths, cmap="cividis", vmin=0, vmax=max(largest, 1e-3), shading="gouraud")
     figure.colorbar(shades, ax=axes, label="displacement by the lens, pixels", shrink=0.8)
-    bent_x, bent_y = x + larger * moved[..., 0], y + larger * moved[..., 1]
-    for lines_x, lines_y, style in ((x, y, {"color": GREY, "linewidth": 0.7}), (bent_x, bent_y, {"color": "black"})):
-        axes.plot(lines_x[::9].T, lines_y[::9].T, **style)
-        axes.plot(lines_x[:, ::8], lines_y[:, ::8], **style)
-    axes.set_title(
-        f"distortion moves points by up to {largest:.1f} pixels; black: a straight grid (grey)\nas the lens bends it"
-        + (f", {larger:g} times as much" if larger > 1 else "")
-    )
+    some = np.s_[4::8, 4::8]
+    axes.quiver(x[some], y[some], moved[some][..., 0], moved[some][..., 1], angles="xy", color="white", width=0.002)
+    axes.set_title(f"distortion moves points by up to {largest:.1f} pixels")

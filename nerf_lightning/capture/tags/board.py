@@ -28,7 +28,7 @@ class Board:
     def __post_init__(self) -> None:
         for key, squares in (("columns", self.columns), ("rows", self.rows)):
             if squares < 3:
-                raise InputError("config", f"tags.board.{key}", str(squares), "at least 3 squares")
+                raise InputError("capture", f"board_{key}", str(squares), "at least 3 squares")
 
 
 def board_detector(dictionary: str, size: float, board: Board) -> Detector:
@@ -44,12 +44,12 @@ def board_detector(dictionary: str, size: float, board: Board) -> Detector:
         InputError: tags that do not fit into the squares, or more white squares than the family has tags.
     """
     if not size < board.square:
-        raise InputError("config", "tags.board.square", f"{board.square:g}", f"more than tags.size, which is {size:g}")
+        raise InputError("capture", "board_square", f"{board.square:g}", f"more than tag_size, which is {size:g}")
     patterns = family(dictionary)
     white = board.columns * board.rows // 2
     if white > len(patterns.bytesList):
         found = f"{board.columns} x {board.rows}, which takes {white} tags"
-        raise InputError("config", "tags.board", found, f"at most the {len(patterns.bytesList)} of {dictionary}")
+        raise InputError("capture", "board_columns", found, f"at most the {len(patterns.bytesList)} of {dictionary}")
     detectors = []
     for legacy in (False, True):  # boards made before OpenCV 4.6 may begin with a white square
         made = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, size, patterns)

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from nerf_lightning.capture.photos import spread
 from nerf_lightning.capture.tags.layout import SQUARE
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.text import subsample
 
 COMMON = (
     "DICT_4X4_50",
@@ -73,7 +73,7 @@ def family(name: str) -> "cv2.aruco.Dictionary":
     """
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if number is None:
-        raise InputError("config", "tags.dictionary", name, f"auto, or a name such as {', '.join(COMMON[:4])}")
+        raise InputError("capture", "dictionary", name, f"auto, or a name such as {', '.join(COMMON[:4])}")
     return cv2.aruco.getPredefinedDictionary(number)
 
 
@@ -113,7 +113,7 @@ def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
     return cv2.cvtColor(read_pixels(path, upright=True)[..., :3], cv2.COLOR_RGB2GRAY)
 
 
-def sight(paths: Sequence[Path], detector: Detector) -> list[Sighting]:
+def detect_in_photos(paths: Sequence[Path], detector: Detector) -> list[Sighting]:
     """Looks for marks in photos, in the order given."""
 
     def look(path: Path) -> Sighting:
@@ -130,7 +130,7 @@ def guess_family(paths: Sequence[Path], photos: int = 4) -> str:
     Raises:
         InputError: where none of the common families is found.
     """
-    chosen = spread(paths, photos)
+    chosen = [paths[i] for i in subsample(len(paths), photos)]
     small = []
     for path in chosen:
         grey = read_grey(path)
@@ -150,6 +150,6 @@ def guess_family(paths: Sequence[Path], photos: int = 4) -> str:
             "",
             f"no tag of a common family in {len(chosen)} of {len(paths)} photos",
             "sharp photos of printed ArUco tags with a white rim",
-            "name the family with tags.dictionary=DICT_... if it is an unusual one",
+            "name the family with dictionary if it is an unusual one",
         )
     return best

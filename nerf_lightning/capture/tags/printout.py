@@ -27,7 +27,7 @@ def write_page(layout: TagLayout, file: Path) -> None:
         InputError: the file is no PDF, or the tags do not fit on the page.
     """
     if file.suffix.lower() != ".pdf":
-        raise InputError("config", "print", str(file), "a file name that ends in .pdf")
+        raise InputError("print-tags", "sheet", str(file), "a file name that ends in .pdf")
     figure = page(layout)
     with atomic(file) as temporary:
         FigureCanvasPdf(figure).print_pdf(temporary)
@@ -42,13 +42,13 @@ def page(layout: TagLayout) -> Figure:
     patterns = family(layout.dictionary)
     if (last := max(layout.poses)) >= len(patterns.bytesList):
         expected = f"one of the {len(patterns.bytesList)} tags of {layout.dictionary}"
-        raise InputError("config", "tags.layout", f"tag {last}", expected, "name a larger family with tags.dictionary")
+        raise InputError("print-tags", "layout", f"tag {last}", expected, "name a larger family with dictionary")
     corners = np.concatenate([layout.corners(tag)[:, :2] for tag in layout.poses])
     low, high = corners.min(0), corners.max(0)
     rim = layout.size / 6
     if (high - low + 2 * rim > A4).any():
         found = f"{1000 * (high - low)[0]:.0f} x {1000 * (high - low)[1]:.0f} mm of tags"
-        raise InputError("config", "tags.size", found, "no more than an A4 page with a white rim holds", "give less")
+        raise InputError("print-tags", "tag_size", found, "no more than an A4 page with a white rim holds", "give less")
     figure = Figure(figsize=(A4[0] / INCH, A4[1] / INCH))
     axes = figure.add_axes((0, 0, 1, 1))
     centre = (low + high) / 2

@@ -1,22 +1,17 @@
-"""Checks that all loaders share. Each raises InputError: one line that a user can act on.
-
-Files come from strangers: nothing here unpickles or evaluates anything.
-"""
+"""Checks that all loaders share. Each raises InputError: one line that a user can act on."""
 
 import logging
-import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-import torch
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, Shaped
 
-from nerf_lightning.cameras import axes_meet, focus_point
+from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.memory import check_memory
-from nerf_lightning.utils.parsing import Header, read_json
+from nerf_lightning.utils.parsing import read_json
 
 log = logging.getLogger(__name__)
 
@@ -24,17 +19,15 @@ PIXEL_BYTES = 20
 """Memory for a pixel of a rendered view: colour, depth and opacity as floats."""
 RIGID_TOLERANCE = 1e-3
 """How far R^T R may stand from the identity, entry by entry; files that print six digits stay well below."""
-
 FARTHEST, NEAREST = 1e12, 1e-12
 """Largest coordinate, and smallest distance of cameras from what they look at, in a file's unit: single precision holds the
 cubes of these lengths, which a similarity's scale is taken from, and no more."""
 PIXELS = 2.0**23
-"""Largest focal length, and largest place on a sensor, pixels. Directions have length 1 and a pixel is 1 / focal length wide:
-single precision cannot tell the directions of two pixels beyond, nor their places."""
+"""Largest focal length, and largest place on a sensor, pixels: single precision cannot tell two pixels apart beyond."""
 STEP = 2.0**-23
 """Between neighbouring numbers of single precision, as a share of them."""
-ROUNDING = 1e-13
-"""Cameras nearer than this share of their coordinates stand on one spot, but for the rounding of double precision."""
+MIN_OTHER_SIZE, MAX_ASPECT_ERROR = 1.8, 0.25
+"""Least ratio of a principal point to the middle, along both axes alike, that tells of photos of another size."""
 
 
 def json_object(path: Path) -> dict:
@@ -73,205 +66,88 @@ def positive(where: object, key: str, value: object, unit: str = "pixels") -> fl
     return value
 
 
-def focal_length(where: object, key: str, value: float, side: float) -> float:
-    """Pixels, of a photo with that many along this side: directions of its pixels must differ, the outermost still point ahead.
-
-    Raises:
-        InputError: where single precision could not hold that.
-    """
-    least = side / PIXELS
-    if not least <= value <= PIXELS:
-        expected = f"a focal length of {least:.2g} to {PIXELS:.0f} pixels"
-        raise InputError(where, key, f"{value:g}", expected, "is it in pixels?")
-    return value
-
-
-def field_of_view(where: object, key: str, angle: float, side: int, fisheye: bool = False) -> float:
-    """The focal length in pixels of a photo that shows this angle, radians, along a side."""
-    if not 0 < angle < math.pi:
-        raise InputError(where, key, f"{angle:g}", "radians between 0 and pi")
-    wide = angle if fisheye else 2 * math.tan(0.5 * angle)
-    if not side / PIXELS <= wide <= PIXELS:
-        raise InputError(where, key, f"{angle:g}", "the angle that a photo shows, in radians")
-    return side / wide
-
-
-def sensor(where: object, key: str, place: float) -> float:
-    """A place on the sensor, or a skew, in pixels: whole ones must differ."""
-    if not abs(place) <= PIXELS:
-        raise InputError(where, key, f"{place:g}", f"at most {PIXELS:.0f} pixels from the photo's corner")
-    return place
-
-
-def principal_point(where: object, key: str, cx: float, cy: float, width: float, height: float) -> None:
-    """Refuses a principal point that is the middle of photos of another size.
-
-    Raises:
-        InputError: it lies as many times farther than the middle along both axes.
-    """
-    across, down = 2 * cx / width, 2 * cy / height
-    if min(across, down) > 1.8 and abs(across / down - 1) < 0.25:
-        found = f"{cx:g}, {cy:g}, the middle of photos {across:.3g} times as large as these, of {width:g}x{height:g}"
-        raise InputError(where, key, found, "intrinsics of these photos", "give w and h of the photos they belong to")
-
-
 def numeric(where: object, key: str, array: Shaped[np.ndarray, "..."], shape: str) -> Float[np.ndarray, "..."]:
     """The array as float64; `shape` is what it must have, like "4 4"."""
-    wanted = f"numbers of shape ({', '.join(shape.split())})"
-    if list(array.shape) != [int(size) for size in shape.split()]:
-        raise InputError(where, key, f"shape {array.shape}", wanted)
-    if array.dtype.kind not in "iuf":
-        raise InputError(where, key, f"dtype {array.dtype}", wanted)
+    wanted = f"finite numbers of shape ({', '.join(shape.split())})"
+    if list(array.shape) != [int(size) for size in shape.split()] or array.dtype.kind not in "iuf":
+        raise InputError(where, key, f"shape {array.shape}, {array.dtype}", wanted)
     array = array.astype(np.float64)
     if not np.isfinite(array).all():
-        raise InputError(where, key, "nan or infinity", f"finite {wanted}")
+        raise InputError(where, key, "nan or infinity", wanted)
     return array
 
 
-def pose_array(where: object, key: str, array: Header | np.ndarray) -> None:
-    """Whether an array can be poses, by its shape and type."""
-    if len(array.shape) != 3 or array.shape[1:] != (4, 4) or array.dtype.kind not in "iuf":
-        found = f"shape {array.shape}, {array.dtype}"
-        raise InputError(where, key, found, "camera-to-world matrices of shape (V, 4, 4)")
+def matrix(where: object, key: str, rows: object) -> Float[np.ndarray, "4 4"]:
+    """A matrix of a JSON file, of 3 or 4 rows of 4 numbers; the fourth row is 0 0 0 1 if absent."""
+    try:
+        found = np.array(rows, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise InputError(where, key, f"no matrix ({error})", "4 rows of 4 numbers") from error
+    if found.shape not in ((4, 4), (3, 4)):
+        raise InputError(where, key, f"shape {found.shape}", "4 rows of 4 numbers")
+    return found if len(found) == 4 else np.concatenate([found, [[0.0, 0.0, 0.0, 1.0]]])
 
 
+@np.errstate(all="ignore")
 def rigid_poses(where: object, label: str, poses: Shaped[np.ndarray, "V ..."]) -> Float[np.ndarray, "V 4 4"]:
     """Camera-to-world matrices [R t; 0 1] with R a rotation. `label` names pose i in messages: "c2ws_train[{}]".
 
     A uniform scale in the rotations is divided out; a line says so.
     """
-    pose_array(where, label.replace("[{}]", ""), poses)
-    scales = [uniform_scale(pose) for pose in poses.astype(np.float64)]
-    if scaled := [scale for scale in scales if abs(scale - 1) > RIGID_TOLERANCE]:
+    expected = "camera-to-world matrices [R t; 0 0 0 1] with R a rotation"
+    if poses.shape[1:] != (4, 4) or poses.dtype.kind not in "iuf":
+        found = f"shape {poses.shape}, {poses.dtype}"
+        raise InputError(where, label.replace("[{}]", ""), found, f"{expected}, of shape (V, 4, 4)")
+    poses = poses.astype(np.float64)
+    lengths = np.linalg.norm(poses[:, :3, :3], axis=1)
+    scale = lengths.mean(1)
+    is_uniform = (scale > NEAREST) & (scale < FARTHEST) & (np.ptp(lengths, axis=1) <= RIGID_TOLERANCE * scale)
+    scaled = is_uniform & (np.abs(scale - 1) > RIGID_TOLERANCE)
+    if scaled.any():
         text = "%s: %d of %d rotations carry a uniform scale, such as %.4g: divided out, camera positions stay"
-        log.warning(text, where, len(scaled), len(scales), scaled[0])
-    return np.stack([rigid_pose(where, label.format(i), pose) for i, pose in enumerate(poses.astype(np.float64))])
+        log.warning(text, where, scaled.sum(), len(poses), scale[scaled.argmax()])
+        poses[scaled, :3, :3] /= scale[scaled, None, None]
+    error = off_rotation(poses[:, :3, :3])
+    far = np.abs(poses[:, :3, 3]).max(1)
+    for wrong, found, todo in (
+        (~np.isfinite(poses).all((1, 2)), "nan or infinity", "leave out views without a pose"),
+        (
+            np.abs(poses[:, 3] - [0, 0, 0, 1]).max(1) > RIGID_TOLERANCE,
+            "another bottom row",
+            "is the matrix transposed?",
+        ),
+        (~(error <= RIGID_TOLERANCE), "no rotation (R^T R is not 1)", "export poses without shear and scale"),
+        (np.linalg.det(poses[:, :3, :3]) < 0, "a mirror (det R = -1)", "is the handedness of the axes right?"),
+        (far > FARTHEST, f"a camera at {far.max():.3g}", f"leave it out: coordinates are at most {FARTHEST:g}"),
+    ):
+        if wrong.any():
+            raise InputError(where, label.format(int(wrong.argmax())), found, expected, todo)
+    return poses
 
 
-@np.errstate(over="ignore", invalid="ignore")
-def uniform_scale(pose: Float[np.ndarray, "4 4"]) -> float:
-    """The factor by which all columns of a pose's rotation are longer than 1; 1 where they are not of one length."""
-    lengths = np.linalg.norm(pose[:3, :3], axis=0)
-    mean = float(lengths.mean())
-    is_uniform = math.isfinite(mean) and NEAREST < mean < FARTHEST and np.ptp(lengths) <= RIGID_TOLERANCE * mean
-    return mean if is_uniform else 1.0
+@np.errstate(all="ignore")
+def off_rotation(matrices: Float[np.ndarray, "V 3 3"]) -> Float[np.ndarray, "V"]:
+    """How far R^T R stands from the identity, entry by entry; not a number where it is too large to say."""
+    return np.abs(matrices.swapaxes(-1, -2) @ matrices - np.eye(3)).max((-2, -1))
 
 
-@np.errstate(over="ignore")
-def rigid_pose(where: object, key: str, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """One camera-to-world matrix, likewise; without a line."""
-    expected = "a finite camera-to-world matrix [R t; 0 0 0 1] with R a rotation"
-    found = todo = ""
-    if np.isfinite(pose).all() and abs((scale := uniform_scale(pose)) - 1) > RIGID_TOLERANCE:
-        pose = np.concatenate([pose[:, :3] / scale, pose[:, 3:]], axis=1)
-    if not np.isfinite(pose).all():
-        found, todo = "nan or infinity", "leave out views without a pose"
-    elif not np.allclose(pose[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE):
-        found, todo = f"bottom row {rounded(pose[3])}", "the matrix may be transposed"
-    elif (error := off_rotation(pose[:3, :3])) > RIGID_TOLERANCE:
-        found = f"R^T R that is {error:.2g} away from the identity"
-        todo = "the rotation may carry a shear or a scale of its own for each axis: export poses without it"
-    elif np.linalg.det(pose[:3, :3]) < 0:
-        found, todo = "a mirror (det R = -1)", "the handedness of the axes may be wrong"
-    elif (far := np.abs(pose[:3, 3]).max()) > FARTHEST:
-        found, expected = f"a camera at {far:.3g}", f"coordinates of at most {FARTHEST:g}"
-        todo = "leave it out, or take a larger unit"
-    if found:
-        raise InputError(where, key, found, expected, todo)
-    return pose
-
-
-def off_rotation(matrix: Float[np.ndarray, "3 3"]) -> float:
-    """How far R^T R stands from the identity; a column's length says it where squares would be infinite."""
-    longest = np.abs(matrix).max()
-    return float(longest if longest > 1e6 else np.abs(matrix.T @ matrix - np.eye(3)).max())
-
-
-def told_apart(where: object, c2w: Float[np.ndarray, "V 4 4"]) -> None:
-    """Checks that cameras' distance from what they look at is one that single precision can hold.
-
-    Args:
-        where: the file.
-        c2w: of cameras, in its frame.
-
-    Raises:
-        InputError: it is not; in any frame whose origin is the subject.
-    """
-    distance = measure_distance(c2w)
-    if distance is not None and not NEAREST <= distance <= FARTHEST:
-        found, expected = f"cameras {distance:.3g} from what they look at", f"a distance of {NEAREST:g} to {FARTHEST:g}"
-        raise InputError(where, "poses", found, expected, "take another unit")
-
-
-def is_precise(c2w: Float[np.ndarray, "V 4 4"], focal: Float[np.ndarray, "V"]) -> bool:
-    """Whether single precision tells apart what pixels show in the file's own frame, far from whose origin the subject may be.
-
-    Args:
-        c2w: of cameras, in the file's frame.
-        focal: their focal lengths, pixels.
-    """
-    distance, far = measure_distance(c2w), float(np.abs(c2w[:, :3, 3]).max())
-    return distance is None or (NEAREST <= distance <= FARTHEST and far * STEP <= distance / float(np.median(focal)))
-
-
-def measure_distance(c2w: Float[np.ndarray, "V 4 4"]) -> float | None:
-    """Median distance of cameras from where their axes meet; None where nothing says how far the subject is."""
-    if len(c2w) < 3:
-        return None
-    poses, places = torch.from_numpy(c2w), c2w[:, :3, 3]
-    if np.ptp(places, axis=0).max() <= ROUNDING * np.abs(places).max() or not axes_meet(poses):
-        return None  # a fly-through or a panorama
-    return float((poses[:, :3, 3] - focus_point(poses)).abs().amax(1).median())
-
-
+@np.errstate(all="ignore")
 def similarity(where: object, key: str, matrix: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "4 4"]:
     """[s R t; 0 1] with R a rotation and s a positive scale."""
     matrix = numeric(where, key, matrix, "4 4")
-    expected = "a similarity [s R t; 0 0 0 1]: a rotation times a scale, and a shift"
-    turn = np.clip(matrix[:3, :3], -2 * FARTHEST, 2 * FARTHEST)
+    turn = matrix[:3, :3]
     scale = float(np.linalg.norm(turn, axis=0).mean())
-    if not NEAREST <= scale <= FARTHEST or np.abs(matrix[:3, 3]).max() > FARTHEST:
-        found, expected = "a scale or a shift that no file's unit has", f"{expected} of at most {FARTHEST:g}"
-    elif np.linalg.det(turn / scale) <= 0 or off_rotation(turn / scale) > RIGID_TOLERANCE:
-        found = rounded(turn)
-    elif not np.allclose(matrix[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE):
-        found = f"bottom row {rounded(matrix[3])}"
-    else:
-        return matrix
-    raise InputError(where, key, found, expected, "leave it out, and the frame is the file's own")
-
-
-def colour(where: object, key: str, value: Shaped[np.ndarray, "..."]) -> tuple[float, float, float]:
-    """sRGB in [0, 1]."""
-    red, green, blue = numeric(where, key, value, "3").tolist()
-    if not all(0 <= part <= 1 for part in (red, green, blue)):
-        raise InputError(where, key, str([red, green, blue]), "three numbers from 0 to 1")
-    return red, green, blue
-
-
-def image_array(where: object, key: str, array: Header) -> None:
-    """Whether an array can be images, by its shape and type."""
-    if len(array.shape) != 4 or array.shape[3] not in (3, 4) or 0 in array.shape[1:3]:
-        raise InputError(where, key, f"shape {array.shape}", "images of shape (V, H, W, 3 or 4)")
-    if array.dtype != np.uint8 and array.dtype.kind != "f":
-        raise InputError(where, key, f"dtype {array.dtype}", "uint8, or floats in [0, 1]")
-
-
-def uint8_images(where: object, key: str, images: Shaped[np.ndarray, "V H W C"]) -> UInt8[np.ndarray, "V H W C"]:
-    """Images as uint8; floats in [0, 1] are scaled and rounded."""
-    if images.dtype == np.uint8:
-        return images
-    if images.size and not (images.min() >= 0 and images.max() <= 1):  # false for nan too
-        raise InputError(where, key, f"floats from {images.min():g} to {images.max():g}", "uint8, or floats in [0, 1]")
-    return np.rint(images * 255).astype(np.uint8)
-
-
-def image_size(where: object, key: str, found_size: tuple[int, ...], size: tuple[int, ...]) -> None:
-    """All images of a scene share one (H, W, C)."""
-    if found_size != size:
-        found = "{1}x{0} with {2} channels".format(*found_size)
-        wanted = "{1}x{0} with {2} channels".format(*size)
-        raise InputError(where, key, found, f"{wanted}, as in the first image", "bring all images to one size")
+    is_similarity = (
+        NEAREST <= scale <= FARTHEST
+        and np.abs(matrix[:3, 3]).max() <= FARTHEST
+        and np.linalg.det(turn / scale) > 0
+        and off_rotation(turn[None] / scale)[0] <= RIGID_TOLERANCE
+        and np.allclose(matrix[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE)
+    )
+    if not is_similarity:
+        expected = f"a similarity [s R t; 0 0 0 1]: a rotation times a scale, and a shift, of at most {FARTHEST:g}"
+        raise InputError(where, key, str(matrix.tolist()), expected, "leave it out: the frame is the file's own")
+    return matrix
 
 
 def split_size(where: object, key: str, count: int, poses: int | None = None) -> None:
@@ -282,9 +158,41 @@ def split_size(where: object, key: str, count: int, poses: int | None = None) ->
         raise InputError(where, key, f"{count} images for {poses} poses", "one pose for each image")
 
 
-def rounded(found: np.ndarray) -> str:
-    """Numbers for a message, in four decimals. NumPy's own rounding multiplies, and makes infinities of large ones."""
-    return str(np.vectorize(lambda number: round(number, 4), otypes=[object])(found.astype(object)).tolist())
+def focal_length(where: object, key: str, value: float, side: float) -> float:
+    """Pixels, of a photo with that many along this side: directions of its pixels must differ, the outermost point ahead."""
+    if not side / PIXELS <= value <= PIXELS:
+        expected = f"a focal length of {side / PIXELS:.2g} to {PIXELS:.0f} pixels"
+        raise InputError(where, key, f"{value:g}", expected, "is it in pixels?")
+    return value
+
+
+def check_optics(where: object, key: str, optics: Optics) -> Optics:
+    """The optics, if a camera can have them.
+
+    Raises:
+        InputError: a size, focal length, principal point or distortion that no camera has, or a principal point that is the
+            middle of photos of another size.
+    """
+    o = optics
+    if not (1 <= o.width <= PIXELS and 1 <= o.height <= PIXELS):
+        raise InputError(where, key, f"{o.width:g}x{o.height:g} pixels", "the size of a photo")
+    for focal, side in ((o.fx, o.width), (o.fy, o.height)):
+        focal_length(where, key, focal, side)
+    check_principal_point(where, key, o.cx, o.cy, o.width, o.height)
+    if not o.sees_every_pixel():
+        found = ", ".join(f"{name}={value:g}" for name, value in o.distortion._asdict().items() if value)
+        raise InputError(where, key, f"a distortion that folds the photo over ({found})", "that of a real lens")
+    return optics
+
+
+def check_principal_point(where: object, key: str, cx: float, cy: float, width: float, height: float) -> None:
+    """Refuses one that is beyond any sensor, or the middle of photos of another size: as far off along both axes."""
+    if not max(abs(cx), abs(cy)) <= PIXELS:
+        raise InputError(where, key, f"{cx:g}, {cy:g}", f"a principal point of at most {PIXELS:.0f} pixels")
+    across, down = 2 * cx / width, 2 * cy / height
+    if min(across, down) > MIN_OTHER_SIZE and abs(across / down - 1) < MAX_ASPECT_ERROR:
+        found = f"{cx:g}, {cy:g}, the middle of photos {across:.3g} times as large as these, of {width:g}x{height:g}"
+        raise InputError(where, key, found, "intrinsics of these photos", "give w and h of the photos they belong to")
 
 
 def intrinsics(
@@ -293,11 +201,11 @@ def intrinsics(
     K = numeric(where, key, K, "3 3")
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
         expected = "[[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels with fx, fy > 0"
-        raise InputError(where, key, rounded(K), expected)
-    for side, (row, focal) in zip((width, height), ((0, K[0, 0]), (1, K[1, 1])), strict=True):
-        focal_length(where, f"{key}[{row}][{row}]", float(focal), side)
-        for column in range(row + 1, 3):
-            sensor(where, f"{key}[{row}][{column}]", float(K[row, column]))
+        raise InputError(where, key, str(K.tolist()), expected)
+    for focal, side in ((K[0, 0], width), (K[1, 1], height)):
+        focal_length(where, key, float(focal), side)
+    if not np.abs(K).max() <= PIXELS:
+        raise InputError(where, key, str(K.tolist()), f"skew and principal point of at most {PIXELS:.0f} pixels")
     return K
 
 
@@ -311,10 +219,10 @@ def near_far(where: object, near: float | None, far: float | None) -> None:
 
 def box(where: object, key: str, aabb: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "2 3"]:
     aabb = numeric(where, key, aabb, "2 3")
-    if np.abs(aabb).max() > FARTHEST:
-        raise InputError(where, key, f"a corner at {np.abs(aabb).max():.3g}", f"coordinates of at most {FARTHEST:g}")
-    if not (aabb[1] - aabb[0] > np.abs(aabb).max(0) * STEP + NEAREST).all():
-        raise InputError(where, key, rounded(aabb), "a lower corner below the upper one on each axis")
+    size = np.abs(aabb).max(0)
+    if size.max() > FARTHEST or not (aabb[1] - aabb[0] > size * STEP + NEAREST).all():
+        expected = f"a lower corner below the upper one on each axis, coordinates of at most {FARTHEST:g}"
+        raise InputError(where, key, str(aabb.tolist()), expected)
     return aabb
 
 

@@ -5,10 +5,7 @@ import os
 import re
 from pathlib import Path
 
-import numpy as np
-
-from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.formats.colmap_model import FILES, Image, Model, count_images, holds_model, read_model
+from nerf_lightning.dataset.formats.colmap_model import FILES, Image, count_images, holds_model, read_model
 from nerf_lightning.dataset.formats.names import ImageFinder, list_images, walk_images
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.orientation import OrientationChooser
@@ -17,6 +14,7 @@ from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
 from nerf_lightning.dataset.size import REDUCED
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.text import join_truncated
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +80,14 @@ def load_colmap(
         others = ", ".join(f"{other.name} ({count_images(other)})" for other in models[1:])
         log.warning("%s: the model with most photos (%d); others: %s", folder, count_images(folder), others)
     model = read_model(folder)
-    _check(folder, model)
+    if not model.images:
+        raise InputError(folder, "images", "0 photos", "at least one placed photo")
+    for image in model.images:
+        if image.camera not in model.cameras:
+            found = f"camera {image.camera} of {image.name}, which is not there"
+            raise InputError(folder, "images", found, "a camera of the model's cameras file")
+    if len({image.name for image in model.images}) < len(model.images):
+        raise InputError(folder, "images", "two photos of one name", "a name of its own for each")
     images = sorted(model.images, key=lambda image: image.name)
     root = find_photo_folder(folder, place, images) if photos is None else photos
     finder = ImageFinder(root)
@@ -95,7 +100,13 @@ def load_colmap(
         )
     finder.report(folder)
     if missing:
-        log.warning("%s: %d of %d photos are not there, %s: left out", root, len(missing), len(images), _named(missing))
+        log.warning(
+            "%s: %d of %d photos are not there, %s: left out",
+            root,
+            len(missing),
+            len(images),
+            join_truncated(missing, SHOWN),
+        )
     found_files = [(image, file) for image, file in zip(images, files, strict=True) if file is not None]
     report_unplaced(root, [file for _, file in found_files])
     scene_folder = root.parent if root.name in PHOTO_FOLDERS or REDUCED_NAME.match(root.name) else root
@@ -105,25 +116,10 @@ def load_colmap(
     for (image, file), mask in zip(found_files, masks, strict=True):
         optics = model.cameras[image.camera]
         turned = upright or orientation.choose(file, (optics.width, optics.height))[2]
-        c2w = checks.rigid_pose(folder, image.name, np.linalg.inv(image.w2c))
-        shots.append(Shot(image.name, file, c2w, optics, mask, turned))
+        shots.append(Shot(image.name, file, image.c2w, optics, mask, turned))
     orientation.report(folder)
     named = place if scene_folder.resolve().is_relative_to(place.resolve()) else scene_folder
     return build_scene(place, name or named.resolve().name, shots, reading, hints=Hints(points=model.points))
-
-
-def _check(folder: Path, model: Model) -> None:
-    """Each image has a camera that is there, and a name of its own."""
-    if not model.images:
-        raise InputError(folder, "images", "0 photos", "at least one placed photo")
-    names: set[str] = set()
-    for image in model.images:
-        if image.camera not in model.cameras:
-            found = f"camera {image.camera} of {image.name}, which is not there"
-            raise InputError(folder, "images", found, "a camera of the model's cameras file")
-        if image.name in names:
-            raise InputError(folder, "images", f"two photos named {image.name}", "a name of its own for each")
-        names.add(image.name)
 
 
 def find_photo_folder(model: Path, place: Path, images: list[Image]) -> Path:
@@ -149,8 +145,6 @@ def report_unplaced(root: Path, placed: list[Path]) -> None:
     left = sorted({file for folder in folders for file in list_images(folder)} - set(placed))
     if left:
         names = [file.relative_to(root).as_posix() for file in left]
-        log.warning("%s: %d photos have no place in the model, %s: left out", root, len(left), _named(names))
-
-
-def _named(names: list[str]) -> str:
-    return ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
+        log.warning(
+            "%s: %d photos have no place in the model, %s: left out", root, len(left), join_truncated(names, SHOWN)
+        )

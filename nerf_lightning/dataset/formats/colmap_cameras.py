@@ -20,17 +20,13 @@ def optics_of(where: object, key: str, name: str, width: int, height: int, p: tu
     Raises:
         InputError: sizes or numbers that no camera has.
     """
-    if not (0 < width < 10**6 and 0 < height < 10**6):
-        raise InputError(where, key, f"{width}x{height} pixels", "the size of a photo")
     one_focal = name in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_FISHEYE") or name.endswith(
         "RADIAL_FISHEYE"
     )
     fx, fy, cx, cy, *more = (p[0], *p) if one_focal else p
     projection = Projection.FISHEYE if "FISHEYE" in name else Projection.PERSPECTIVE
-    for focal, side, place in ((fx, width, cx), (fy, height, cy)):
-        checks.focal_length(where, key, focal, side)
-        checks.sensor(where, key, place)
     if name == "FOV":
+        checks.check_optics(where, key, Optics(width, height, fx, fy, cx, cy))
         found = field_of_view_lens(width, height, fx, fy, cx, cy, more[0])
         if found is None:
             raise InputError(where, key, f"FOV with {p}", "a field of view that the photo fits into")
@@ -46,8 +42,4 @@ def optics_of(where: object, key: str, name: str, width: int, height: int, p: tu
             distortion = distortion._replace(k3=rest[0], k4=rest[1], s1=rest[2], s2=rest[3])
     else:
         distortion = Distortion(*more)
-    optics = Optics(width, height, fx, fy, cx, cy, distortion, projection)
-    if not optics.sees_every_pixel():
-        found_text = f"{name} with {', '.join(f'{value:g}' for value in p)}"
-        raise InputError(where, key, found_text, "a distortion that does not fold the photo")
-    return optics
+    return checks.check_optics(where, key, Optics(width, height, fx, fy, cx, cy, distortion, projection))

@@ -16,18 +16,18 @@ FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIM
 EQUIRECTANGULAR = "EQUIRECTANGULAR"
 MAX_FOCAL_DISAGREEMENT = 0.02
 """Most relative difference of a focal length and an angle of view that say the same."""
+MIN_ANGLE = 1e-9
+"""Of view, radians."""
 
 
 def read_size(frame: Frame) -> tuple[int, int] | None:
     """Width and height in pixels that a file states for a camera, None where it states none."""
-    sides = [frame.number(key) for key in ("w", "h")]
-    if None in sides:
+    width, height = frame.number("w"), frame.number("h")
+    if width is None or height is None:
         return None
-    for key, side in zip(("w", "h"), sides, strict=True):
-        if not side or not 1 <= side <= checks.PIXELS:
-            raise InputError(frame.file, frame.name_key(key), f"{side:g}", "the pixels of a photo")
-    width, height = (max(1, round(side)) for side in sides if side)
-    return width, height
+    if not (1 <= width <= checks.PIXELS and 1 <= height <= checks.PIXELS):
+        raise InputError(frame.file, f"{frame.key}: w, h", f"{width:g}x{height:g}", "the pixels of a photo")
+    return round(width), round(height)
 
 
 def read_optics(frame: Frame, width: int, height: int) -> Optics:
@@ -47,33 +47,22 @@ def read_optics(frame: Frame, width: int, height: int) -> Optics:
         expected = f"one of {', '.join((*PERSPECTIVE, *FISHEYE, EQUIRECTANGULAR))}"
         raise InputError(file, name_key("camera_model"), repr(model)[:60], expected)
     fisheye = model in FISHEYE or bool(frame.get("is_fisheye"))
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2")
     for key in REFUSED if fisheye else (*REFUSED, "k4"):
         value = frame.get(key)
         if any(value) if isinstance(value, list) else value not in (None, False, 0, "0"):
-            expected = "at most k1, k2, k3, k4" if fisheye else "at most k1, k2, k3, p1, p2"
+            expected = f"at most {', '.join(names)}"
             raise InputError(file, name_key(key), repr(value)[:60], expected, "calibrate or export with these alone")
     found_x, found_y = read_focal(frame, "x", width, fisheye), read_focal(frame, "y", height, fisheye)
     fx, fy = found_x or found_y, found_y or found_x
     if fx is None or fy is None:
         found = f"no focal length among [{', '.join(sorted({**frame.content, **frame.entry}))}]"
         raise InputError(file, name_key("fl_x"), found, "fl_x in pixels or camera_angle_x in radians")
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2")
+    cx, cy = frame.number("cx"), frame.number("cy")
+    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
     distortion = Distortion(**{key: frame.number(key) or 0.0 for key in names})
-    cx, cy = read_place(frame, "cx", width), read_place(frame, "cy", height)
-    checks.principal_point(file, f"{name_key('cx')}, {name_key('cy')}", cx, cy, width, height)
-    optics = Optics(
-        width, height, fx, fy, cx, cy, distortion, Projection.FISHEYE if fisheye else Projection.PERSPECTIVE
-    )
-    if not optics.sees_every_pixel():
-        expected = "that of a real lens"
-        raise InputError(file, ", ".join(map(name_key, names)), "a distortion that folds the photo over", expected)
-    return optics
-
-
-def read_place(frame: Frame, key: str, side: int) -> float:
-    """The principal point along a side in pixels; the middle where the file does not state it."""
-    given = frame.number(key)
-    return side / 2 if given is None else checks.sensor(frame.file, frame.name_key(key), given)
+    projection = Projection.FISHEYE if fisheye else Projection.PERSPECTIVE
+    return checks.check_optics(file, frame.key, Optics(width, height, fx, fy, cx, cy, distortion, projection))
 
 
 def read_focal(frame: Frame, axis: str, side: int, fisheye: bool) -> float | None:
@@ -82,20 +71,21 @@ def read_focal(frame: Frame, axis: str, side: int, fisheye: bool) -> float | Non
     Raises:
         InputError: a length or an angle that no camera has.
     """
-    file, key, angle_key, degrees_key = frame.file, f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov"
-    angle, degrees = frame.number(angle_key), frame.number(degrees_key)
-    by_angle = None
-    if angle is not None:
-        if math.pi <= angle < 180:
-            found, todo = f"{angle:g}", f"it seems to be in degrees: write {math.radians(angle):.6g}"
-            raise InputError(file, frame.name_key(angle_key), found, "an angle in radians, below pi", todo)
-        by_angle = checks.field_of_view(file, frame.name_key(angle_key), angle, side, fisheye)
-    elif degrees is not None:
-        by_angle = checks.field_of_view(file, frame.name_key(degrees_key), math.radians(degrees), side, fisheye)
-    if (given := frame.number(key)) is None:
+    file, key, angle_key = frame.file, f"fl_{axis}", f"camera_angle_{axis}"
+    given, angle, degrees = frame.number(key), frame.number(angle_key), frame.number(f"{axis}_fov")
+    if angle is None and degrees is not None:
+        angle, angle_key = math.radians(degrees), f"{axis}_fov"
+    if given is not None:
+        checks.positive(file, frame.name_key(key), given)
+    if angle is None:
+        return given
+    if not MIN_ANGLE < angle < math.pi:
+        todo = f"it seems to be in degrees: write {math.radians(angle):.6g}" if math.pi <= angle < 180 else ""
+        raise InputError(file, frame.name_key(angle_key), f"{angle:g}", "an angle in radians, between 0 and pi", todo)
+    by_angle = side / (angle if fisheye else 2 * math.tan(0.5 * angle))
+    if given is None:
         return by_angle
-    focal = checks.focal_length(file, frame.name_key(key), checks.positive(file, frame.name_key(key), given), side)
-    if by_angle is not None and abs(by_angle / focal - 1) > MAX_FOCAL_DISAGREEMENT and frame.key == "frames[0]":
+    if abs(by_angle / given - 1) > MAX_FOCAL_DISAGREEMENT and frame.key == "frames[0]":
         text = "%s: %s=%.5g and the angle of view, which says %.5g, disagree: %s is taken"
-        log.warning(text, file, key, focal, by_angle, key)
-    return focal
+        log.warning(text, file, key, given, by_angle, key)
+    return given

@@ -9,7 +9,7 @@ from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.names import list_images
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.optics import Optics
-from nerf_lightning.dataset.orientation import OrientationChooser, has_shape
+from nerf_lightning.dataset.orientation import OrientationChooser
 from nerf_lightning.dataset.posed import Hints, build_scene
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
@@ -40,13 +40,11 @@ def load_llff(folder: Path, name: str | None = None, reading: Reading = AS_IT_IS
     orientation = OrientationChooser(reading.orientation)
     shots = []
     for photo, mask, pose, (height, width, focal) in zip(photos, masks, c2w, sizes.tolist(), strict=True):
-        wide, high, upright = orientation.choose(photo, (width, height))
-        if not has_shape((wide, high), (width, height)):
-            found = f"{wide}x{high} pixels"
-            raise InputError(photo, "", found, f"{width:g}x{height:g} as in {POSES}, or the same reduced")
-        focal *= wide / width
-        optics = Optics(wide, high, focal, focal, wide / 2, high / 2)
-        shots.append(Shot(photo.name, photo, pose, optics, mask, upright))
+        optics = Optics(round(width), round(height), focal, focal, width / 2, height / 2)
+        upright = orientation.choose(photo, (optics.width, optics.height))[2]
+        shots.append(
+            Shot(photo.name, photo, pose, checks.check_optics(folder / POSES, photo.name, optics), mask, upright)
+        )
     orientation.report(folder)
     return build_scene(folder, name or folder.resolve().name, shots, reading, hints=Hints(nearest=nearest))
 
@@ -65,13 +63,12 @@ def _rows(path: Path) -> tuple[Float[np.ndarray, "V 4 4"], Float[np.ndarray, "V 
     c2w[:, :3, 2], c2w[:, :3, 3] = -poses[:, :, 2], poses[:, :, 3]
     c2w[:, 3, 3] = 1
     sizes = poses[:, :, 4]
-    for i, (height, width, focal) in enumerate(sizes.tolist()):
-        for what, side in (("height", height), ("width", width)):
-            if not 0 < side <= checks.PIXELS:
-                raise InputError(path, f"row {i}", f"a {what} of {side:g}", "the pixels of a photo")
-        checks.focal_length(path, f"row {i}", focal, max(width, height))
     if not len(poses):
         raise InputError(path, "", "no photo", "a row for each")
+    if (wrong := ~((sizes[:, :2] >= 1) & (sizes[:, :2] <= checks.PIXELS)).all(1)).any():
+        raise InputError(
+            path, f"row {wrong.argmax()}", str(sizes[wrong.argmax()].tolist()), "height, width, focal length"
+        )
     nearest = float(rows[:, 15].min())
     return checks.rigid_poses(path, "row {}", c2w), sizes, nearest if 0 < nearest <= checks.FARTHEST else None
 

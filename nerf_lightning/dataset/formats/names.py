@@ -4,7 +4,7 @@ import logging
 import os
 import re
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
@@ -22,14 +22,14 @@ MAX_SHOWN = 4
 """Names in a message."""
 
 
-def is_hidden(path: Path) -> bool:
-    """Whether a file is an operating system's own: `.DS_Store`, and the `._*` files that macOS leaves on other disks."""
-    return path.name.startswith(".")
+def is_image(name: str) -> bool:
+    """By its extension; hidden files, as macOS's `._a.jpg`, are none."""
+    return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith(".")
 
 
-def list_images(folder: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> list[Path]:
+def list_images(folder: Path) -> list[Path]:
     """The image files of a folder, sorted by name."""
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and not is_hidden(file))
+    return sorted(file for file in folder.iterdir() if is_image(file.name) and file.is_file())
 
 
 def split_name(name: str) -> tuple[str, ...]:
@@ -54,10 +54,9 @@ def fold_name(name: str) -> tuple[str, ...]:
 class ImageFinder:
     """Finds the image files that a scene file names.
 
-    A name means, in this order: the exact path relative to `root`, perhaps without its extension, as Blender exports leave it;
-    the same path with other separators, without the part above `root` of a machine it came from; and the one file below
-    `root` whose name, and as many of its folders as possible, are the same under Unicode and case folding and apart from the
-    extension. Reduced copies, masks and depth maps count only where nothing else has the name.
+    A name means the exact path relative to `root`, perhaps without its extension, as Blender exports leave it; or else the one
+    file below `root` whose name, and as many of its folders as possible, are the same under Unicode and case folding, with any
+    separators and apart from the extension. Reduced copies, masks and depth maps count only where nothing else has the name.
 
     Args:
         root: folder that names are relative to.
@@ -76,7 +75,7 @@ class ImageFinder:
         Raises:
             InputError: several files may be meant, or one by two names; `where` and `key` name the place of the name.
         """
-        if (file := self.find_exact(name)) is None and (file := self._find_moved(name, where, key)) is not None:
+        if (file := self.find_exact(name)) is None and (file := self._find_folded(name, where, key)) is not None:
             self.substituted[name] = file
         if file is None:
             return None
@@ -84,13 +83,6 @@ class ImageFinder:
             found = f"{owner!r} and {name!r}, of which only {file.relative_to(self.root)} is there"
             raise InputError(where, key, found, "a photo for each", "is the folder of photos complete?")
         return file
-
-    def _find_moved(self, name: str, where: object, key: str) -> Path | None:
-        parts = split_name(name)
-        for first in range(len(parts)):
-            if (file := self.find_exact("/".join(parts[first:]))) is not None:
-                return None if file in self.owners else file
-        return self._find_folded(name, where, key)
 
     def find_exact(self, name: str) -> Path | None:
         """The file at a path relative to the root, whose extension may be missing."""
@@ -161,5 +153,5 @@ def walk_images(root: Path) -> Iterator[Path]:
             count += 1
             if count > MAX_FILES:
                 return
-            if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith("."):
+            if is_image(name):
                 yield Path(folder, name)

@@ -3,14 +3,14 @@
 import logging
 import re
 import zipfile
-from dataclasses import replace
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras
@@ -52,83 +52,109 @@ def load_npz(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -
     Raises:
         InputError: anything missing, malformed or contradictory.
     """
-    data = read_npz(path, (*PAIRS, *PAIRS.values(), *SCALARS), partial(_compare, path))
+    known = (*PAIRS, *PAIRS.values(), *SCALARS)
+    data = read_npz(path, known, partial(_check_headers, path))
     with zipfile.ZipFile(path) as archive:
         names = {member.removesuffix(".npy") for member in archive.namelist()}
-    if unused := sorted(names - {*PAIRS, *PAIRS.values(), *SCALARS}):
+    if unused := sorted(names - {*known}):
         log.info("%s: keys that are not used: %s", path, ", ".join(unused))
-    images = {key: checks.uint8_images(path, key, data[key]) for key in PAIRS if key in data}
-    height, width = images["images_train"].shape[1:3]
+    height, width = data["images_train"].shape[1:3]
+    longest = choose_resize(
+        path, [(width, height)] * len(data["c2ws_train"]), data["images_train"].shape[3], reading.resize
+    )
     K = _intrinsics(path, data, width, height)
 
-    def cameras(c2w: Float[np.ndarray, "V 4 4"]) -> Cameras:
-        return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height)
+    def pose(key: str) -> tuple[Float[np.ndarray, "V 4 4"], Cameras]:
+        c2w = checks.rigid_poses(path, key + "[{}]", data[key])
+        return c2w, Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height)
 
-    poses = {key: checks.rigid_poses(path, key + "[{}]", data[key]) for key in PAIRS.values() if key in data}
-    posed = {
-        key: PosedViews(Views.of(torch.from_numpy(images[key]), cameras(poses[PAIRS[key]])), poses[PAIRS[key]])
-        for key in images
-    }
-    train, val, test = (posed.get(key) for key in PAIRS)
-    if val is None:
-        val, test = test, None
-    assert train is not None  # as was checked
-    if val is None:
+    def read(key: str) -> PosedViews:
+        c2w, cameras = pose(PAIRS[key])
+        views = Views.of(torch.from_numpy(_bytes(path, key, data[key])), cameras)
+        return PosedViews(resize_views(views, longest), c2w)
+
+    train, *held_out = (read(key) for key in PAIRS if key in data)
+    if not held_out:
         log.warning("%s: no held-out photos: every %d-th training photo is held out", path, reading.holdout)
         split = split_shots(path, len(train.c2w), reading.holdout)
         train, val = (PosedViews(train.views[torch.tensor(part)], train.c2w[part]) for part in (split.train, split.val))
-    longest = choose_resize(path, [(width, height)] * len(data["c2ws_train"]), train.views.channels, reading.resize)
-    if longest is not None:
-        train, val, test = (None if one is None else _resize(one, longest) for one in (train, val, test))
-        assert train is not None and val is not None
-    path_poses = poses.get("c2ws_test") if "images_test" not in data else None
+        held_out = [val]
+    near, far = (checks.number(path, key, data[key]) if key in data else None for key in ("near", "far"))
+    checks.near_far(path, near, far)
     hints = Hints(
         keep_frame=True,
-        path=None if path_poses is None else cameras(path_poses).resized(fit_size(width, height, longest)),
-        background=checks.colour(path, "background", data["background"]) if "background" in data else None,
+        path=pose("c2ws_test")[1].resized(fit_size(width, height, longest)) if _has_path(data) else None,
+        background=_background(path, data["background"]) if "background" in data else None,
         bounds=_bounds(path, data, reading),
         to_source=checks.similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,
-        near=checks.number(path, "near", data["near"]) if "near" in data else None,
-        far=checks.number(path, "far", data["far"]) if "far" in data else None,
+        near=near,
+        far=far,
     )
-    checks.near_far(path, hints.near, hints.far)
-    return assemble_scene(path, name or re.sub(r"_\d+x\d+$", "", path.stem).lower(), train, val, test, reading, hints)
+    name = name or re.sub(r"_\d+x\d+$", "", path.stem)
+    return assemble_scene(path, name, train, held_out[0], held_out[1] if held_out[1:] else None, reading, hints)
 
 
-def _resize(posed: PosedViews, longest: int) -> PosedViews:
-    return replace(posed, views=resize_views(posed.views, longest))
+def _has_path(data: Mapping[str, np.ndarray]) -> bool:
+    """Whether there are poses without photos: a camera path."""
+    return "c2ws_test" in data and "images_test" not in data
 
 
-def _intrinsics(path: Path, data: dict[str, np.ndarray], width: int, height: int) -> Float[Tensor, "3 3"]:
-    """Of all views, pixels."""
-    if "K" in data:
-        K = checks.intrinsics(path, "K", data["K"], width, height)
-        checks.principal_point(path, "K", K[0, 2], K[1, 2], width, height)
-        return torch.from_numpy(K).float()
-    checks.require_keys(path, data, ["focal"])
-    focal = checks.positive(path, "focal", data["focal"])
-    checks.focal_length(path, "focal", focal, max(width, height))
-    return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-
-
-def _compare(path: Path, headers: Headers) -> None:
+def _check_headers(path: Path, headers: Headers) -> None:
     """Compares shapes, before anything is unpacked."""
     checks.require_keys(path, headers, NEEDED)
+    one = headers["images_train"].shape[1:]
     for key, pose_key in PAIRS.items():
-        if pose_key in headers:
-            checks.pose_array(path, pose_key, headers[pose_key])
-            checks.split_size(path, pose_key, headers[pose_key].shape[0])
         if key in headers:
             checks.require_keys(path, headers, [pose_key])
-            checks.image_array(path, key, headers[key])
-            checks.split_size(path, key, headers[key].shape[0], headers[pose_key].shape[0])
-            checks.image_size(path, key, headers[key].shape[1:], headers["images_train"].shape[1:])
+            shape, dtype = headers[key].shape, headers[key].dtype
+            if (
+                len(shape) != 4
+                or shape[3] not in (3, 4)
+                or 0 in shape[1:3]
+                or (dtype != np.uint8 and dtype.kind != "f")
+            ):
+                expected = "images of shape (V, H, W, 3 or 4), uint8 or floats in [0, 1]"
+                raise InputError(path, key, f"shape {shape}, {dtype}", expected)
+            if shape[1:] != one:
+                raise InputError(path, key, f"shape {shape}", f"images of shape {one}, as in images_train")
+            checks.split_size(path, key, shape[0], headers[pose_key].shape[0] if headers[pose_key].shape else 0)
+        elif pose_key in headers:
+            checks.split_size(path, pose_key, headers[pose_key].shape[0] if headers[pose_key].shape else 0)
     for key in set(headers) & set(SCALARS):
         if headers[key].size > MAX_NUMBERS:
             raise InputError(path, key, f"shape {headers[key].shape}", f"at most {MAX_NUMBERS} numbers")
 
 
-def _bounds(path: Path, data: dict[str, np.ndarray], reading: Reading) -> Bounds | None:
+def _bytes(path: Path, key: str, images: Shaped[np.ndarray, "V H W C"]) -> UInt8[np.ndarray, "V H W C"]:
+    """Images as uint8; floats in [0, 1] are scaled and rounded."""
+    if images.dtype == np.uint8:
+        return images
+    if not (images.min() >= 0 and images.max() <= 1):  # false for nan too
+        raise InputError(path, key, f"floats from {images.min():g} to {images.max():g}", "uint8, or floats in [0, 1]")
+    return np.rint(images * 255).astype(np.uint8)
+
+
+def _intrinsics(path: Path, data: Mapping[str, np.ndarray], width: int, height: int) -> Float[Tensor, "3 3"]:
+    """Of all views, pixels."""
+    if "K" in data:
+        K = checks.intrinsics(path, "K", data["K"], width, height)
+        checks.check_principal_point(path, "K", K[0, 2], K[1, 2], width, height)
+        return torch.from_numpy(K).float()
+    checks.require_keys(path, data, ["focal"])
+    focal = checks.number(path, "focal", data["focal"])
+    checks.focal_length(path, "focal", focal, max(width, height))
+    return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+
+
+def _background(path: Path, colour: Shaped[np.ndarray, "..."]) -> tuple[float, float, float]:
+    """sRGB in [0, 1]."""
+    red, green, blue = checks.numeric(path, "background", colour, "3").tolist()
+    if not (min(red, green, blue) >= 0 and max(red, green, blue) <= 1):
+        raise InputError(path, "background", str([red, green, blue]), "three numbers from 0 to 1")
+    return red, green, blue
+
+
+def _bounds(path: Path, data: Mapping[str, np.ndarray], reading: Reading) -> Bounds | None:
     """The box that a file states."""
     if "aabb" not in data:
         return None
@@ -169,8 +195,5 @@ def save_npz(scene: Scene, path: Path) -> None:
     if not torch.equal(scene.to_source, torch.eye(4, dtype=torch.float64)):
         arrays["to_source"] = scene.to_source
     content: dict[str, Any] = {key: array.numpy() for key, array in arrays.items()}
-    try:
-        with atomic(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **content)
-    except OSError as error:
-        raise InputError(path, "", f"no way to write ({error})", "a folder that exists, with space") from error
+    with atomic(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **content)

@@ -98,39 +98,31 @@ def read_split(frames: list[Frame]) -> Split | None:
     if not frames:
         return None
     file, content = frames[0].file, frames[0].content
-    folded = {fold_name(entry["file_path"]) for entry in content["frames"]}
-    named: dict[str, set[tuple[str, ...]]] = {}
-    for key in ("train_filenames", "val_filenames", "test_filenames"):
-        if (given := content.get(key)) is None:
-            continue
+    every = {fold_name(entry["file_path"]) for entry in content["frames"]}
+    named: dict[str, list[int]] = {}
+    for part in ("train", "val", "test"):
+        key = f"{part}_filenames"
+        given = content.get(key) or []
         if not isinstance(given, list) or not all(isinstance(item, str) for item in given):
             raise InputError(file, key, repr(given)[:60], "a list of file_path strings")
-        if strangers := [item for item in given if fold_name(item) not in folded]:
+        if strangers := [item for item in given if fold_name(item) not in every]:
             raise InputError(file, key, f"{strangers[0]!r}, which is no frame", "the file_path of a frame")
         if given:
-            named[key] = {fold_name(item) for item in given}
+            names = {fold_name(item) for item in given}
+            named[part] = [i for i, frame in enumerate(frames) if fold_name(frame.name) in names]
     if not named:
         return None
-    own = [fold_name(frame.name) for frame in frames]
-
-    def select(key: str) -> list[int]:
-        return [i for i, name in enumerate(own) if name in named.get(key, ())]
-
-    train, val, test = (select(key) for key in ("train_filenames", "val_filenames", "test_filenames"))
-    if "train_filenames" not in named:
-        train = [i for i in range(len(frames)) if i not in {*val, *test}]
-    if not val and not test:
-        val = [i for i in range(len(frames)) if i not in set(train)]
-    if not val:
-        val, test = test, []
-    for key, part in (("val_filenames", val), ("test_filenames", test)):
+    rest = [i for i in range(len(frames)) if not any(i in part for part in named.values())]
+    train = named.get("train", rest)
+    held_out = [named[part] for part in ("val", "test") if named.get(part)] or [rest]
+    for part in held_out:
         if both := sorted(set(part) & set(train)):
             found = f"{frames[both[0]].name!r}, which is in train_filenames too"
-            raise InputError(file, key if key in named else "test_filenames", found, "held-out photos of their own")
-    test = test if test != val else []
+            raise InputError(file, "val_filenames, test_filenames", found, "held-out photos of their own")
     checks.split_size(file, "train split", len(train))
-    checks.split_size(file, "val split", len(val))
-    return Split(train, val, test)
+    checks.split_size(file, "val split", len(held_out[0]))
+    test = held_out[1] if len(held_out) > 1 and held_out[1] != held_out[0] else []
+    return Split(train, held_out[0], test)
 
 
 def read_cameras(source: Path, frames: list[Frame], folder: Path, reading: Reading) -> list[Shot]:

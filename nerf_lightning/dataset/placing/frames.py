@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf_lightning.dataset.placing.choose import FEWEST, choose, motion, sharpness, suitable_count
-from nerf_lightning.dataset.placing.kept import find_kept, keep, made_of
+from nerf_lightning.dataset.placing.kept import kept_folder, made_of
 from nerf_lightning.dataset.placing.video import colours, frames, grey, seconds_of
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.errors import InputError
@@ -34,11 +34,9 @@ def kept_frames(video: Path) -> Path:
     """
     beside = video.with_name(f"{video.stem}_frames")
     sources = made_of([existing_file(video)])
-    kept = find_kept(beside, sources, lambda folder: any(folder.glob("*.jpg")))
-    if kept is not None:
-        log.info("%s: its frames are in %s", video, kept)
-        return kept
-    folder = keep(beside, sources, lambda empty: _write(video, empty, None))
+    folder = kept_folder(
+        beside, sources, lambda kept: any(kept.glob("*.jpg")), lambda empty: _write(video, empty, None)
+    )
     log.info("%s: the %d sharpest frames are in %s", video, len(list(folder.glob("*.jpg"))), folder)
     return folder
 

@@ -22,18 +22,24 @@ def made_of(files: Iterable[Path]) -> dict[str, Any]:
     return {name: [state.st_size, state.st_mtime_ns] for name, state in states.items()}
 
 
-def find_kept(beside: Path, sources: dict[str, Any], whole: Callable[[Path], bool]) -> Path | None:
-    """The folder that was made of the same sources, beside them or in the cache; None where it must be made.
+def kept_folder(
+    beside: Path, sources: dict[str, Any], is_whole: Callable[[Path], bool], fill: Callable[[Path], None]
+) -> Path:
+    """The folder that was made of the same sources before, or is made now: beside them, or in the cache where that cannot be
+    written.
 
     Args:
-        beside: where it stands if that could be written.
+        beside: where it stands if that can be written.
         sources: what it must have been made of, as plain values.
-        whole: whether a folder still holds what belongs there.
+        is_whole: whether a folder still holds what belongs there.
+        fill: writes what belongs there into an empty folder.
 
     Raises:
-        InputError: a folder of somebody else has that name.
+        InputError: a folder of somebody else has that name, or neither can be written.
     """
-    for folder in (beside, _cached(beside)):
+    digest = hashlib.sha256(str(beside.resolve()).encode()).hexdigest()[:16]
+    cached = cache_folder() / "placing" / digest / beside.name
+    for folder in (beside, cached):
         if not folder.is_dir() or not any(folder.iterdir()):
             continue
         if not (folder / RECORD).is_file():
@@ -41,26 +47,13 @@ def find_kept(beside: Path, sources: dict[str, Any], whole: Callable[[Path], boo
             raise InputError(
                 folder, "", found, "nothing, or what an earlier run made", "move it elsewhere or rename it"
             )
-        if _read(folder / RECORD) == sources and whole(folder):
+        if _read(folder / RECORD) == sources and is_whole(folder):
+            log.info("%s: kept from an earlier run", folder)
             return folder
         log.info("%s was made of other files, or is not whole: it is made again", folder)
-    return None
-
-
-def keep(beside: Path, sources: dict[str, Any], fill: Callable[[Path], None]) -> Path:
-    """Makes the folder: beside its sources, or in the cache where that cannot be written.
-
-    Args:
-        beside, sources: see `find_kept`.
-        fill: writes what belongs there into an empty folder.
-
-    Raises:
-        InputError: neither can be written.
-    """
     try:
         return _filled(beside, sources, fill)
     except (OSError, Unwritable) as error:
-        cached = _cached(beside)
         log.warning("%s cannot be written (%s): %s is, instead", beside, _reason(error), cached)
     try:
         return _filled(cached, sources, fill)
@@ -78,11 +71,6 @@ def _filled(folder: Path, sources: dict[str, Any], fill: Callable[[Path], None])
         fill(temporary)
         write_json(temporary / RECORD, sources)
     return folder
-
-
-def _cached(beside: Path) -> Path:
-    digest = hashlib.sha256(str(beside.resolve()).encode()).hexdigest()[:16]
-    return cache_folder() / "placing" / digest / beside.name
 
 
 def _read(record: Path) -> Any:

@@ -3,11 +3,8 @@
 import re
 from pathlib import Path
 
+from nerf_lightning.dataset.formats.names import list_images
 from nerf_lightning.errors import InputError
-
-EXTENSIONS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif"}
-UNREAD = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".webp", ".avif", ".mov", ".mp4"}
-"""Files of cameras and phones that are no photos that can be read."""
 
 
 def natural(path: Path) -> list[tuple[int, int, str]]:
@@ -18,12 +15,7 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
 
 def has_photos(folder: Path) -> bool:
     """Whether a folder holds photos itself."""
-    return folder.is_dir() and any(_is_photo(file) for file in folder.iterdir())
-
-
-def _is_photo(file: Path) -> bool:
-    """By its name; hidden files, such as macOS's `._0001.jpg`, are none."""
-    return file.suffix.lower() in EXTENSIONS and not file.name.startswith(".") and file.is_file()
+    return folder.is_dir() and bool(list_images(folder))
 
 
 def find_photos(folder: Path, key: str) -> list[Path]:
@@ -38,10 +30,11 @@ def find_photos(folder: Path, key: str) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError("config", key, f"{folder}, which is no folder", "a folder of photos")
-    files = list(folder.iterdir())
-    photos = sorted(filter(_is_photo, files), key=natural)
+    photos = sorted(list_images(folder), key=natural)
     if not photos:
-        others = sorted({file.suffix.lower() for file in files} & UNREAD)
+        others = sorted({file.suffix.lower() for file in folder.iterdir() if file.suffix})
         found = f"only {', '.join(others)} files" if others else "no photo"
-        raise InputError(folder, "", found, "JPEG, PNG, TIFF or HEIC photos", "convert them first" if others else "")
+        raise InputError(
+            folder, "", found, "JPEG, PNG, TIFF, WebP or HEIC photos", "convert them first" if others else ""
+        )
     return photos

@@ -2,12 +2,11 @@
 
 import logging
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 from nerf_lightning.dataset.formats.colmap import PLACED_FOLDER
 from nerf_lightning.dataset.placing.choose import FEWEST
-from nerf_lightning.dataset.placing.kept import find_kept, keep, made_of
+from nerf_lightning.dataset.placing.kept import kept_folder, made_of
 from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.dataset.placing.structure import reconstruct
 from nerf_lightning.errors import InputError
@@ -40,33 +39,23 @@ def place(folder: Path) -> Path:
         InputError: pycolmap is not installed, a photo cannot be read, or the photos do not hang together.
     """
     photos = find_photos(folder, "dataset.path")
-    sources = made_of(photos)
-    kept = find_kept(
-        folder / PLACED_FOLDER, sources, lambda kept: all((kept / MODEL / file).is_file() for file in FILES)
-    )
-    if kept is not None:
-        log.info("%s: cameras as an earlier run placed them, in %s", folder, kept)
-        return kept / MODEL
-    require("colmap", "pycolmap", purpose="the optional extra for photos without cameras")
-    with tempfile.TemporaryDirectory() as workspace:
-        model = reconstruct(photos, Path(workspace))
-    count = 0 if model is None else model.num_reg_images()
-    if model is None or count < FEWEST:
-        found = f"{count} of {len(photos)} photos that hang together"
-        raise InputError(folder, "", found, f"at least {FEWEST}", OVERLAP)
-    placed = {image.name for image in model.images.values() if image.has_pose}
 
     def fill(empty: Path) -> None:
+        require("colmap", "pycolmap", purpose="the optional extra for photos without cameras")
+        with tempfile.TemporaryDirectory() as workspace:
+            model = reconstruct(photos, Path(workspace))
+        count = 0 if model is None else model.num_reg_images()
+        if model is None or count < FEWEST:
+            found = f"{count} of {len(photos)} photos that hang together"
+            raise InputError(folder, "", found, f"at least {FEWEST}", OVERLAP)
+        placed = {image.name for image in model.images.values() if image.has_pose}
+        log.info("%d of %d photos placed", len(placed), len(photos))
+        if missing := [photo.name for photo in photos if photo.name not in placed]:
+            log.info("not placed, for they share too few points with the others: %s", join_truncated(missing, SHOWN))
         (empty / MODEL).mkdir(parents=True)
         model.write_binary(empty / MODEL)
 
-    target = keep(folder / PLACED_FOLDER, sources, fill)
-    log.info("%s", _told(target, len(photos), [photo.name for photo in photos if photo.name not in placed]))
-    return target / MODEL
+    def is_whole(kept: Path) -> bool:
+        return all((kept / MODEL / file).is_file() for file in FILES)
 
-
-def _told(target: Path, count: int, missing: Sequence[str]) -> str:
-    line = f"{count - len(missing)} of {count} photos placed, kept in {target}"
-    if not missing:
-        return line
-    return f"{line}; not placed, for they share too few points with the others: {join_truncated(missing, SHOWN)}"
+    return kept_folder(folder / PLACED_FOLDER, made_of(photos), is_whole, fill) / MODEL

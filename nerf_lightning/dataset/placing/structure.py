@@ -116,7 +116,11 @@ def _lenses(database: Path, names: Sequence[str], shots: Sequence[Shot]) -> dict
             camera = pycolmap.Camera.create_from_model_name(0, kind, focal, width, height)
             camera.has_prior_focal_length = told is not None
             members_of[content.write_camera(camera)] = members
-            log.info("%d photos of %s, focal length %s", len(members), _described(taken), _pixels(told))
+            text = "%d photos of %dx%d by %s %s, focal length %s pixels"
+            known = "unknown" if told is None else f"{told:.0f}"
+            log.info(
+                text, len(members), taken.width, taken.height, taken.make or "an unknown camera", taken.model, known
+            )
     return members_of
 
 
@@ -141,15 +145,6 @@ def find_features(database: Path, copies: Path, members_of: Mapping[int, Sequenc
             reader.existing_camera_id = number
             pycolmap.extract_features(database, copies, members, pycolmap.CameraMode.AUTO, reader)
             step(len(members))
-
-
-def _described(taken: Shot) -> str:
-    camera = taken.model if taken.model.startswith(taken.make) else f"{taken.make} {taken.model}".strip()
-    return f"{taken.width}x{taken.height}" + (f", {camera}" if camera else "")
-
-
-def _pixels(focal: float | None) -> str:
-    return "unknown" if focal is None else f"about {focal:.0f} pixels"
 
 
 def match_photos(database: Path, names: Sequence[str], file: Path) -> None:

@@ -1,0 +1,106 @@
+"""nerf_lightning capture and print-tags."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from nerf_lightning.cli.command import command
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import output_path, user_path
+from nerf_lightning.utils.options import AtLeast, AtMost
+
+TagSize = Annotated[float, AtLeast(1e-4), AtMost(10)]
+"""Metres: printers make no smaller dots, and photos hold no larger tags."""
+Squares = Annotated[int, AtLeast(3), AtMost(1000)]
+"""Along a side of a chessboard with inner corners."""
+
+
+@command
+def capture(
+    *,
+    calibration: Path,
+    photos: Path,
+    tag_size: TagSize,
+    output: Annotated[Path, Parameter(alias="-o")] = Path("scene.npz"),
+    dictionary: str = "auto",
+    layout: Path | None = None,
+    board_columns: Squares | None = None,
+    board_rows: Squares | None = None,
+    board_square: TagSize | None = None,
+    resize: Annotated[int, AtLeast(0)] = 300,
+    holdout: Annotated[int, AtLeast(2)] = 10,
+) -> Any:
+    """Turn photos of a subject beside printed ArUco tags into a scene, with a report beside it.
+
+    Photos in which the subject hides all tags are placed by their texture, where pycolmap is installed.
+
+    Args:
+        calibration: Folder of photos of the tags alone, from many angles.
+        photos: Folder of photos of the subject with tags in view, in the order taken, with the same zoom.
+        tag_size: Side of a tag's black square, metres.
+        output: Scene to write, FILE.npz; cameras.json, calibration.yaml and FILE_report/ go beside it.
+        dictionary: OpenCV's name of the tags' family, such as DICT_4X4_50; auto tries the common ones.
+        layout: sheet_2x3, or a YAML file of where the tags lie; default: found from the photos.
+        board_columns: Squares of a ChArUco board from left to right, if one is used in place of tags.
+        board_rows: Squares of the board from top to bottom.
+        board_square: Side of a square of the board, metres.
+        resize: Longest side of the scene's photos, pixels; 0 keeps their size.
+        holdout: Every N-th photo is held out for validation.
+
+    Returns:
+        A `nerf_lightning.capture.run.Capture`: the calibration, the poses and the scene.
+
+    Raises:
+        InputError: an option or a photo is no good.
+    """
+    target = output_path(output)
+    if target.suffix != ".npz":
+        raise InputError("capture", "output", str(output), "a file name that ends in .npz")
+    board = {"board_columns": board_columns, "board_rows": board_rows, "board_square": board_square}
+    missing = [key for key, value in board.items() if value is None]
+    if 0 < len(missing) < len(board):
+        raise InputError("capture", missing[0], "nothing", "a value, as for the rest of the board")
+
+    from nerf_lightning.capture.report.write import write_report
+    from nerf_lightning.capture.run import capture_scene
+    from nerf_lightning.capture.tags.board import Board
+
+    found = capture_scene(
+        user_path(calibration),
+        user_path(photos),
+        tag_size,
+        target,
+        dictionary=dictionary,
+        layout=layout,
+        board=Board(board_columns, board_rows, board_square) if board_columns and board_rows and board_square else None,
+        longest=resize or None,
+        holdout=holdout,
+    )
+    report = target.with_name(f"{target.stem}_report")
+    write_report(found, report)
+    placed = sum(photo.c2w is not None for photo in found.photos)
+    print(f"{placed} of {len(found.photos)} photos placed; wrote {target}, cameras.json and calibration.yaml")
+    print(f"look at {report}, then: nerf_lightning train +experiment=capture dataset.path={target}")
+    return found
+
+
+@command
+def print_tags(
+    sheet: Path, /, *, tag_size: TagSize = 0.06, dictionary: str = "DICT_4X4_50", layout: Path = Path("sheet_2x3")
+) -> None:
+    """Write a page of ArUco tags to print, A4 at its true size.
+
+    Args:
+        sheet: FILE.pdf to write.
+        tag_size: Side of a tag's black square, metres.
+        dictionary: OpenCV's name of the tags' family.
+        layout: sheet_2x3 (six tags), or a YAML file of where the tags lie.
+
+    Raises:
+        InputError: no PDF, an unknown family or layout, or tags that do not fit on the page.
+    """
+    from nerf_lightning.capture.tags.layout import read_layout
+    from nerf_lightning.capture.tags.printout import write_page
+
+    write_page(read_layout(layout, dictionary, tag_size), output_path(sheet))
