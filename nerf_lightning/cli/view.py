@@ -70,7 +70,11 @@ def is_run(path: Path) -> bool:
 
     path = path.expanduser()
     if path.is_file():
-        return zipfile.is_zipfile(path) and "header.npy" in zipfile.ZipFile(path).namelist()
+        try:
+            with zipfile.ZipFile(path) as file:
+                return "header.npy" in file.namelist()
+        except (OSError, zipfile.BadZipFile):  # whatever reads it says what is wrong
+            return False
     if (path / "config.yaml").is_file() or path.absolute() == OUTPUTS.absolute():
         return True
     scene = any(path.glob("*.json")) or any((path / name).exists() for name in ("images", "sparse", "poses_bounds.npy"))

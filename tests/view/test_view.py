@@ -115,8 +115,10 @@ def test_is_run_tells_runs_from_scenes(scene: Scene, small_run: Path, tmp_path: 
     shutil.copytree(small_run, photos / "outputs" / "first")
     (photos / "transforms.json").write_text("{}")
     np.savez(tmp_path / "compact.npz", header=np.zeros(3, np.uint8))
-    found = {name: is_run(tmp_path / name) for name in ("scene.npz", "runs", "runs/first", "photos", "compact.npz")}
-    assert found == {"scene.npz": False, "runs": True, "runs/first": True, "photos": False, "compact.npz": True}
+    (tmp_path / "damaged.npz").write_bytes((tmp_path / "scene.npz").read_bytes()[:-30])
+    expected = {"scene.npz": False, "runs": True, "runs/first": True, "photos": False, "compact.npz": True}
+    expected |= {"damaged.npz": False, "nowhere": False}
+    assert {name: is_run(tmp_path / name) for name in expected} == expected
 
 
 def test_view_ends_with_ctrl_c_and_writes_nothing(scene: Scene, tmp_path: Path):
