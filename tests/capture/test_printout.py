@@ -3,8 +3,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-
 from nerf_lightning.capture.command import print_tags
+
 from nerf_lightning.capture.tags.detect import tag_detector
 from nerf_lightning.capture.tags.layout import TagLayout, flat_pose, read_layout
 from nerf_lightning.capture.tags.printout import A4, page, write_page
