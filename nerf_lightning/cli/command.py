@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from nerf_lightning.utils.options import check_options
 
 P = ParamSpec("P")
+VAR_POSITIONAL = inspect.Parameter.VAR_POSITIONAL
 T = TypeVar("T")
 
 Output = Annotated[Path | None, Parameter(alias="-o")]
@@ -30,14 +31,20 @@ def command(function: Callable[P, T]) -> Callable[P, T]:
         InputError: by the function, for a value that its annotation excludes.
     """
     signature, hints = inspect.signature(function), get_type_hints(function)
+    parameters = signature.parameters
 
     @functools.wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> T:
         bound = signature.bind(*args, **kwargs)
         for key, value in bound.arguments.items():
-            if isinstance(value, str) and Path in get_args(hints[key]) + (hints[key],):
+            if Path not in get_args(hints[key]) + (hints[key],):
+                continue
+            if isinstance(value, str):
                 bound.arguments[key] = Path(value)
-        check_options("", function, bound.arguments, source=function.__name__.replace("_", "-"))
+            elif isinstance(value, tuple):  # of *paths
+                bound.arguments[key] = tuple(map(Path, value))
+        given = {key: value for key, value in bound.arguments.items() if parameters[key].kind is not VAR_POSITIONAL}
+        check_options("", function, given, source=function.__name__.replace("_", "-"))
         return function(*bound.args, **bound.kwargs)
 
     return checked
