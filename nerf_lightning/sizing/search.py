@@ -160,6 +160,7 @@ def train_rung(cfg: DictConfig, data: Data, folder: Path, smaller: System | None
         The system, on the device that trained it, and the seconds it took.
     """
     prepare(cfg)
+    silence_lightning()
     if isinstance(data, RayDataModule):
         data.start_again()
     device = build.device_of(cfg)

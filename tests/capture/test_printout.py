@@ -3,11 +3,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from nerf_lightning.capture.command import print_tags
 
 from nerf_lightning.capture.tags.detect import tag_detector
 from nerf_lightning.capture.tags.layout import TagLayout, flat_pose, read_layout
 from nerf_lightning.capture.tags.printout import A4, page, write_page
+from nerf_lightning.cli.capture import print_tags
 from nerf_lightning.drawing.ink import pixels_of
 from nerf_lightning.errors import InputError
 
