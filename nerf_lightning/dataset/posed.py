@@ -53,13 +53,6 @@ class Split:
     test: list[int] = field(default_factory=list)
     """Held out and measured on at the end alone, where a format has both."""
 
-    def renumber(self) -> "Split":
-        """The same split of the photos laid out part after part."""
-        first, second = len(self.train), len(self.train) + len(self.val)
-        ends = (0, first, second, second + len(self.test))
-        train, val, test = (list(range(*pair)) for pair in itertools.pairwise(ends))
-        return Split(train, val, test)
-
 
 @dataclass(frozen=True)
 class PosedViews:
@@ -128,8 +121,10 @@ def build_scene(
     checks.split_size(source, "train split", len(split.train))
     checks.split_size(source, "val split", len(split.val))
     # Part after part, so that none of them needs a copy of its pixels.
-    shots = [shots[i] for i in (*split.train, *split.val, *split.test)]
-    split = split.renumber()
+    parts = (split.train, split.val, split.test)
+    shots = [shots[i] for part in parts for i in part]
+    ends = np.cumsum([0, *map(len, parts)]).tolist()
+    train, val, test = (list(range(*pair)) for pair in itertools.pairwise(ends))
     poses = np.stack([shot.c2w for shot in shots])
     views = read_shots(source, shots, reading)
     check_visible(source, views)
@@ -137,9 +132,8 @@ def build_scene(
     def take(part: list[int]) -> PosedViews:
         return PosedViews(views[torch.tensor(part, dtype=torch.long)], poses[part])
 
-    train, val = take(split.train), take(select_known(views, split.val, shots))
-    test = take(split.test) if split.test else None
-    return assemble_scene(source, name, train, val, test, reading, hints)
+    known = select_known(views, val, shots)
+    return assemble_scene(source, name, take(train), take(known), take(test) if test else None, reading, hints)
 
 
 def assemble_scene(

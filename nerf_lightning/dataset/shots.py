@@ -66,12 +66,9 @@ class Reading:
     def __post_init__(self) -> None:
         if self.holdout < 2:
             raise InputError("holdout", "", str(self.holdout), "2 or more: every N-th photo is held out")
-        if self.masked not in MASKED:
-            raise InputError("dataset.masked", "", repr(self.masked), "auto, unknown or empty")
-        if self.bounded not in BOUNDED:
-            raise InputError("dataset.bounded", "", repr(self.bounded), "auto, true or false")
-        if self.orientation not in ORIENTATIONS:
-            raise InputError("dataset.orientation", "", repr(self.orientation), "auto, stored or exif")
+        for key, words in (("masked", MASKED), ("bounded", BOUNDED), ("orientation", ORIENTATIONS)):
+            if getattr(self, key) not in words:
+                raise InputError(f"dataset.{key}", "", repr(getattr(self, key)), f"one of {', '.join(words)}")
 
 
 AS_IT_IS = Reading()

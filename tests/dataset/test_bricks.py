@@ -125,18 +125,6 @@ def test_bricks_bounds_hold_the_model(scene):
     assert (points >= aabb[0] - 1e-4).all() and (points <= aabb[1] + 1e-4).all()
 
 
-def test_visible_culling_changes_nothing(scene):
-    cameras = scene.val.cameras.resized((24, 24))
-    for view in range(2):
-        for fast, slow in zip(
-            visible(bulldozer(), cameras, view), visible(bulldozer(), cameras, view, cull=False), strict=True
-        ):
-            np.testing.assert_array_equal(fast, slow)
-    origins, directions, *fast = trace_exactly(cameras.view_rays(0))
-    for a, b in zip(fast, nearest(bulldozer(), origins, directions, cull=False), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_picture_agrees_with_trace(scene):
     """The rasterising tracer in single precision against ray-by-ray tracing in double."""
     cameras = scene.train.cameras

@@ -117,23 +117,6 @@ def test_convention_hypotheses_each_mistake_is_named(name: str, outward: bool, o
     assert share(best) == 1 and words in best.found
 
 
-def test_explained_pan_tells_the_focal_length():
-    pan = centred(ring(24, outward=True), np.zeros(3))
-    matches = matches_of(pan, 8.0)
-    for zoom in (0.25, 0.8, 1.25, 4.0):
-        assert explained(matches, pan, zoom).mean() < 0.2
-    wrong = Matches(
-        *(getattr(matches, key) for key in ("views", "pair")),
-        *(
-            x / np.linalg.norm(x, axis=1, keepdims=True)
-            for x in (matches.first * [4, 4, 1], matches.second * [4, 4, 1])
-        ),
-        matches.tolerance * 4,
-        matches.fisheye,
-    )
-    assert explained(wrong, pan, 4.0).all(), "photos whose focal length is said to be a quarter of it"
-
-
 def scene_of(c2w: np.ndarray, names: tuple[str, ...] = (), focal: float = 80.0, width: int = 96) -> Scene:
     """Photos of a room without bounds; every eighth is held out."""
     cameras = cameras_at(c2w, focal, width, 3 * width // 4)

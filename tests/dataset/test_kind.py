@@ -89,7 +89,7 @@ def test_open_scene_bounded_option_rules(format: str, ball_views: Views, tmp_pat
     assert not scene.bounds.unbounded and "dataset.bounded=true" in scene.kind
     cut = str(write_scene(format, tmp_path / "t", ball_views))
     assert open_scene(cut, reading=Reading(bounded="false")).bounds.unbounded
-    with pytest.raises(InputError, match="dataset.bounded: found 'maybe', expected auto, true or false"):
+    with pytest.raises(InputError, match="dataset.bounded: found 'maybe', expected one of auto, true, false"):
         Reading(bounded="maybe")
 
 

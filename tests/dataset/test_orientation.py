@@ -59,5 +59,5 @@ def test_open_scene_square_photos_stay_as_stored(
     assert "taken to be about the pixels as stored (dataset.orientation=exif" in caplog.text
     turned = open_scene(str(folder), reading=Reading(orientation="exif"))
     assert torch.equal(stored.train.image(0), torch.rot90(turned.train.image(0), 1))
-    with pytest.raises(InputError, match="dataset.orientation: found 'up', expected auto, stored or exif"):
+    with pytest.raises(InputError, match="dataset.orientation: found 'up', expected one of auto, stored, exif"):
         Reading(orientation="up")

@@ -45,11 +45,3 @@ def test_held_out_subset_is_of_the_whole_view(subset: PixelSubset):
     whole, some = picture.held_out(0), picture.held_out(0, subset)
     expected = (rows[:, None] * 40 + columns[columns < 40]).flatten()
     assert torch.equal(some.rgb, whole.rgb[expected]) and torch.allclose(some.uv, whole.uv[expected])
-
-
-def test_test_on_strips_gives_strips():
-    data = RayDataModule(bricks(size=64, train_views=2, val_views=2, cache=""))
-    data.test_on(PixelSubset(rows=0.5))
-    assert [batch.height for batch in data.test_dataloader()] == [32, 32]
-    data.test_on(WHOLE)
-    assert [batch.height for batch in data.test_dataloader()] == [64, 64]

@@ -24,6 +24,7 @@ from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config
 from nerf_lightning.runs.scene_file import load_scene
 from nerf_lightning.sampler import Samples, UniformSampler
+from nerf_lightning.synthetic import corruptions
 from nerf_lightning.system import aligned
 from nerf_lightning.training.train import train
 from tests.helpers.soft_ball import BOX, cameras_around_ball, soft_ball

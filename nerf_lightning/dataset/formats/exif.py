@@ -1,9 +1,7 @@
 """What cameras write into their photos."""
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from nerf_lightning.dataset.formats.header import DAMAGED, read_header
 
@@ -11,15 +9,10 @@ EXPOSURE, APERTURE, SPEED = 0x829A, 0x829D, 0x8827
 """Numbers of EXIF tags: seconds, f-number and ISO speed."""
 
 
-def exif_tags(path: Path) -> Mapping[int, Any]:
-    """The EXIF tags of a photo by their numbers; where there are none, or broken ones, nothing."""
-    header = read_header(path)
-    return {} if header is None else header.tags
-
-
 def stated_exposure(path: Path) -> float | None:
     """Light that a photo gathered, by its tags: seconds times ISO speed over the squared f-number; None if they do not say."""
-    tags = exif_tags(path)
+    header = read_header(path)
+    tags = {} if header is None else header.tags
     try:
         speed = tags[SPEED]
         first = speed[0] if isinstance(speed, tuple) else speed  # of two kinds of sensitivity

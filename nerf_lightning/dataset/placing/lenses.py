@@ -10,8 +10,7 @@ from typing import Any
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from nerf_lightning.dataset.formats.exif import exif_tags
-from nerf_lightning.dataset.formats.header import DAMAGED, DETAILS
+from nerf_lightning.dataset.formats.header import DAMAGED, DETAILS, read_header
 
 MAKE, MODEL, FOCAL, FOCAL_35MM = 0x010F, 0x0110, 0x920A, 0xA405
 """Numbers of EXIF tags."""
@@ -44,7 +43,8 @@ def shot(path: Path, width: int, height: int) -> Shot:
         path: of the photo.
         width, height: of the upright photo, pixels.
     """
-    tags = exif_tags(path)
+    header = read_header(path)
+    tags = {} if header is None else header.tags
     make, model = (" ".join(str(tags.get(tag, "")).replace("\0", " ").split()) for tag in (MAKE, MODEL))
     return Shot(width, height, make, model, _millimetres(tags.get(FOCAL)), _millimetres(tags.get(FOCAL_35MM)))
 
