@@ -19,12 +19,12 @@ import torch
 from omegaconf import OmegaConf
 
 from nerf_lightning.cameras import Cameras, orbit_around
-from nerf_lightning.config.build import build_system, resolved
+from nerf_lightning.config.build import build_system
 from nerf_lightning.config.compose import composed
 from nerf_lightning.export.drawable import voxels_like
 from nerf_lightning.export.page import SCRIPTS, field_page, gallery_page, picture_page
 from nerf_lightning.runs.compact import decode, encode, without_folders
-from nerf_lightning.runs.folder import RunFolder
+from nerf_lightning.runs.folder import RunFolder, plain_config
 from nerf_lightning.runs.scene_file import frame_from
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.html import address_from, hash_source, read_source
@@ -64,7 +64,7 @@ def made(recipe: str, precision: str = "byte", unbounded: bool = False) -> bytes
         for parameter in system.field.parameters():
             parameter.add_(torch.randn_like(parameter) * (0.3 if recipe == "tensorf" else 0.5))
     system.sampler.import_state({"occupied": torch.rand(16**3) < 0.3})
-    plain = resolved(cfg)
+    plain = plain_config(cfg)
     plain["dataset"]["path"] = "/home/somebody/photos"
     return without_folders(encode(system, precision, plain, scene))
 
