@@ -52,7 +52,7 @@ def measure(args: argparse.Namespace) -> Rows:
     few: Rows = []
     for name, scene in scenes.items():
         place = output / "sizes" / name
-        found = rightsize(scene, given, output=place)
+        found = rightsize(scene, *given, output=place)
         cfg = composed([*describe_scene(scene), *given], place)
         data = build_data(cfg)
         assert isinstance(data, RayDataModule)  # scenes alone are measured
@@ -70,7 +70,7 @@ def measure(args: argparse.Namespace) -> Rows:
     sparse = composed([*describe_scene(str(path)), *given], output)
     for views, of, result in (
         (VIEWS, cfg, found),
-        (FEW, sparse, rightsize(str(path), given, output=output / "sizes" / path.stem)),
+        (FEW, sparse, rightsize(str(path), *given, output=output / "sizes" / path.stem)),
     ):
         chosen = result["full"][str(result["rung"])]
         default = train_in_full(of, {}, {}, build_data(of), output / "sizes" / f"default_{views}")

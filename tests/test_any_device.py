@@ -189,5 +189,5 @@ def test_rightsize_on_device_finds_smallest(device: torch.device, tmp_path: Path
         "callbacks.snapshots=null",
     ]
     where = {"ladder": str(tmp_path / "ladder.yaml"), "output": tmp_path / "found"}
-    found = rightsize(str(tmp_path / "scene.npz"), options, psnr=8.0, **where)
+    found = rightsize(str(tmp_path / "scene.npz"), *options, psnr=8.0, **where)
     assert found["device"].startswith(NAME) and found["reached"]

@@ -4,13 +4,14 @@ import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, ParamSpec, TypeVar
+from typing import Annotated, ParamSpec, TypeVar, get_args, get_type_hints
 
 from cyclopts import Parameter
 
 from nerf_lightning.utils.options import check_options
 
 P = ParamSpec("P")
+VAR_POSITIONAL = inspect.Parameter.VAR_POSITIONAL
 T = TypeVar("T")
 
 Output = Annotated[Path | None, Parameter(alias="-o")]
@@ -24,16 +25,26 @@ Device = Annotated[str, Parameter(help="auto, cpu, cuda or mps; auto takes the b
 
 
 def command(function: Callable[P, T]) -> Callable[P, T]:
-    """Makes a function check its arguments against its annotations, wherever it is called from.
+    """Makes a function check its arguments against its annotations, wherever it is called from; text stands for a path.
 
     Raises:
         InputError: by the function, for a value that its annotation excludes.
     """
-    signature = inspect.signature(function)
+    signature, hints = inspect.signature(function), get_type_hints(function)
+    parameters = signature.parameters
 
     @functools.wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> T:
-        check_options("", function, signature.bind(*args, **kwargs).arguments, source=function.__name__)
-        return function(*args, **kwargs)
+        bound = signature.bind(*args, **kwargs)
+        for key, value in bound.arguments.items():
+            if Path not in get_args(hints[key]) + (hints[key],):
+                continue
+            if isinstance(value, str):
+                bound.arguments[key] = Path(value)
+            elif isinstance(value, tuple):  # of *paths
+                bound.arguments[key] = tuple(map(Path, value))
+        given = {key: value for key, value in bound.arguments.items() if parameters[key].kind is not VAR_POSITIONAL}
+        check_options("", function, given, source=function.__name__.replace("_", "-"))
+        return function(*bound.args, **bound.kwargs)
 
     return checked

@@ -9,9 +9,7 @@ from nerf_lightning.utils.options import AtLeast
 
 @command
 def compare(
-    runs: list[Path] | None = None,
-    /,
-    *,
+    *runs: Path,
     seconds: Annotated[float, AtLeast(0)] = 15.0,
     within_db: Annotated[float, AtLeast(0)] = 0.5,
     smallest_within_db: Annotated[float, AtLeast(0)] = 1.0,
@@ -42,7 +40,7 @@ def compare(
     from nerf_lightning.runs.index import find_runs
     from nerf_lightning.utils.files import output_path, user_path
 
-    folders = [user_path(folder) for folder in runs or []] or [OUTPUTS]
+    folders = [user_path(folder) for folder in runs] or [OUTPUTS]
     folder = folders[0] / "compare" if output is None else output_path(output)
     file = PUBLISHED if references in ("published", "none") else user_path(references)
     published = read_references(file)

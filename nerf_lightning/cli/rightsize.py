@@ -16,9 +16,8 @@ IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic")
 @command
 def rightsize(
     scene: str,
-    overrides: list[str] | None = None,
     /,
-    *,
+    *overrides: str,
     within_db: Annotated[float, AtLeast(0)] | None = None,
     psnr: float | None = None,
     ladder: str | None = None,
@@ -56,7 +55,7 @@ def rightsize(
     from nerf_lightning.utils.parsing import read_json
 
     folder = output_path(output)
-    cfg = composed([*describe_scene(scene), *(overrides or [])], folder)
+    cfg = composed([*describe_scene(scene), *overrides], folder)
     sizes = read_ladder(ladder or str(cfg.method))
     target = Target(psnr, 0.3 if within_db is None else within_db)
     with owned(folder):

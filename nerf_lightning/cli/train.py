@@ -73,7 +73,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
     from omegaconf import OmegaConf, read_write
     from omegaconf.errors import OmegaConfBaseException
 
-    from nerf_lightning.cli.app import fail
+    from nerf_lightning.cli.app import fail, find_cause
     from nerf_lightning.config import resolvers  # noqa: F401  (conf/ uses the resolvers)
     from nerf_lightning.config.literal import escape, quote_texts
     from nerf_lightning.config.options import replace_nulls
@@ -85,9 +85,12 @@ def run_hydra(overrides: Sequence[str]) -> None:
             with read_write(runtime):  # Hydra does not escape the path that it puts there
                 runtime.output_dir = escape(plain["output_dir"])
             return train_job(cfg)
-        except (InputError, OmegaConfBaseException) as error:
+        except Exception as error:
+            known = error if isinstance(error, OmegaConfBaseException) else find_cause(error)
+            if known is None:
+                raise
             remove_empty(Path(HydraConfig.get().runtime.output_dir))
-            fail(error)  # here, as Hydra would print a line of its own
+            fail(known)  # here, as Hydra would print a line of its own
 
     def refuse(message: str) -> None:
         raise InputError(

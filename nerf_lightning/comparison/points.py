@@ -33,8 +33,8 @@ class Conditions(NamedTuple):
 
 def conditions_of(run: Run) -> Conditions:
     """A run's conditions, from its results.json."""
-    scene: dict[str, Any] = run.results.get("scene") or {}
-    machine: dict[str, Any] = run.results.get("machine") or {}
+    parts = (run.results.get("scene"), run.results.get("machine"))
+    scene, machine = (part if isinstance(part, dict) else {} for part in parts)
     size, views, background = scene.get("resolution"), scene.get("views"), run.results.get("background")
     counts = [views.get(split) for split in ("train", "val")] if isinstance(views, dict) else []
     kind, chip = str(run.results.get("device")).partition(":")[0], machine.get("processor", "unknown processor")

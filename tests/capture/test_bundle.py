@@ -22,7 +22,7 @@ def bundle(photos: int = 8, noise: float = 0.0, off: float = 0.0, seed: int = 0)
     return Bundle(LENS, w2c, np.stack([SIX.poses[0], *tags]), [s.marks for s in seen], np.zeros(6))
 
 
-def test_derivatives_are_those_of_differences():
+def test_problem_jacobian_matches_differences():
     made = replace(bundle(3, noise=0.5, off=0.05), twists=1e-3 * np.arange(6.0))
     made = replace(made, lens=replace(LENS, distortion=(-0.2, 0.05, 0.001, -0.002, 0.01), fy=910.0))
     problem = Problem(made, np.ones(9, bool), {0}, True)
@@ -41,7 +41,7 @@ def test_derivatives_are_those_of_differences():
         np.testing.assert_allclose(jacobian[:, i], slope, rtol=1e-4, atol=1e-4 * max(1.0, np.abs(slope).max()))
 
 
-def test_exact_marks_are_explained_exactly():
+def test_refine_of_exact_marks_finds_truth():
     found = refine(bundle(off=0.03), ("focal", "cx", "cy", "k1", "k2"))
     assert found.total_rms < 1e-4
     np.testing.assert_allclose(lens_vector(found.bundle.lens), lens_vector(LENS), rtol=1e-5, atol=1e-6)
@@ -49,7 +49,7 @@ def test_exact_marks_are_explained_exactly():
         assert angle_between(pose, truth) < 1e-5 and np.abs(pose - truth).max() < 1e-5
 
 
-def test_what_is_not_free_stays():
+def test_refine_keeps_what_is_not_free():
     start = bundle(noise=0.2, off=0.01)
     found = refine(start, (), frozenset(range(6))).bundle
     assert found.lens == start.lens
@@ -57,7 +57,7 @@ def test_what_is_not_free_stays():
     assert refine(start).deviations == {}
 
 
-def test_one_wrong_corner_does_not_bend_the_rest():
+def test_refine_with_wrong_corner_keeps_lens():
     start = bundle(noise=0.05, off=0.01)
     marks = dict(start.marks[2])
     wrong = marks[4].pixels + np.array([[40.0, -30.0], [0, 0], [0, 0], [0, 0]])
@@ -68,7 +68,7 @@ def test_one_wrong_corner_does_not_bend_the_rest():
     assert found.rms.argmax() == 2 and found.rms[2] > 5
 
 
-def test_deviations_tell_the_spread_of_repeated_fits():
+def test_refine_deviations_match_spread_of_repeated_fits():
     focals, told = [], []
     for seed in range(12):
         start = bundle(6, noise=0.2)
@@ -79,7 +79,7 @@ def test_deviations_tell_the_spread_of_repeated_fits():
     assert 0.5 < np.std(focals) / np.mean(told) < 2
 
 
-def test_twisted_paper_is_told_from_flat():
+def test_refine_of_twisted_tag_finds_twist():
     twist, c2w = 7e-4, cameras(8, 3)
     lifted = SIZE * SQUARE + twist * np.array([[0, 0, -1], [0, 0, 1], [0, 0, -1], [0, 0, 1]])
     rng = np.random.default_rng(0)
@@ -97,7 +97,7 @@ def test_twisted_paper_is_told_from_flat():
     assert bent.bundle.twists[0] == pytest.approx(twist, rel=0.1)
 
 
-def test_a_simpler_lens_has_plain_values():
+def test_simplified_lens_has_plain_values():
     lens = replace(LENS, fy=910.0, distortion=(-0.2, 0.05, 0.01, 0.02, 0.03))
     assert simplified(lens, ()) == lens
     plain = simplified(lens, ("focal", "k1"))

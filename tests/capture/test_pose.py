@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 from capture.views import LENS, SIX, SIZE, camera, cameras, sightings
 
-from benchmarks.capture import flips_of_walk
+from benchmarks.capture import count_flips
 from nerf_lightning.capture.poses.flips import resolve_flips
 from nerf_lightning.capture.poses.geometry import (
     angle_between,
@@ -19,7 +19,7 @@ from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import SQUARE
 
 
-def test_motions_go_to_numbers_and_back():
+def test_to_vector_inverts_to_matrix():
     rng = np.random.default_rng(0)
     for vector in rng.standard_normal((20, 6)):
         matrix = to_matrix(vector)
@@ -30,20 +30,20 @@ def test_motions_go_to_numbers_and_back():
     np.testing.assert_allclose(angle_between(to_matrix(np.array([3.0, 0, 0, 0, 0, 0])), np.eye(4)), 3.0, rtol=1e-6)
 
 
-def test_undoing_the_lens_undoes_it():
+def test_normalised_inverts_project():
     points = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 2))
     pixels = project(LENS, np.eye(4), np.concatenate([points, np.ones((50, 1))], axis=1))
     np.testing.assert_allclose(normalised(LENS, pixels), points, atol=1e-9)
 
 
-def test_an_exact_tag_gives_its_pose_first():
+def test_mark_poses_of_exact_tag_gives_true_pose_first():
     for pose in cameras(20, 1):
         mark = Mark(SIZE * SQUARE, project(LENS, inverse(pose), SIZE * SQUARE))
         best, *_ = mark_poses(LENS, mark)
         assert angle_between(best.pose, inverse(pose)) < 1e-4 and best.squares < 1e-6
 
 
-def test_a_tag_seen_from_afar_has_two_solutions():
+def test_mark_poses_of_far_tag_gives_two():
     pose = camera([0.3, 0.1, 1.0], [0, 0, 0])
     solutions = mark_poses(LENS, Mark(SIZE * SQUARE, project(LENS, inverse(pose), SIZE * SQUARE)))
     assert len(solutions) == 2
@@ -51,7 +51,7 @@ def test_a_tag_seen_from_afar_has_two_solutions():
     assert solutions[1].squares < 8 * 0.5**2  # half a pixel of noise would hide the difference
 
 
-def test_all_tags_of_a_photo_settle_its_pose():
+def test_photo_poses_of_six_tags_gives_true_pose_first():
     for seen, pose in zip(sightings(SIX, cameras(10, 2), noise=0.3), cameras(10, 2), strict=True):
         best, *_ = photo_poses(LENS, seen.marks, SIX.poses)
         assert angle_between(best.pose, inverse(pose)) < np.radians(0.6)
@@ -59,22 +59,22 @@ def test_all_tags_of_a_photo_settle_its_pose():
     assert photo_poses(LENS, seen.marks, {99: np.eye(4)}) == []
 
 
-def test_neighbours_tell_a_flipped_tag():
-    found = flips_of_walk(seed=3, count=80, tilt=15.0, pace=40)
+def test_resolve_flips_of_slow_walk_leaves_none():
+    found = count_flips(seed=3, count=80, tilt=15.0, pace=40)
     assert found["alone"] >= 4 and found["in_order"] == 0
 
 
-def test_neighbours_tell_more_than_the_best_fit_where_steps_are_large():
-    found = flips_of_walk(seed=1, count=120, tilt=15.0, pace=20)
+def test_resolve_flips_of_fast_walk_leaves_one_at_most():
+    found = count_flips(seed=1, count=120, tilt=15.0, pace=20)
     assert found["alone"] >= 4 and found["in_order"] <= 1
 
 
-def test_photos_in_random_order_say_nothing_of_each_other():
-    found = flips_of_walk(seed=0, count=80, tilt=20.0, pace=40, shuffled=True)
+def test_resolve_flips_of_random_order_is_not_worse():
+    found = count_flips(seed=0, count=80, tilt=20.0, pace=40, shuffled=True)
     assert found["in_order"] <= found["alone"]
 
 
-def test_photos_without_order_keep_their_best():
+def test_resolve_flips_of_scattered_photos_keeps_their_best():
     c2w, rng = cameras(15, 5, tilt=45), np.random.default_rng(7)
     points = SIX.corners(4)
     seen = [(points, project(LENS, inverse(pose), points) + 0.1 * rng.standard_normal((4, 2))) for pose in c2w]
@@ -83,7 +83,7 @@ def test_photos_without_order_keep_their_best():
     assert resolve_flips(LENS, options, world) == [0] * 15
 
 
-def test_a_lens_that_folds_the_picture_is_told():
+def test_folds_of_turning_polynomial_is_true():
     assert not folds(LENS) and not folds(replace(LENS, distortion=(0.0, 0.0, 0.0, 0.0, 0.0)))
     assert not folds(replace(LENS, distortion=(-0.3, 0.1, 0.0, 0.0, 0.0)))
     assert folds(replace(LENS, distortion=(0.16, -1.0, 0.0, 0.0, 0.0)))  # turns back, and never reaches the corner

@@ -7,7 +7,7 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from compare.conftest import run_maker
+from comparison.conftest import run_maker
 from made_runs import MakeRun
 
 from nerf_lightning.cli.compare import compare
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_run("ship", scene={"name": "ship", "views": {"train": 9, "val": 2}, "resolution": [8, 6]}, seed=5)
     make_run("cut", text='{"scene": {"name": "toy"}, "psnr": 3')
     (root / "mine.yaml").write_text(f"mine:\n{ENTRY}{METHODS}")
-    compare([root / "runs", root / "runs" / "ship"], references=str(root / "mine.yaml"), output=root / "out")
+    compare(root / "runs", root / "runs" / "ship", references=str(root / "mine.yaml"), output=root / "out")
     return root / "out"
 
 
@@ -76,13 +76,13 @@ def test_compare_page_is_self_contained_and_escapes_names(folder: Path):
 def test_compare_bad_input_is_named(arguments: dict, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=words):
-        compare(arguments.pop("runs"), **arguments)
+        compare(*arguments.pop("runs"), **arguments)
     assert not list(tmp_path.iterdir())
 
 
 def test_compare_only_failed_runs_are_listed(make_run: MakeRun, tmp_path: Path):
     make_run("a", text="{")
-    table = compare([tmp_path / "runs"], references="none")
+    table = compare(tmp_path / "runs", references="none")
     assert list(table["status"]) == ["unreadable"]
     assert "a: unreadable" in (tmp_path / "runs" / "compare" / "compare.html").read_text("utf-8")
 

@@ -1,9 +1,9 @@
 import logging
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -126,27 +126,27 @@ def test_place_same_photos_are_placed_once(own, caplog: pytest.LogCaptureFixture
     assert sorted(path.name for path in folder.iterdir()) == [*(f"{number}.jpg" for number in range(9)), "placed"]
 
 
-def refusing(*folders: Path) -> Callable[..., str]:
-    real = tempfile.mkdtemp
+def refusing(*folders: Path) -> Callable[..., None]:
+    real = Path.mkdir
 
-    def mkdtemp(suffix: str | None = None, prefix: str | None = None, dir: Path | None = None) -> str:
-        if dir in folders:
-            raise PermissionError(13, "Permission denied", str(dir))
-        return real(suffix, prefix, dir)
+    def mkdir(folder: Path, *args: Any, **kwargs: Any) -> None:
+        if folder.parent in folders:
+            raise PermissionError(13, "Permission denied", str(folder))
+        real(folder, *args, **kwargs)
 
-    return mkdtemp
+    return mkdir
 
 
 def test_place_unwritable_folder_uses_the_cache(own, tmp_path, monkeypatch, caplog):
     folder, calls = own
     monkeypatch.setenv("NERF_LIGHTNING_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(tempfile, "mkdtemp", refusing(folder))
+    monkeypatch.setattr(Path, "mkdir", refusing(folder))
     model = place(folder)
     assert tmp_path / "cache" in model.parents and not (folder / "placed").exists()
     assert f"{folder / 'placed'} cannot be written (Permission denied)" in caplog.text
     assert place(folder) == model and calls == [8]
     shutil.rmtree(tmp_path / "cache")
-    monkeypatch.setattr(tempfile, "mkdtemp", refusing(folder, model.parents[2]))
+    monkeypatch.setattr(Path, "mkdir", refusing(folder, model.parents[2]))
     with pytest.raises(InputError, match="found Permission denied, expected a folder that can be written; set NERF_"):
         place(folder)
 

@@ -42,7 +42,7 @@ def scene(tmp_path: Path) -> str:
 def search_small(scene: str, overrides: list[str] = [], **options: Any) -> dict[str, Any]:  # noqa: B006
     folder = Path(scene).parent
     given = ["recipe=tensorf_medium", "callbacks.orbit=null", *FAST, *overrides]
-    return rightsize(scene, given, **{"ladder": str(folder / "ladder.yaml"), "output": folder / "found", **options})
+    return rightsize(scene, *given, **{"ladder": str(folder / "ladder.yaml"), "output": folder / "found", **options})
 
 
 def test_rightsize_leaves_smallest_that_is_enough_and_an_experiment(
@@ -81,7 +81,7 @@ def test_rightsize_takes_images_and_any_distance(tmp_path: Path):
     imageio.imwrite(tmp_path / "a b.png", torch.arange(32 * 32 * 3).view(32, 32, 3).remainder(251).byte().numpy())
     off = [f"callbacks.{one}=null" for one in ("training_gif", "charts", "baselines")]
     given = ["model=picture_mlp", *off, *FAST]
-    found = rightsize(str(tmp_path / "a b.png"), given, within_db=100.0, output=tmp_path / "found")
+    found = rightsize(str(tmp_path / "a b.png"), *given, within_db=100.0, output=tmp_path / "found")
     assert found["rung"] == 0 and found["reached"] and found["sampler"] == {}
 
 

@@ -138,7 +138,7 @@ def test_full_disk_keeps_the_last_checkpoint(room: int, undisturbed: Path, insid
     with monkeypatch.context() as patch:
         at_step(patch, Progress, "on_train_batch_end", lambda: limit(room))
         # Who reads what the process has said needs files too.
-        patch.setattr("nerf_lightning.config.cli.give_up", lift_limit(limit))
+        patch.setattr("nerf_lightning.cli.app.fail", lift_limit(limit))
         code, _, err = inside(*SMALL, "logger=null", "callbacks.checkpoints.every_seconds=1e-9", "name=broken")
     assert code == 2 and err.count("\n") == 1 and "no space left on the device" in err, err
     assert read_state(run_of("broken"))[0] == STOP - 1 and not temporary_files()
@@ -150,15 +150,15 @@ def test_full_disk_keeps_the_last_checkpoint(room: int, undisturbed: Path, insid
 
 
 def lift_limit(limit: Callable[[int], None]) -> Callable[[Exception], None]:
-    from nerf_lightning.config import cli
+    from nerf_lightning.cli import app as cli
 
-    end = cli.give_up
+    end = cli.fail
 
-    def give_up(error: Exception) -> None:
+    def fail(error: Exception) -> None:
         limit(resource.RLIM_INFINITY)
         end(error)
 
-    return give_up
+    return fail
 
 
 def test_checkpoints_that_do_not_fit_are_refused_before_training(undisturbed: Path, inside, monkeypatch):

@@ -151,7 +151,7 @@ def _squared_errors(
 
 
 def _posterior_means(
-    likelihoods: Sequence[Float[np.ndarray, "S S"]], axis: Float[np.ndarray, "S"], drift: Float[np.ndarray, "N-1 2"]
+    likelihoods: Sequence[Float[np.ndarray, "S S"]], axis: Float[np.ndarray, "S"], drift: Float[np.ndarray, "M 2"]
 ) -> tuple[Float[np.ndarray, "N 2"], float]:
     """Mean direction of each photo given all photos, with the step width of most evidence, and that width (the
     forward-backward algorithm; Rabiner 1989).

@@ -15,20 +15,11 @@ FEWEST = 6
 
 @dataclass(frozen=True)
 class Board:
-    """A chessboard of `columns` x `rows` squares of side `square`, metres.
-
-    Raises:
-        InputError: a board too small to have inner corners.
-    """
+    """A chessboard of `columns` x `rows` squares, at least 3 each, of side `square`, metres."""
 
     columns: int
     rows: int
     square: float
-
-    def __post_init__(self) -> None:
-        for key, squares in (("columns", self.columns), ("rows", self.rows)):
-            if squares < 3:
-                raise InputError("capture", f"board_{key}", str(squares), "at least 3 squares")
 
 
 def board_detector(dictionary: str, size: float, board: Board) -> Detector:
