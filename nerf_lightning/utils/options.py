@@ -68,7 +68,9 @@ def check_options(
     open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
     prefix = f"{where}." if where else ""
     for name, value in options.items():
-        if name not in parameters and not open_ended:
+        if name not in parameters and open_ended:
+            continue
+        if name not in parameters:
             near = difflib.get_close_matches(name, parameters, 1)
             known = ", ".join(key for key in parameters if key not in given and key != "self")
             todo = f"did you mean {near[0]}?" if near else ""
