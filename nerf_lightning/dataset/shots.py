@@ -163,8 +163,8 @@ def read_shots(source: Path, shots: Sequence[Shot], reading: Reading) -> Views:
     of = sizes if reading.undistort else [(shot.optics.width, shot.optics.height) for shot in shots]
     cameras = Cameras(torch.from_numpy(K).float(), c2w.float(), torch.tensor(of), bent).resized(torch.tensor(small))
     counted = None if known is None or known.all() else Runs.of(torch.from_numpy(known))
-    stated = [stated_exposure(shot.photo) for shot in shots]
-    exposures = tuple(one for one in stated if one is not None)
+    gathered = [stated_exposure(shot.photo) for shot in shots]
+    exposures = tuple(one for one in gathered if one is not None)
     names = tuple(shot.name for shot in shots)
     return Views(torch.from_numpy(pixels), cameras, counted, names, exposures if len(exposures) == len(shots) else ())
 

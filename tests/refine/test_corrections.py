@@ -225,7 +225,7 @@ def test_run_with_corrections_reports_and_exports_them(tmp_path: Path, capsys, m
 def test_refine_auto_bad_outlines_start_pose_correction(tmp_path: Path):
     size = {"size": 16, "train_views": 12, "val_views": 1}
     options = ["+experiment=smoke_3d", "refine=auto", "dataset.rays=64", f"budget.steps={FIRST - 1}", *OFF]
-    for scene, wanted in ((bricks(**size), False), (corruptions.with_pose_noise(bricks(**size), 0, 15.0, 0.1), True)):
+    for scene, wanted in ((bricks(**size), False), (corruptions.add_pose_noise(bricks(**size), 0, 15.0, 0.1), True)):
         folder = tmp_path / str(wanted)
         train(composed(options, folder), folder=folder, scene=scene)
         results = json.loads((folder / "results.json").read_text())

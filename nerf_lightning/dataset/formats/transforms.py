@@ -115,8 +115,8 @@ def read_split(frames: list[Frame]) -> Split | None:
     rest = [i for i in range(len(frames)) if not any(i in part for part in named.values())]
     train = named.get("train", rest)
     held_out = [named[part] for part in ("val", "test") if named.get(part)] or [rest]
-    for part in held_out:
-        if both := sorted(set(part) & set(train)):
+    for views in held_out:
+        if both := sorted(set(views) & set(train)):
             found = f"{frames[both[0]].name!r}, which is in train_filenames too"
             raise InputError(file, "val_filenames, test_filenames", found, "held-out photos of their own")
     checks.split_size(file, "train split", len(train))
