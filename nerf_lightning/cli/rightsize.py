@@ -45,6 +45,10 @@ def rightsize(
     """
     if within_db is not None and psnr is not None:
         raise InputError("rightsize", "psnr", f"{psnr:g} and within_db={within_db:g}", "one of the two")
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from nerf_lightning.cli.train import translate_error
     from nerf_lightning.config.compose import composed
     from nerf_lightning.runs.owner import owned
     from nerf_lightning.sizing.choose import Target
@@ -55,7 +59,10 @@ def rightsize(
     from nerf_lightning.utils.parsing import read_json
 
     folder = output_path(output)
-    cfg = composed([*describe_scene(scene), *overrides], folder)
+    try:
+        cfg = composed([*describe_scene(scene), *overrides], folder)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise translate_error(error) from error
     sizes = read_ladder(ladder or str(cfg.method))
     target = Target(psnr, 0.3 if within_db is None else within_db)
     with owned(folder):

@@ -109,7 +109,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job)()
     except (HydraException, OmegaConfBaseException) as error:
-        raise _translate(error) from error
+        raise translate_error(error) from error
 
 
 def train_job(cfg: "DictConfig") -> float | None:
@@ -205,7 +205,7 @@ def _suggest_flag(message: str) -> str:
     return f"did you mean {key}{found[2] or '=...'}?"
 
 
-def _translate(error: Exception) -> InputError:
+def translate_error(error: Exception) -> InputError:
     """An error of Hydra or OmegaConf as bad input, with the nearest key where one is not known."""
     line = " ".join(str(error).split("Config search path")[0].split())
     if (unknown := re.match(r"Could not override '([^']+)'", line)) is not None:

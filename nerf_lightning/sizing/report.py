@@ -69,9 +69,10 @@ def draw_chart(found: dict[str, Any]) -> Figure:
     enough = max(one["psnr"] for one in full) - target["within_db"] if target["psnr"] is None else target["psnr"]
     figure = Figure(figsize=(7.2, 4.6), dpi=DPI, layout="constrained")
     axes = figure.subplots()
-    for rungs, style, colour, label in ((growing, "o-", BLUE, "while growing"), (full, "s", ORANGE, "trained in full")):
+    kinds = ((growing, "o-", BLUE, "white", "while growing"), (full, "s", ORANGE, ORANGE, "trained in full"))
+    for rungs, style, colour, fill, label in kinds:
         sizes, figures = [one["size"] / 1000 for one in rungs], [one["psnr"] for one in rungs]
-        axes.plot(sizes, figures, style, color=colour, ms=8, mfc="white", label=label)
+        axes.plot(sizes, figures, style, color=colour, ms=8, mfc=fill, label=label)
     for rung, one in enumerate(growing):
         offset = (0, 8) if rung % 2 else (0, -16)  # neighbours may be as large as each other
         place = one["size"] / 1000, one["psnr"]
@@ -80,6 +81,8 @@ def draw_chart(found: dict[str, Any]) -> Figure:
     axes.plot(*place, "o", ms=19, mfc="none", mec=VERMILLION, mew=2, label=f"chosen: rung {found['rung']}")
     axes.axhline(enough, color=GREY, lw=1, ls="--", label=f"enough: {enough:.2f} dB")
     axes.set(xscale="log", xlabel="compact file, kB", ylabel="held-out PSNR, dB", title="What each size is worth")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.margins(0.08, 0.12)
     axes.grid(alpha=0.3)
-    axes.legend(loc="lower right")
+    axes.legend(loc="best")
     return figure

@@ -21,10 +21,9 @@ from nerf_lightning.export.reach import confined_to, seen_cells
 from nerf_lightning.export.smallest import held_out_psnr, smallest, some_cameras
 from nerf_lightning.model import as_wide
 from nerf_lightning.runs.compact import encode
-from nerf_lightning.runs.find import MARKER
 from nerf_lightning.runs.folder import load_run, plain_config
 from nerf_lightning.runs.index import read_run
-from nerf_lightning.runs.owner import LOCK
+from nerf_lightning.runs.owner import is_empty
 from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.sizing.choose import Measured, Target, choose_final, choose_first, choose_second, stop_growing
 from nerf_lightning.sizing.ladder import Ladder, Options
@@ -128,7 +127,7 @@ def begin(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None
         InputError: where the folder holds anything else.
     """
     plan = {"target": asdict(target), "ladder": asdict(ladder), "config": plain_config(cfg)}
-    if not output.is_dir() or not any(file.name not in (LOCK, MARKER) for file in output.iterdir()):
+    if is_empty(output):
         write_json(output / PLAN, plan)
     elif not (output / PLAN).is_file() or read_json(output / PLAN, "a plan") != json.loads(json.dumps(plan)):
         found, expected = "something else in it", "a folder for this search alone"

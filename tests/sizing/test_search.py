@@ -93,6 +93,8 @@ def test_rightsize_takes_images_and_any_distance(tmp_path: Path):
         ([], {"ladder": "none_such"}, "none_such"),
         ([], {"output": Path()}, "in it"),
         (["threads=0"], {}, "threads"),
+        (["budget.second=60"], {}, "budget.seconds"),
+        (["budget.seconds=["], {}, "command line"),
         (["sampler.samples=-1"], {}, "sampler.samples"),
     ],
 )
