@@ -26,7 +26,7 @@ FOLDER_KEYS = ("hydra.run.dir", "hydra.sweep.dir")
 
 def is_override(word: str) -> bool:
     """Whether a command line's first word is for Hydra: KEY=VALUE, +KEY=VALUE, ~KEY, or one of its flags."""
-    if word in ("-h", "--help", "--version"):
+    if word in ("-h", "--help", "--version", "--install-completion"):
         return False
     return word.startswith(("+", "~", "-")) or re.match(r"[\w./@]+=", word) is not None
 

@@ -28,6 +28,15 @@ def test_help_of_a_command_fits_a_screen(name: str, inside, monkeypatch: pytest.
     assert len(out.splitlines()) <= 45
 
 
+def test_install_completion_writes_a_script(inside, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("SHELL", "/bin/bash")
+    code, out, err = inside("--install-completion")
+    assert code == 0, err
+    assert any("rightsize" in file.read_text() for file in tmp_path.rglob("*") if file.is_file()), out
+
+
 def test_without_arguments_lists_commands_in_the_order_of_the_work(inside):
     code, out, _ = inside()
     assert code == 0
