@@ -73,7 +73,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
     from omegaconf import OmegaConf, read_write
     from omegaconf.errors import OmegaConfBaseException
 
-    from nerf_lightning.cli.app import fail
+    from nerf_lightning.cli.app import fail, find_cause
     from nerf_lightning.config import resolvers  # noqa: F401  (conf/ uses the resolvers)
     from nerf_lightning.config.literal import escape, quote_texts
     from nerf_lightning.config.options import replace_nulls
@@ -85,9 +85,12 @@ def run_hydra(overrides: Sequence[str]) -> None:
             with read_write(runtime):  # Hydra does not escape the path that it puts there
                 runtime.output_dir = escape(plain["output_dir"])
             return train_job(cfg)
-        except (InputError, OmegaConfBaseException) as error:
+        except Exception as error:
+            known = error if isinstance(error, OmegaConfBaseException) else find_cause(error)
+            if known is None:
+                raise
             remove_empty(Path(HydraConfig.get().runtime.output_dir))
-            fail(error)  # here, as Hydra would print a line of its own
+            fail(known)  # here, as Hydra would print a line of its own
 
     def refuse(message: str) -> None:
         raise InputError(
@@ -114,24 +117,38 @@ def train_job(cfg: "DictConfig") -> float | None:
 
     Returns:
         Held-out PSNR in dB, which a sweep optimises; None for a sweep's job that failed.
+
+    Raises:
+        InputError: as `training.train.train`, and where the folder belongs to another run.
     """
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
+    from omegaconf import OmegaConf, read_write
 
+    from nerf_lightning.config.literal import escape
     from nerf_lightning.config.options import check_run_options
     from nerf_lightning.utils.signals import Interrupted
 
-    if HydraConfig.get().mode == RunMode.MULTIRUN:
+    hydra: Any = HydraConfig.get()
+    if hydra.mode == RunMode.MULTIRUN:
         from nerf_lightning.training.sweep import job
 
         return job(cfg)
-    from nerf_lightning.training.command import run
+    check_run_options(cfg, hydra.runtime.choices)
+    from nerf_lightning.runs.owner import own_folder, owned
+    from nerf_lightning.training.train import train as train_run
 
-    check_run_options(cfg, HydraConfig.get().runtime.choices)
+    folder = Path(hydra.runtime.output_dir)
     try:
-        return run(cfg)
+        if cfg.resume is not None:
+            with owned(folder):
+                return train_run(cfg)
+        timed = "${now:" in str(OmegaConf.to_container(hydra.run, resolve=False))
+        with own_folder(folder, cfg.overwrite, renamed=timed) as folder:
+            with read_write(hydra):  # further processes of this run ask Hydra
+                hydra.run.dir = hydra.runtime.output_dir = escape(str(folder))
+            return train_run(cfg)
     except Interrupted as interrupted:
-        folder = Path(HydraConfig.get().runtime.output_dir)
         if (folder / "checkpoints" / "last.ckpt").exists():
             argument = shlex.quote(f"resume={os.path.relpath(folder)}")
             interrupted.hint = f"continue with: nerf_lightning train {argument}"
