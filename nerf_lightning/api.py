@@ -195,9 +195,8 @@ def train(
         f"device={device}",
         f"budget.seconds={'null' if seconds is None else seconds}",
         f"budget.steps={'null' if steps is None else steps}",
+        *([] if recipe is None else [f"recipe={recipe}"]),
     ]
-    if recipe is not None:
-        given.append(f"recipe={recipe}")
     try:
         with undisturbed(), handle_signals():
             cfg = composed([*given, *options], place)
@@ -217,19 +216,15 @@ def undisturbed() -> Iterator[None]:
     hydra, threads, kernels = HydraConfig.instance().cfg, torch.get_num_threads(), chosen_kernels()
     flushed = float(torch.tensor(1e-40) * 1) == 0
     numbers, more_numbers, environment = random.getstate(), np.random.get_state(), dict(os.environ)
-    torchs, cards = torch.get_rng_state(), torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     levels = {name: logging.getLogger(name).level for name in NOISY}
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), torch.random.fork_rng(range(torch.cuda.device_count())):
             yield
     finally:
         HydraConfig.instance().cfg = hydra
         torch.set_num_threads(threads)
         use_kernels(kernels)
         torch.set_flush_denormal(flushed)
-        torch.set_rng_state(torchs)
-        if cards:
-            torch.cuda.set_rng_state_all(cards)
         random.setstate(numbers)
         np.random.set_state(more_numbers)
         for name in os.environ.keys() - environment.keys():

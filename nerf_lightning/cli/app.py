@@ -41,23 +41,14 @@ app = App(
 )
 _help = f"{inspect.cleandoc(train.__doc__ or '')}\n{describe_groups()}"
 _commands: tuple[Any, ...] = (
-    print_tags,
-    capture,
-    check,
-    train,
-    view,
-    render,
-    evaluate,
-    export,
-    compare,
-    rightsize,
-    stability,
+    *(print_tags, capture, check, train, view, render),
+    *(evaluate, export, compare, rightsize, stability),
 )
 for _command in _commands:
-    if _command is not train:
+    if _command is train:
+        app.command(train, help=_help, help_format="plaintext", usage="Usage: nerf_lightning train KEY=VALUE...\n")
+    else:
         app.command(_command)
-        continue
-    app.command(train, help=_help, help_format="plaintext", usage="Usage: nerf_lightning train KEY=VALUE...\n")
 for _number, _name in enumerate(app.resolved_commands()):
     app[_name].sort_key = _number
 app.register_install_completion_command()

@@ -117,24 +117,38 @@ def train_job(cfg: "DictConfig") -> float | None:
 
     Returns:
         Held-out PSNR in dB, which a sweep optimises; None for a sweep's job that failed.
+
+    Raises:
+        InputError: as `training.train.train`, and where the folder belongs to another run.
     """
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
+    from omegaconf import OmegaConf, read_write
 
+    from nerf_lightning.config.literal import escape
     from nerf_lightning.config.options import check_run_options
     from nerf_lightning.utils.signals import Interrupted
 
-    if HydraConfig.get().mode == RunMode.MULTIRUN:
+    hydra: Any = HydraConfig.get()
+    if hydra.mode == RunMode.MULTIRUN:
         from nerf_lightning.training.sweep import job
 
         return job(cfg)
-    from nerf_lightning.training.command import run
+    check_run_options(cfg, hydra.runtime.choices)
+    from nerf_lightning.runs.owner import own_folder, owned
+    from nerf_lightning.training.train import train as train_run
 
-    check_run_options(cfg, HydraConfig.get().runtime.choices)
+    folder = Path(hydra.runtime.output_dir)
     try:
-        return run(cfg)
+        if cfg.resume is not None:
+            with owned(folder):
+                return train_run(cfg)
+        timed = "${now:" in str(OmegaConf.to_container(hydra.run, resolve=False))
+        with own_folder(folder, cfg.overwrite, renamed=timed) as folder:
+            with read_write(hydra):  # further processes of this run ask Hydra
+                hydra.run.dir = hydra.runtime.output_dir = escape(str(folder))
+            return train_run(cfg)
     except Interrupted as interrupted:
-        folder = Path(HydraConfig.get().runtime.output_dir)
         if (folder / "checkpoints" / "last.ckpt").exists():
             argument = shlex.quote(f"resume={os.path.relpath(folder)}")
             interrupted.hint = f"continue with: nerf_lightning train {argument}"

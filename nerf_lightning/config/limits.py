@@ -7,7 +7,6 @@ import yaml
 from omegaconf import DictConfig
 
 from nerf_lightning.config import conf_dir
-from nerf_lightning.errors import InputError
 from nerf_lightning.utils.options import Count, check_options
 
 
@@ -30,9 +29,6 @@ def limits_of(cfg: DictConfig, device: torch.device) -> Limits:
     folder = conf_dir() / "devices"
     own = folder / f"{device.type}.yaml"
     limits = yaml.safe_load((own if own.exists() else folder / "cpu.yaml").read_text(encoding="utf-8"))
-    given = cfg.get("limits", {})
-    if not isinstance(given, DictConfig | dict):
-        raise InputError("config", "limits", repr(given), "batch and chunk, each a number or null")
-    limits |= {str(key): value for key, value in given.items() if value is not None}
+    limits |= {str(key): value for key, value in cfg.get("limits", {}).items() if value is not None}
     check_options("limits", Limits, limits)
     return Limits(**limits)

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any
+from typing import Annotated
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -37,16 +37,16 @@ class RunOptions:
     overwrite: bool
     budget: dict
     limits: dict
-    dataset: Any
-    model: Any
-    optimizer: Any
-    schedule: Any
-    trainer: Any
-    sampler: Any = None
-    renderer: Any = None
-    refine: Any = None
-    callbacks: Any = None
-    logger: Any = None
+    dataset: dict
+    model: dict
+    optimizer: dict
+    schedule: dict
+    trainer: dict
+    sampler: dict | None = None
+    renderer: dict | None = None
+    refine: dict | None = None
+    callbacks: dict | None = None
+    logger: dict | None = None
     render: dict[str, Annotated[float, AtLeast(0)] | None] | None = None
     """Of an experiment with a 2D field: `scale` of the enlarged image."""
 

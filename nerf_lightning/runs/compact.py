@@ -175,5 +175,5 @@ def load_compact(path: Path, device: torch.device = CPU) -> RunFolder:
     Raises:
         InputError: as `decode`, and where there is no such file.
     """
-    existing_file(path, "a compact file", "python -m nerf_lightning.export makes one")
+    existing_file(path, "a compact file", "nerf_lightning export compact makes one")
     return decode(read_content(path), path, device)

@@ -8,7 +8,7 @@ snapshots/ orbit.gif   pictures
 """
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from torch import Tensor
 import nerf_lightning
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.config.build import Frame, build_system, resolved
+from nerf_lightning.config.options import RunOptions
 from nerf_lightning.errors import InputError, found_in
 from nerf_lightning.runs.checkpoint import check_finite, read_checkpoint
 from nerf_lightning.runs.scene_file import frame_from, load_scene
@@ -28,20 +29,18 @@ from nerf_lightning.runs.trusted import check_config
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.files import atomic, user_path
+from nerf_lightning.utils.options import check_options
 from nerf_lightning.utils.parsing import VALUE_ERRORS, existing_file, read_yaml
 
-GROUPS = ("dataset", "optimizer", "schedule", "model", "trainer")
-"""Groups of a configuration, in the order written: if a file was cut short, at least the last is missing."""
-
-
+OF_COMMAND = ("overwrite", "version")
+"""Keys of a configuration that are not those of the run that was made with it."""
 VERSION = ".".join(nerf_lightning.__version__.split(".")[:2])
 """Of this package, as runs are marked with: those of another one are refused."""
 
 
 def plain_config(cfg: DictConfig) -> dict[str, Any]:
     """The resolved configuration; a relative dataset path becomes absolute, so that it is valid from any folder."""
-    of_command = ("overwrite", "version")
-    plain = {"version": VERSION} | {key: value for key, value in resolved(cfg).items() if key not in of_command}
+    plain = {"version": VERSION} | {key: value for key, value in resolved(cfg).items() if key not in OF_COMMAND}
     path = plain["dataset"].get("path")
     if path is not None:
         plain["dataset"]["path"] = os.path.abspath(user_path(path))
@@ -72,10 +71,9 @@ def config_from(plain: Any, path: Path | str) -> DictConfig:
         found = "no version" if version is None else f"version {version}"
         todo = "train the run again, or use the version of nerf_lightning that made it"
         raise InputError(path, "version", found, f"version {VERSION}, which this one reads", todo)
-    for group in GROUPS:
-        if not isinstance(checked.get(group), dict):
-            found = repr(checked[group])[:60] if group in checked else "nothing"
-            raise InputError(path, group, found, "a run's whole configuration", "was the file cut short?")
+    known = {field.name for field in fields(RunOptions)}
+    options = {key: value for key, value in checked.items() if key in known}
+    check_options("", RunOptions, options, OF_COMMAND, source=str(path))
     return OmegaConf.create(checked)
 
 

@@ -91,14 +91,10 @@ def find_runs(root: Path) -> list[Run]:
     return [read_run(folder) for folder in sorted(folders, key=_in_order)]
 
 
-def _in_order(folder: Path) -> list[tuple[bool, float, str]]:
+def _in_order(folder: Path) -> list[tuple[float, str]]:
     """Sorts =2 before =10."""
-    words = re.split(r"(?<==)([-+.\de]+)(?=,|$)", str(folder))
-    return [(not _number(word), float(word) if _number(word) else 0.0, word) for word in words]
-
-
-def _number(word: str) -> bool:
-    return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", word) is not None
+    words = re.split(r"(?<==)([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?=,|$)", str(folder))
+    return [(float(word), "") if place % 2 else (0.0, word) for place, word in enumerate(words)]
 
 
 def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -116,7 +112,7 @@ def varied(runs: Sequence[Run]) -> list[str]:
     common = [key for key in (options[0] if options else {}) if all(key in other for other in options)]
     keys = [key for key in common if any(other[key] != options[0][key] for other in options)]
     if "recipe" in keys and all(other["recipe"] for other in options):
-        keys = [key for key in keys if key == "recipe" or not _follows(key, "recipe", options)]
+        keys = [key for key in keys if key == "recipe" or not _is_set_by_recipe(key, options)]
     if "method" in keys:
         keys = [key for key in keys if not key.startswith("model.")]
     kept: dict[tuple[str, str], str] = {}
@@ -125,23 +121,12 @@ def varied(runs: Sequence[Run]) -> list[str]:
     return [key for key in keys if key in kept.values() and not key.endswith("_target_")]
 
 
-def _follows(key: str, other: str, options: Sequence[dict[str, Any]]) -> bool:
-    """Whether runs with the same value at `other` have the same at `key`."""
-    pairs = {(str(one[other]), str(one[key])) for one in options}
-    return len(pairs) == len({value for value, _ in pairs})
-
-
-FIGURES = (
-    "scene", "background", "method", "seed", "device", "threads", "machine", "load", "versions", "parameters",
-    "artifact_bytes", "train_seconds", "steps", "rays_per_second", "psnr", "ssim", "psnr_worst_view",
-    "rows_measured", "test", "render_seconds_per_view", "peak_memory_bytes", "curve", "warnings", "plateau", "recoveries",
-    "status", "diagnosis",
-)  # fmt: skip
-"""The keys of every results.json."""
+def _is_set_by_recipe(key: str, options: Sequence[dict[str, Any]]) -> bool:
+    """Whether runs of one recipe have one value at `key`."""
+    return len({(one["recipe"], str(one[key])) for one in options}) == len({one["recipe"] for one in options})
 
 
 def failed_results(method: Any, seed: Any, diagnosis: str) -> dict[str, Any]:
     """A results.json for a run that failed before it could write its own."""
-    nothing: dict[str, Any] = dict.fromkeys(FIGURES)
-    empty: dict[str, Any] = {"curve": [], "warnings": [], "recoveries": []}
-    return nothing | empty | {"method": method, "seed": seed, "status": "failed", "diagnosis": diagnosis}
+    empty: dict[str, Any] = {"psnr": None, "curve": [], "warnings": [], "recoveries": []}
+    return {"method": method, "seed": seed, "status": "failed", "diagnosis": diagnosis} | empty

@@ -2,11 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
-from omegaconf import DictConfig
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
@@ -19,14 +17,12 @@ from nerf_lightning.utils.libraries import silence_lightning
 
 
 @dataclass(frozen=True)
-class SceneRun:
+class SceneRun(RunFolder):
     """As `RunFolder`, for a scene."""
 
-    cfg: DictConfig
     system: NeRF3D
     orbit: Cameras
     to_source: Float[Tensor, "4 4"]
-    scene: dict[str, Any]
 
     @property
     def scale(self) -> float:
@@ -55,7 +51,7 @@ def open_scene_run(path: Path, device: torch.device) -> SceneRun:
     found = open_run(path, device)
     if not isinstance(found.system, NeRF3D) or found.orbit is None or found.to_source is None:
         raise InputError(path, "", "a picture's run", "a scene's run", "final.png shows a picture")
-    return SceneRun(found.cfg, found.system, found.orbit, found.to_source, found.scene)
+    return SceneRun(**vars(found))
 
 
 def beside(path: Path) -> Path:

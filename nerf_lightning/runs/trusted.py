@@ -1,39 +1,28 @@
 """What a configuration from outside may name: a stranger's run folder or compact file must not execute code."""
 
+import functools
 import importlib
 import math
 import os
+import re
 from pathlib import Path
 from typing import Any
 
+from nerf_lightning.config import conf_dir
 from nerf_lightning.config.literal import escape
 from nerf_lightning.errors import InputError
 
 TRUST = "NERF_LIGHTNING_TRUST"
 """Environment variable: further packages, comma-separated, whose classes a run folder may name."""
-TARGETS = {
-    "lightning": ("Trainer",),
-    "lightning.pytorch.loggers": ("CSVLogger",),
-    "nerf_lightning.callbacks": (
-        *("Baselines", "Checkpoints", "Enlarge", "Guard", "HeldOut", "Live", "Orbit", "PictureCharts", "Progress"),
-        *("Snapshots", "Throughput", "TrainingGif"),
-    ),
-    "nerf_lightning.dataset": ("from_bricks", "from_download", "from_photos", "from_picture"),
-    "nerf_lightning.model": (
-        *("FourierField", "HashGrid2DField", "HashGridField", "MLPField", "PictureMLP", "SirenField", "TensoRFField"),
-        "VoxelField",
-    ),
-    "nerf_lightning.refine": ("Corrections",),
-    "nerf_lightning.renderer": ("VolumeRenderer",),
-    "nerf_lightning.sampler": (
-        *("ImportanceSampler", "OccupancySampler", "ProposalSampler", "UniformSampler"),
-        "suited_sampler",
-    ),
-    "nerf_lightning.system": ("constant", "cosine", "exponential"),
-    "nerf_lightning.training.loggers": ("TensorBoard", "mlflow", "wandb"),
-    "torch.optim": ("Adam", "AdamW"),
-}
-"""What a run folder may name, by module. Anything else could be called with a stranger's arguments."""
+SWEEP_CALLBACK = "nerf_lightning.training.sweep.SweepReport"
+"""Hydra's, never in a run's configuration."""
+
+
+@functools.cache
+def shipped_targets() -> frozenset[str]:
+    """What the shipped configuration builds. Anything else could be called with a stranger's arguments."""
+    texts = "".join(file.read_text(encoding="utf-8") for file in conf_dir().rglob("*.yaml"))
+    return frozenset(re.findall(r"_target_: ([\w.]+)", texts)) - {SWEEP_CALLBACK}
 
 
 def check_config(plain: Any, path: Path | str) -> dict[str, Any]:
@@ -69,9 +58,9 @@ def _check(path: Path | str, key: str, node: Any) -> None:
 
 def _is_trusted(target: Any) -> bool:
     """Whether a target is on the list, or defined (not merely imported) in a package that the user trusts."""
-    module, _, name = str(target).rpartition(".")
-    if name in TARGETS.get(module, ()):
+    if str(target) in shipped_targets():
         return True
+    module, _, name = str(target).rpartition(".")
     package = module.split(".")[0]
     if not package or package not in os.environ.get(TRUST, "").split(","):
         return False

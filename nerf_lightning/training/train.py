@@ -5,7 +5,6 @@ import logging
 import math
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import Annotated
 
 import lightning as L
 import torch
@@ -47,7 +46,6 @@ from nerf_lightning.training.loggers import TensorBoard, finishing_wandb, log_su
 from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.machine import CROWDED, crowding
 from nerf_lightning.utils.memory import check_memory, keep_freed_memory, out_of_memory
-from nerf_lightning.utils.options import AtMost, Count, Seed, check_options
 from nerf_lightning.utils.progress import animates
 from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.utils.text import join_truncated
@@ -55,8 +53,6 @@ from nerf_lightning.utils.text import join_truncated
 MAX_NAMED = 10
 """Photos that do not fit which are printed; all stand in results.json."""
 log = logging.getLogger(__name__)
-Threads = Annotated[Count, AtMost(1024)]
-"""Threads of one process; beyond, starting them fails on common systems, and ends the process."""
 
 
 class Described(L.Callback):
@@ -144,9 +140,14 @@ def load_data(cfg: DictConfig, scene: Scene | None, resumed: Path | None) -> Ray
 def prepare_system(
     cfg: DictConfig, data: RayDataModule | PixelDataModule, device: torch.device, poses_are_off: bool
 ) -> System:
-    """The system to train, if it fits into memory and the data."""
+    """The system to train.
+
+    Raises:
+        InputError: it needs more memory than is free, trained at its largest, or does not fit the data.
+    """
     system = build_system(cfg, frame_of(data), device)
-    check_field_memory(system, device)
+    what = "numbers, with their gradients and moments,"
+    check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
     if isinstance(system, NeRF3D) and system.corrections is not None and poses_are_off:
         system.corrections.begin_poses()
     system.backend = BACKEND if cfg.compile else None
@@ -154,16 +155,6 @@ def prepare_system(
         log.info("model: %s", system.field.sizing)
     check_background(cfg, data, system)
     return system
-
-
-def check_field_memory(system: System, device: torch.device) -> None:
-    """Refuses a field that, trained at its largest, needs more memory than is free.
-
-    Raises:
-        InputError: where it does.
-    """
-    what = "numbers, with their gradients and moments,"
-    check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
 
 
 def fit(
@@ -225,29 +216,17 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
 
 
 def prepare(cfg: DictConfig, may_compile: bool = False) -> None:
-    """Checks and sets what applies to the whole process, with its `compile` where that may be.
+    """Sets what applies to the whole process; with `may_compile`, for a compiled step if the run asks for one.
 
     Raises:
-        InputError: for a seed, threads or kernels that cannot be.
+        InputError: for kernels that there are not.
     """
-    settings = {
-        "seed": cfg.seed,
-        "threads": cfg.threads,
-        "kernels": cfg.kernels,
-        "compile": may_compile and cfg.compile,
-    }
-    check_options("", prepare_process, settings)
-    prepare_process(**settings)
-
-
-def prepare_process(seed: Seed, threads: Threads | None, kernels: str, compile: bool = False) -> None:
-    """Sets what applies to the whole process."""
-    if threads is not None:
-        torch.set_num_threads(threads)
-    use_kernels("reference" if compile else kernels)
+    if cfg.threads is not None:
+        torch.set_num_threads(cfg.threads)
+    use_kernels("reference" if may_compile and cfg.compile else cfg.kernels)
     keep_freed_memory()
     torch.set_flush_denormal(True)  # tiny weights otherwise slow the CPU down many times
-    L.seed_everything(seed, verbose=False)
+    L.seed_everything(cfg.seed, verbose=False)
 
 
 def check_processes(trainer: L.Trainer) -> None:
@@ -260,14 +239,9 @@ def check_processes(trainer: L.Trainer) -> None:
         return
     cluster = getattr(trainer.strategy, "cluster_environment", None)
     if HydraConfig.get().mode == RunMode.MULTIRUN and not getattr(cluster, "creates_processes_externally", False):
-        expected = "one process a job in a sweep"
-        raise InputError(
-            "config",
-            "trainer.devices",
-            str(trainer.world_size),
-            expected,
-            "or a launcher that starts the processes itself",
-        )
+        todo = "or a launcher that starts the processes itself"
+        processes = str(trainer.world_size)
+        raise InputError("config", "trainer.devices", processes, "one process a job in a sweep", todo)
 
 
 def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch.device) -> None:
@@ -292,27 +266,20 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
             trial.loss(PixelBatch(uv, rgb)).backward()
 
 
-def test_words(test: dict | None) -> str:
-    """The figure of the test split beside that of the held-out views."""
-    if test is None or test["psnr"] is None:
-        return ""
-    of = "" if test["views"] == test["views_in_split"] else f" of {test['views_in_split']}"
-    return f" (val), {test['psnr']:.2f} dB on {test['views']}{of} test views,"
-
-
 def report(results: dict, folder: Path, logger: L.pytorch.loggers.Logger | None) -> None:
     """Prints the outcome."""
     for one in results["recoveries"]:
         print(f"guard: at step {one['step']}: {one['cause']}; {one['action']}")
     scene, seconds = results["scene"]["name"], results["train_seconds"]
     quality = "no PSNR" if results["psnr"] is None else f"{results['psnr']:.2f} dB"
-    quality += f" held out{test_words(results['test'])}"
+    quality += " held out"
+    if (test := results["test"]) is not None and test["psnr"] is not None:
+        of = "" if test["views"] == test["views_in_split"] else f" of {test['views_in_split']}"
+        quality += f" (val), {test['psnr']:.2f} dB on {test['views']}{of} test views,"
     print(f"{scene}: {quality} after {seconds:.0f} s of training ({results['status']})")
     if (results["rows_measured"] or 1.0) < 1.0:
-        share = (
-            f"{results['rows_measured']:.0%} of the rows of each held-out photo, as all would take longer than training"
-        )
-        print(f"measured on {share}; python -m nerf_lightning.evaluate run={folder} measures all")
+        share = f"{results['rows_measured']:.0%} of the rows of each held-out photo, to take no longer than training"
+        print(f"measured on {share}; nerf_lightning evaluate {folder} measures all")
     if results["diagnosis"]:
         print(results["diagnosis"])
     crowded = crowding(results)

@@ -30,20 +30,9 @@ def the_device(name: str) -> torch.device:
         return torch.device(found[0])
     if name in found:
         return torch.device(name)
-    built = {"cuda": torch.backends.cuda.is_built(), "mps": torch.backends.mps.is_built()}
-    why = (
-        ""
-        if name not in built
-        else ", but there is no such chip"
-        if built[name]
-        else ", but this PyTorch has no such part"
-    )
-    todo = (
-        "install PyTorch's CUDA build, or give device=auto"
-        if name == "cuda" and not built["cuda"]
-        else "give device=auto"
-    )
-    raise InputError("config", "device", f"{name!r}{why}", f"auto, or what is there: {', '.join(found)}", todo)
+    missing = name == "cuda" and not torch.backends.cuda.is_built()
+    todo = f"{'install PyTorch for CUDA, or ' if missing else ''}give device=auto"
+    raise InputError("config", "device", repr(name), f"auto, or what is there: {', '.join(found)}", todo)
 
 
 def fits(size: int, device: torch.device) -> bool:

@@ -63,11 +63,10 @@ def work_clocks(threads: int) -> tuple[float, float]:
 
 def crowding(results: Mapping[str, Any]) -> float | None:
     """Share of a run's threads taken by other work, which used more than the cores the run left free; None if unknown."""
-    load, machine, threads = results.get("load"), results.get("machine"), results.get("threads")
-    if not (isinstance(load, Mapping) and isinstance(machine, Mapping) and isinstance(threads, int | float)):
-        return None
-    others, cores = load.get("others"), machine.get("cores")
-    if not (isinstance(others, int | float) and isinstance(cores, int | float)):
+    try:
+        threads, cores = float(results["threads"]), float(results["machine"]["cores"])
+        others = float(results["load"]["others"])
+    except (KeyError, TypeError, ValueError):  # not measured, or a damaged file
         return None
     return max(0.0, others - max(0.0, cores - threads)) / max(threads, 1.0)
 

@@ -15,6 +15,9 @@ from commands import BARE, popen
 
 from nerf_lightning.config import conf_dir
 from nerf_lightning.config.compose import composed
+from nerf_lightning.dataset import Scene, save_npz
+from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.dataset.scene import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.owner import owned
 
@@ -76,23 +79,17 @@ def test_train_bad_input_one_line_and_exit_code_2(arguments: list[str], words: l
 
 
 def test_photos_without_alpha_refuse_another_background(inside, tmp_path: Path):
-    from nerf_lightning.dataset import save_npz
-    from nerf_lightning.dataset.bricks.scene import bricks
-    from nerf_lightning.dataset.scene import Scene, Views
-
     scene = bricks(size=16, train_views=4, val_views=1, cache="")
     flat = [Views.of(v.images[..., :3].contiguous(), v.cameras) for v in (scene.train, scene.val)]
     save_npz(Scene("flat", "made", *flat, scene.orbit, scene.bounds), tmp_path / "flat.npz")
     code, _, err = inside("dataset=photos", "dataset.path=flat.npz", "renderer.background=white")
-    assert code == 2
-    assert "renderer.background: found white, expected scene" in err
+    assert code == 2 and "renderer.background: found white, expected scene" in err
 
 
-def test_traceback_on_request(inside, monkeypatch):
+def test_error_shows_its_traceback_on_request(inside, monkeypatch):
     monkeypatch.setenv("NERF_LIGHTNING_TRACEBACK", "1")
     code, _, err = inside("budget.steps=0", "dataset.size=16")
-    assert code == 2
-    assert "Traceback" in err
+    assert code == 2 and "Traceback" in err
 
 
 def test_without_the_lego_file_the_bricks_stand_in(inside):
@@ -199,36 +196,20 @@ def test_a_users_own_groups(inside, tmp_path: Path):
     (tmp_path / "mine" / "model" / "tiny.yaml").write_text("_target_: nerf_lightning.model.PictureMLP\nwidth: 4\n")
     given = ["dataset=picture", "dataset.max_side=16", "model=tiny", "callbacks=picture", "budget.steps=2"]
     code, out, err = inside("--config-dir=mine", *given)
-    assert code == 0, err
-    assert "sunset" in out
+    assert code == 0 and "sunset" in out, err
 
 
-def test_the_wheel_brings_its_configuration(tmp_path: Path):
+def test_wheel_brings_its_configuration(tmp_path: Path):
     """Installed somewhere else, run from yet another folder, the package finds everything it needs."""
-    build = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "-q",
-        "--no-deps",
-        "--no-build-isolation",
-        "-w",
-        str(tmp_path),
-        str(ROOT),
-    ]
-    subprocess.run(build, check=True, capture_output=True, timeout=120)
+    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(tmp_path)]
+    subprocess.run([*build, str(ROOT)], check=True, capture_output=True, timeout=120)
     (wheel,) = tmp_path.glob("*.whl")
     site = tmp_path / "site"
     zipfile.ZipFile(wheel).extractall(site)  # what installing it does, in a tenth of the time
-    for folder, place in (
-        (ROOT / "nerf_lightning", site / "nerf_lightning"),
-        (conf_dir(), site / "nerf_lightning" / "conf"),
-    ):
-        needed = {
-            path.relative_to(folder) for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts
-        }
-        assert needed and not {path for path in needed if not (place / path).is_file()}
+    for folder, place in ((ROOT / "nerf_lightning", "."), (conf_dir(), "conf")):
+        for path in folder.rglob("*"):
+            installed = site / "nerf_lightning" / place / path.relative_to(folder)
+            assert not path.is_file() or "__pycache__" in path.parts or installed.is_file(), path
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     process = popen("+experiment=smoke_2d", "--info=config", cwd=elsewhere, path=str(site))

@@ -4,7 +4,6 @@ import json
 import resource
 import shutil
 import signal
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +15,7 @@ import torch
 from nerf_lightning.callbacks import Checkpoints, HeldOut, Progress
 from nerf_lightning.callbacks.checkpoints import check_disk
 from nerf_lightning.cameras import Bounds
+from nerf_lightning.cli.app import fail
 from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import NoRoom
 from nerf_lightning.model import TensoRFField
@@ -150,15 +150,11 @@ def test_full_disk_keeps_the_last_checkpoint(room: int, undisturbed: Path, insid
 
 
 def lift_limit(limit: Callable[[int], None]) -> Callable[[Exception], None]:
-    from nerf_lightning.cli import app as cli
-
-    end = cli.fail
-
-    def fail(error: Exception) -> None:
+    def lift_and_fail(error: Exception) -> None:
         limit(resource.RLIM_INFINITY)
-        end(error)
+        fail(error)
 
-    return fail
+    return lift_and_fail
 
 
 def test_checkpoints_that_do_not_fit_are_refused_before_training(undisturbed: Path, inside, monkeypatch):
@@ -183,11 +179,3 @@ def test_growing_field_counts_its_last_size():
     expected, first = field.values_grown(), field.values
     field.grow(1.0)
     assert expected == field.values > 3 * first
-
-
-def test_clock_that_jumps_changes_nothing(undisturbed: Path, inside, monkeypatch: pytest.MonkeyPatch):
-    now, jumps = time.time(), iter([1e9, -1e9] * 100_000)
-    monkeypatch.setattr(time, "time", lambda: now + next(jumps))
-    code, _, err = inside(*SMALL, "name=jumps")
-    assert code == 0, err
-    assert_same(read_state(run_of("jumps")), read_state(undisturbed))

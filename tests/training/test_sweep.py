@@ -19,7 +19,7 @@ def table(root: Path) -> dict[str, dict[str, str]]:
         return {row["job"]: row for row in csv.DictReader(file)}
 
 
-def test_a_sweep_leaves_table_and_figure_and_is_done_once(inside, tmp_path: Path):
+def test_sweep_again_does_nothing_and_keeps_table_and_figure(inside, tmp_path: Path):
     command = ["-m", *SMALL, "callbacks.charts=null", "model.width=8,16", "seed=1"]
     code, out, err = inside(*command)
     name = "sweep_budget.steps=3_callbacks.charts=null_dataset.max_side=16_model.width=8,16_seed=1"
@@ -37,7 +37,7 @@ def test_a_sweep_leaves_table_and_figure_and_is_done_once(inside, tmp_path: Path
     assert {name: (root / name / "results.json").stat().st_mtime_ns for name in names} == results
 
 
-def test_a_job_that_raises_is_named_and_the_others_go_on(inside, tmp_path: Path):
+def test_sweep_job_that_raises_is_named_and_others_go_on(inside, tmp_path: Path):
     code, out, err = inside("-m", *SMALL, *BARE, "model.width=-1,8")
     (root,) = (tmp_path / "outputs" / "smoke_2d").iterdir()
     assert code == 1
@@ -52,7 +52,7 @@ def test_a_job_that_raises_is_named_and_the_others_go_on(inside, tmp_path: Path)
     assert (root / "model.width=-1" / "error.txt").is_file()
 
 
-def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(inside, tmp_path: Path, monkeypatch):
+def test_sweep_job_that_stopped_resumes_and_one_of_other_options_starts_anew(inside, tmp_path: Path, monkeypatch):
     import torch
 
     from nerf_lightning.callbacks import Checkpoints
@@ -91,7 +91,7 @@ def test_a_stopped_job_goes_on_from_its_checkpoint_and_other_options_start_anew(
     assert not (broken / "error.txt").exists()
 
 
-def test_a_sweep_that_is_interrupted_tells_so_and_goes_on_with_the_same_command(inside, tmp_path: Path, monkeypatch):
+def test_sweep_interrupted_continues_with_the_same_command(inside, tmp_path: Path, monkeypatch):
     from nerf_lightning.callbacks import Progress
 
     def stop(self, trainer, *given):
@@ -111,7 +111,7 @@ def test_a_sweep_that_is_interrupted_tells_so_and_goes_on_with_the_same_command(
     assert "interrupted" not in {row["status"] for row in table(root).values()}
 
 
-def test_a_job_that_another_process_trains_is_left_to_it(inside, tmp_path: Path):
+def test_sweep_leaves_a_job_to_the_process_that_trains_it(inside, tmp_path: Path):
     job = tmp_path / "sweep" / "seed=1"
     given = ["-m", *SMALL, *BARE, "callbacks.snapshots.steps=[]", "logger=null", f"hydra.sweep.dir={tmp_path}/sweep"]
     with owned(job):
@@ -127,15 +127,16 @@ def test_a_job_that_another_process_trains_is_left_to_it(inside, tmp_path: Path)
     [
         (["seed=0,1", "foo=1"], "foo"),
         (["model=null,siren"], "model: found null, expected one of fourier"),
+        (["seed=0,1", "hydra/launcher=submitit_lunar"], "nerf_lightning[sweeps]"),
     ],
 )
-def test_sweep_unknown_key_refused_in_one_line(arguments: list[str], words: str, inside, tmp_path: Path):
-    code, out, err = inside("-m", *SMALL, *arguments)
+def test_sweep_bad_input_is_refused_in_one_line(arguments: list[str], words: str, inside, tmp_path: Path):
+    code, _, err = inside("-m", *SMALL, *arguments)
     assert code == 2 and words in err and err.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
 @pytest.mark.filterwarnings("ignore")  # Optuna warns, and here warnings are errors
-def test_optuna_proposes_the_same_trials_again_and_failing_ones_are_recorded(inside, tmp_path: Path, capfd):
+def test_sweep_by_optuna_repeats_its_trials_and_records_failures(inside, tmp_path: Path, capfd):
     line = ["+experiment=tune_picture", "dataset.max_side=16", "budget.steps=2", "hydra.sweeper.n_trials=2", *BARE]
     told = [inside(*line), inside(*line)]
     assert [code for code, _, _ in told] == [0, 0], told
@@ -175,7 +176,7 @@ SHARED = {
 
 
 @pytest.mark.parametrize("what", ["planes that grow", pytest.param("a picture", marks=pytest.mark.long)])
-def test_two_processes_share_a_run_and_leave_one_folder(what: str, inside, tmp_path: Path):
+def test_two_processes_of_a_run_leave_one_folder(what: str, inside, tmp_path: Path):
     steps = 100 if what == "a picture" else 200  # after 100 of so small a scene, seeds alone differ by 1.2 dB
     options = [*SHARED[what], f"budget.steps={steps}", "trainer.accelerator=cpu", "threads=1"]
     code, out, err = inside(*options, "name=one")
@@ -194,12 +195,7 @@ def test_two_processes_share_a_run_and_leave_one_folder(what: str, inside, tmp_p
     assert (two["steps"], two["status"]) == (steps, "finished")
 
 
-def test_a_missing_launcher_says_what_to_install(inside, monkeypatch):
-    code, out, err = inside("-m", *SMALL, "seed=0,1", "hydra/launcher=submitit_lunar")
-    assert code == 2 and "nerf_lightning[sweeps]" in err and err.count("\n") == 1
-
-
-def test_several_processes_refuse_what_they_cannot_share(inside):
+def test_sweep_of_jobs_with_several_processes_is_refused(inside):
     pair = ["trainer=ddp", "trainer.accelerator=cpu"]
     code, out, err = inside("-m", *SMALL, "seed=0,1", *pair)
     assert code == 1 and err.count("one process a job in a sweep") >= 2

@@ -53,7 +53,7 @@ def test_resumed_run_may_use_another_device(inside, small_run: Path, plain_torch
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     for key in ("device", "trainer.accelerator"):
         code, _, err = inside(f"resume={run}", f"{key}=cuda")
-        assert code == 2 and err.count("\n") == 1 and "device: found 'cuda', but" in err, err
+        assert code == 2 and err.count("\n") == 1 and "device: found 'cuda'," in err, err
     after = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.name not in (LOCK, MARKER)}
     assert before == after, "nothing was touched"
     code, _, err = inside(f"resume={run}", "device=cpu", "limits.chunk=100", "budget.steps=12")
@@ -72,23 +72,11 @@ def test_auto_is_the_best_device(monkeypatch: pytest.MonkeyPatch, plain_torch: N
     assert the_device("auto") == torch.device("cuda") and the_device("cpu") == CPU
 
 
-@pytest.mark.parametrize(
-    ("name", "built", "words"),
-    [
-        ("cuda", True, "'cuda', but there is no such chip, expected auto, or what is there: cpu"),
-        ("cuda", False, "install PyTorch's CUDA build"),
-        ("mps", False, "'mps', but this PyTorch"),
-        ("gpu", True, "'gpu', expected auto, or what is there: cpu"),
-        ("privateuseone", True, "'privateuseone'"),
-    ],
-)
-def test_missing_device_says_why(
-    name: str, built: bool, words: str, monkeypatch: pytest.MonkeyPatch, plain_torch: None
-):
-    for kind in (torch.backends.cuda, torch.backends.mps):
-        monkeypatch.setattr(kind, "is_built", lambda: built)
-    with pytest.raises(InputError, match=words):
+@pytest.mark.parametrize("name", ["cuda", "mps", "gpu", "privateuseone"])
+def test_the_device_missing_says_what_is_there(name: str, plain_torch: None):
+    with pytest.raises(InputError, match=f"found '{name}', expected auto, or what is there: cpu") as refused:
         the_device(name)
+    assert ("install PyTorch for CUDA" in str(refused.value)) == (name == "cuda")
 
 
 REGISTERED = """
@@ -144,8 +132,6 @@ def test_limits_follow_device_and_run(device: str, batch: int, chunk: int):
     for broken in ({"batch": 0}, {"chunk": "many"}, {"rays": 3}):
         with pytest.raises(InputError, match=f"limits.{next(iter(broken))}"):
             limits(**broken)
-    with pytest.raises(InputError, match="limits: found 3"):
-        limits_of(OmegaConf.create({"limits": 3}), where)
 
 
 def test_chunk_follows_the_device(tmp_path: Path):
