@@ -5,7 +5,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Annotated, Any
 
 import lightning as L
 import torch
@@ -14,9 +14,10 @@ from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from nerf_lightning.callbacks.attached import agreed, attached
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
-from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.errors import NoRoom
 from nerf_lightning.system import System
 from nerf_lightning.utils.files import atomic, link_file
+from nerf_lightning.utils.options import AtLeast
 from nerf_lightning.utils.signals import Interrupted, defer_signals, install_handlers, received_signal
 from nerf_lightning.utils.text import subsample
 
@@ -65,14 +66,9 @@ class Checkpoints(L.Callback):
     Args:
         folder: where they go, below the run folder.
         every_seconds: wall-clock seconds between saves of `last.ckpt`; it is also saved at the end.
-
-    Raises:
-        InputError: where every_seconds <= 0.
     """
 
-    def __init__(self, folder: str = "checkpoints", every_seconds: float = 20):
-        if every_seconds <= 0:
-            raise InputError("callbacks.checkpoints.every_seconds", "", str(every_seconds), "more than 0")
+    def __init__(self, folder: str = "checkpoints", every_seconds: Annotated[float, AtLeast(0)] = 20):
         self.folder = folder
         self.every_seconds = every_seconds
         self.best: float | None = None

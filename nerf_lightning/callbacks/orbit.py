@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import lightning as L
 import numpy as np
@@ -15,10 +16,9 @@ from nerf_lightning.callbacks.rendering import share_of
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.panels import panel, to_bytes, write_animation
-from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.files import atomic
-from nerf_lightning.utils.options import FramesPerSecond
+from nerf_lightning.utils.options import AtLeast, FramesPerSecond
 from nerf_lightning.utils.text import subsample
 
 MAX_FRAMES, MIN_FRAMES = 60, 12
@@ -36,20 +36,14 @@ class Orbit(Renders):
         frames: how many of the orbit's views, evenly chosen, at their full size; 0 makes no GIF. None takes 60 of at most
             `MAX_SIDE` pixels, or fewer and smaller ones where there is not time for them (see `RenderPlan`).
         fps: frames a second.
-
-    Raises:
-        InputError: where frames < 0 or fps <= 0.
     """
 
-    def __init__(self, path: str = "orbit.gif", frames: int | None = None, fps: FramesPerSecond = 20):
-        if frames is not None and frames < 0:
-            raise InputError("callbacks.orbit.frames", "", str(frames), "0 (no orbit) or more")
-        if fps <= 0:
-            raise InputError("callbacks.orbit.fps", "", str(fps), "more than 0")
+    def __init__(
+        self, path: str = "orbit.gif", frames: Annotated[int, AtLeast(0)] | None = None, fps: FramesPerSecond = 20
+    ):
         self.path = path
         self.frames = frames
         self.fps = fps
-
         self._drawn = 0
 
     def needs(self, trainer: L.Trainer) -> dict[str, Need]:

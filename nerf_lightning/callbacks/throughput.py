@@ -5,8 +5,8 @@ from typing import Any
 import lightning as L
 
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.errors import InputError
 from nerf_lightning.system import System, mse_to_psnr
+from nerf_lightning.utils.options import Count
 
 TRAIN_SECONDS = "speed/train_seconds"
 """The time that a step's figures belong to, logged with them."""
@@ -17,14 +17,9 @@ class Throughput(L.Callback):
 
     Args:
         every: steps between log entries; the speeds are averages over them.
-
-    Raises:
-        InputError: where every < 1.
     """
 
-    def __init__(self, every: int = 20):
-        if every < 1:
-            raise InputError("callbacks.throughput.every", "", str(every), "at least 1")
+    def __init__(self, every: Count = 20):
         self.every = every
         self.rays = 0
         """Rays (or pixels) trained on since the run began, over all resumes."""

@@ -9,10 +9,9 @@ import lightning as L
 from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.callbacks.snapshots import Snapshots
 from nerf_lightning.drawing.panels import narrowed, write_animation
-from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.files import atomic
-from nerf_lightning.utils.options import FramesPerSecond
+from nerf_lightning.utils.options import Count, FramesPerSecond
 
 
 class TrainingGif(L.Callback):
@@ -22,16 +21,9 @@ class TrainingGif(L.Callback):
         path: the GIF, below the run folder.
         fps: frames a second; the last one stays for three.
         width: most pixels across; wider snapshots are shrunk.
-
-    Raises:
-        InputError: where fps <= 0 or width < 1.
     """
 
-    def __init__(self, path: str = "training.gif", fps: FramesPerSecond = 3, width: int = 640):
-        if not fps > 0:
-            raise InputError("callbacks.training_gif.fps", "", str(fps), "more than 0")
-        if width < 1:
-            raise InputError("callbacks.training_gif.width", "", str(width), "at least 1")
+    def __init__(self, path: str = "training.gif", fps: FramesPerSecond = 3, width: Count = 640):
         self.path = path
         self.fps = fps
         self.width = width
