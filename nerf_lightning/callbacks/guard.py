@@ -93,7 +93,7 @@ class Guard(L.Callback):
             if self.attempts and trainer.global_step == 0 and trainer.world_size == 1:
                 self._cap_learning_rate(trainer, pl_module)
 
-    def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         pl_module.rate = self.rate
         start_step = self.monitor.history.start_step
         if start_step and self.rate < 1:
@@ -106,9 +106,7 @@ class Guard(L.Callback):
             alive = any(p.grad is not None and bool(p.grad.any()) for p in pl_module.parameters())
             self.monitor.add_gradient(alive)
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         if self._given_up or not self.attempts or trainer.world_size > 1:
             return
         step = trainer.global_step

@@ -78,9 +78,7 @@ class HeldOut(Renders):
                 figures["val/ssim"] = fmean(view["ssim"] for view in views)
             trainer.logger.log_metrics(figures, trainer.global_step)
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         self.measure(trainer, pl_module, pl_module.progress)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:

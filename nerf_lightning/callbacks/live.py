@@ -87,9 +87,7 @@ class Live(ChecksData):
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._drawn = time.perf_counter()
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         if self.page is None:
             return
         now = time.perf_counter()
@@ -106,9 +104,7 @@ class Live(ChecksData):
         self._drawn = time.perf_counter()
         self._credit -= self._drawn - now
 
-    def on_test_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         if self.page is not None:
             self.page.show_progress(1.0, f"trained; measuring: {self.describe(trainer)}")
             self.page.paint(IMAGE_SECONDS)

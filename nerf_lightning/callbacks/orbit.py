@@ -21,6 +21,8 @@ from nerf_lightning.utils.files import atomic
 from nerf_lightning.utils.options import AtLeast, FramesPerSecond
 from nerf_lightning.utils.text import subsample
 
+FILE = "orbit.gif"
+"""Below the run folder."""
 MAX_FRAMES, MIN_FRAMES = 60, 12
 MAX_SIDE = 800
 """Pixels along a frame's longer side by default."""
@@ -32,16 +34,12 @@ class Orbit(Renders):
     """Renders the scene's orbit after the test.
 
     Args:
-        path: the GIF, below the run folder.
         frames: how many of the orbit's views, evenly chosen, at their full size; 0 makes no GIF. None takes 60 of at most
             `MAX_SIDE` pixels, or fewer and smaller ones where there is not time for them (see `RenderPlan`).
         fps: frames a second.
     """
 
-    def __init__(
-        self, path: str = "orbit.gif", frames: Annotated[int, AtLeast(0)] | None = None, fps: FramesPerSecond = 20
-    ):
-        self.path = path
+    def __init__(self, frames: Annotated[int, AtLeast(0)] | None = None, fps: FramesPerSecond = 20):
         self.frames = frames
         self.fps = fps
         self._drawn = 0
@@ -75,10 +73,10 @@ class Orbit(Renders):
         cameras = full.scaled(scale).to(pl_module.device)
         if count < most or scale < 1:
             print(
-                f"{self.path}: {count} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
+                f"{FILE}: {count} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
                 f" training; callbacks.orbit.frames={most} draws all at full size"
             )
-        with atomic(Path(trainer.default_root_dir) / self.path) as temporary:
+        with atomic(Path(trainer.default_root_dir) / FILE) as temporary:
             write_animation(temporary, self._frames(trainer, pl_module, cameras, count), 1 / self.fps)
 
     def _frames(

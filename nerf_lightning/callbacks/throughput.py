@@ -29,9 +29,7 @@ class Throughput(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._mark = (Budget.of(trainer).seconds, self.rays)
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         stats, step = pl_module.stats, trainer.global_step
         self.rays += stats.rays * trainer.world_size
         self._samples += stats.samples * trainer.world_size
