@@ -178,12 +178,10 @@ class Budget(L.Callback):
         )  # a finished run that is resumed has nothing left to do
         self._start()
 
-    def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         pl_module.progress = self.shared_progress(trainer)
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         if self._by_step:
             self._count_step()
         pl_module.progress = self.shared_progress(trainer)

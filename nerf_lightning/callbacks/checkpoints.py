@@ -5,7 +5,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Annotated, Any
 
 import lightning as L
 import torch
@@ -14,9 +14,10 @@ from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from nerf_lightning.callbacks.attached import agreed, attached
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.heldout import HeldOut
-from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.errors import NoRoom
 from nerf_lightning.system import System
 from nerf_lightning.utils.files import atomic, link_file
+from nerf_lightning.utils.options import AtLeast
 from nerf_lightning.utils.signals import Interrupted, defer_signals, install_handlers, received_signal
 from nerf_lightning.utils.text import subsample
 
@@ -57,23 +58,19 @@ def check_disk(folder: Path, system: System) -> None:
 
 
 class Checkpoints(L.Callback):
-    """Keeps `last.ckpt` and `best.ckpt` in a folder. Each is written whole, then renamed: a killed run keeps the one before.
+    """Keeps `last.ckpt` and `best.ckpt`. Each is written whole, then renamed: a killed run keeps the one before.
 
     A run that is asked to end (Ctrl-C, SIGTERM) finishes its step, or the view that it measures, and saves `last.ckpt`:
     going on from there gives the same weights.
 
     Args:
-        folder: where they go, below the run folder.
         every_seconds: wall-clock seconds between saves of `last.ckpt`; it is also saved at the end.
-
-    Raises:
-        InputError: where every_seconds <= 0.
     """
 
-    def __init__(self, folder: str = "checkpoints", every_seconds: float = 20):
-        if every_seconds <= 0:
-            raise InputError("callbacks.checkpoints.every_seconds", "", str(every_seconds), "more than 0")
-        self.folder = folder
+    folder = "checkpoints"
+    """Below the run folder."""
+
+    def __init__(self, every_seconds: Annotated[float, AtLeast(0)] = 20):
         self.every_seconds = every_seconds
         self.best: float | None = None
         self._saved = 0.0
@@ -100,9 +97,7 @@ class Checkpoints(L.Callback):
         self._steps.enter_context(defer_signals())
         self._stepping = True
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         due, signum = agreed(trainer, (time.monotonic() - self._saved >= self.every_seconds, received_signal()))
         if signum is not None:
             raise Interrupted(signum)
@@ -134,9 +129,7 @@ class Checkpoints(L.Callback):
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._tested = []
 
-    def on_test_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, outputs: Any, *batch: Any) -> None:
         self._tested.append(outputs["psnr"])
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:

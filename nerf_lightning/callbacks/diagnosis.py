@@ -1,5 +1,7 @@
 """Why a held-out figure is worse than training promised."""
 
+import math
+
 import lightning as L
 
 from nerf_lightning.callbacks.attached import attached, data_of
@@ -18,10 +20,10 @@ def gap(trainer: L.Trainer, system: System, quality: float) -> str:
     if isinstance(system, NeRF2D):
         return ""
     guard = attached(trainer, Guard)
-    level = guard.watch.level if guard is not None else None
-    if not level:
+    loss = guard.monitor.history.ema_loss if guard is not None else None
+    if not loss or not math.isfinite(loss):
         return ""
-    trained = mse_to_psnr(level)
+    trained = mse_to_psnr(loss)
     if trained < quality + WIDE_GAP or quality >= GOOD:
         return ""
     return (

@@ -25,22 +25,21 @@ class Enlarge(ChecksData):
         scale: factor on width and height; None does nothing.
 
     Raises:
-        InputError: where scale is not above 0, or makes a picture beyond 2^28 pixels.
+        InputError: from `check`, where scale is not above 0, or makes a picture beyond 2^28 pixels.
     """
 
     MOST = 1 << 28
 
     def __init__(self, scale: float | None = None):
-        if scale is not None and not scale > 0:
-            raise InputError("render.scale", "", str(scale), "above 0, or null for none")
         self.scale = scale
 
     def check(self, data: RayDataModule | PixelDataModule) -> None:
         if self.scale is None or not isinstance(data, PixelDataModule):
             return
         width, height = data.scene.size
-        if self.scale**2 * width * height > self.MOST:
-            raise InputError("render.scale", "", str(self.scale), f"a picture of at most {self.MOST} pixels")
+        if not (self.scale > 0 and self.scale**2 * width * height <= self.MOST):
+            expected = f"above 0, for a picture of at most {self.MOST} pixels"
+            raise InputError("render.scale", "", str(self.scale), expected)
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF2D) -> None:
         if self.scale is None or not trainer.is_global_zero:

@@ -14,6 +14,7 @@ from nerf_lightning.callbacks.throughput import TRAIN_SECONDS
 from nerf_lightning.dataset.subset import STRIP_ROWS, WHOLE, PixelSubset, thin
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
+from nerf_lightning.utils.options import Count
 from nerf_lightning.utils.signals import raise_if_signalled
 from nerf_lightning.utils.text import subsample
 
@@ -35,14 +36,12 @@ class HeldOut(Renders):
         views: how many held-out views, evenly chosen; None takes all. The last point always uses all views.
 
     Raises:
-        InputError: for fractions outside (0, 1) or less than one view.
+        InputError: for fractions outside (0, 1), or not in order.
     """
 
-    def __init__(self, at: list[float], views: int | None = None):
+    def __init__(self, at: list[float], views: Count | None = None):
         if any(not 0 < fraction < 1 for fraction in at) or sorted(at) != list(at):
             raise InputError("callbacks.heldout.at", "", str(list(at)), "ascending fractions between 0 and 1")
-        if views is not None and views < 1:
-            raise InputError("callbacks.heldout.views", "", str(views), "at least 1, or null for all")
         self.at = list(at)
         self.views = views
         self.curve: list[list[float]] = []
@@ -79,9 +78,7 @@ class HeldOut(Renders):
                 figures["val/ssim"] = fmean(view["ssim"] for view in views)
             trainer.logger.log_metrics(figures, trainer.global_step)
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         self.measure(trainer, pl_module, pl_module.progress)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:

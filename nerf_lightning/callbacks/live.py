@@ -1,7 +1,7 @@
 """Live: the field in the browser while it trains."""
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import lightning as L
 
@@ -12,7 +12,7 @@ from nerf_lightning.callbacks.progress import Progress
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.utils.options import Port
+from nerf_lightning.utils.options import AtLeast, AtMost, Port
 from nerf_lightning.view.serve import announce, require_viser, resolve_host
 
 if TYPE_CHECKING:
@@ -35,17 +35,20 @@ class Live(ChecksData):
     Args:
         host: address to listen on; 0.0.0.0 shares the page with the network.
         port: the next free one if it is in use; 0 for any.
-        share: of the time that drawing may take, above 0 and below 1.
+        share: of the time that drawing may take.
         side: pixels along the longer side of the finest image.
 
     Raises:
-        InputError: for any other share; at the start of training, if it is an image's, Viser is not installed, or the
-            address does not exist.
+        InputError: at the start of training, if it is an image's, Viser is not installed, or the address does not exist.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: Port = 8080, share: float = 0.06, side: int = 512):
-        if not 0 < share < 1:
-            raise InputError("callbacks.live.share", "", str(share), "above 0 and below 1")
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: Port = 8080,
+        share: Annotated[float, AtLeast(0.001), AtMost(0.99)] = 0.06,
+        side: int = 512,
+    ):
         self.host = host
         self.port = port
         self.share = share
@@ -84,9 +87,7 @@ class Live(ChecksData):
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._drawn = time.perf_counter()
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         if self.page is None:
             return
         now = time.perf_counter()
@@ -103,9 +104,7 @@ class Live(ChecksData):
         self._drawn = time.perf_counter()
         self._credit -= self._drawn - now
 
-    def on_test_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         if self.page is not None:
             self.page.show_progress(1.0, f"trained; measuring: {self.describe(trainer)}")
             self.page.paint(IMAGE_SECONDS)

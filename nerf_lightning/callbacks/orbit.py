@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import lightning as L
 import numpy as np
@@ -15,12 +16,13 @@ from nerf_lightning.callbacks.rendering import share_of
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.panels import panel, to_bytes, write_animation
-from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.files import atomic
-from nerf_lightning.utils.options import FramesPerSecond
+from nerf_lightning.utils.options import AtLeast, FramesPerSecond
 from nerf_lightning.utils.text import subsample
 
+FILE = "orbit.gif"
+"""Below the run folder."""
 MAX_FRAMES, MIN_FRAMES = 60, 12
 MAX_SIDE = 800
 """Pixels along a frame's longer side by default."""
@@ -32,24 +34,14 @@ class Orbit(Renders):
     """Renders the scene's orbit after the test.
 
     Args:
-        path: the GIF, below the run folder.
         frames: how many of the orbit's views, evenly chosen, at their full size; 0 makes no GIF. None takes 60 of at most
             `MAX_SIDE` pixels, or fewer and smaller ones where there is not time for them (see `RenderPlan`).
         fps: frames a second.
-
-    Raises:
-        InputError: where frames < 0 or fps <= 0.
     """
 
-    def __init__(self, path: str = "orbit.gif", frames: int | None = None, fps: FramesPerSecond = 20):
-        if frames is not None and frames < 0:
-            raise InputError("callbacks.orbit.frames", "", str(frames), "0 (no orbit) or more")
-        if fps <= 0:
-            raise InputError("callbacks.orbit.fps", "", str(fps), "more than 0")
-        self.path = path
+    def __init__(self, frames: Annotated[int, AtLeast(0)] | None = None, fps: FramesPerSecond = 20):
         self.frames = frames
         self.fps = fps
-
         self._drawn = 0
 
     def needs(self, trainer: L.Trainer) -> dict[str, Need]:
@@ -81,10 +73,10 @@ class Orbit(Renders):
         cameras = full.scaled(scale).to(pl_module.device)
         if count < most or scale < 1:
             print(
-                f"{self.path}: {count} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
+                f"{FILE}: {count} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
                 f" training; callbacks.orbit.frames={most} draws all at full size"
             )
-        with atomic(Path(trainer.default_root_dir) / self.path) as temporary:
+        with atomic(Path(trainer.default_root_dir) / FILE) as temporary:
             write_animation(temporary, self._frames(trainer, pl_module, cameras, count), 1 / self.fps)
 
     def _frames(

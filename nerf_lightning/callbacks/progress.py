@@ -109,9 +109,7 @@ class Progress(L.Callback):
         self.open(f"train {data_of(trainer).scene.name}")
         self._recent = Budget.of(trainer).seconds
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         self._rays += pl_module.stats.rays * trainer.world_size
         if self.due():
             self.show(trainer, pl_module, self.status(trainer))

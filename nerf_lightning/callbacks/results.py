@@ -66,6 +66,15 @@ def peak_memory_bytes(device: torch.device) -> int | None:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
+def summarize(views: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
+    """Means over views, and the worst of them."""
+    return {
+        "psnr": statistic_of(views, fmean, "psnr"),
+        "ssim": statistic_of(views, fmean, "ssim"),
+        "psnr_worst_view": statistic_of(views, min, "psnr"),
+    }
+
+
 def statistic_of(views: Sequence[Mapping[str, float]], statistic: Callable[..., float], key: str) -> float | None:
     """A statistic over the views that have a finite figure; None where no view has."""
     values = [view[key] for view in views if math.isfinite(view[key])]
@@ -125,9 +134,7 @@ class Results(Renders):
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self.views, self.test_views = [], None
 
-    def on_test_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, outputs: Any, *batch: Any) -> None:
         self.views.append(outputs)
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
@@ -149,9 +156,9 @@ class Results(Renders):
             ]
         nothing = min(plain + NO_BETTER, SEEN_AS_EQUAL)
         stopped = "stopped_early" if Budget.of(trainer).progress(trainer.global_step) < 1.0 else "finished"
-        broken = [name for name, value in pl_module.named_parameters() if not value.isfinite().all()]
-        if broken:
-            self.write(trainer, pl_module, "collapsed", f"{broken[0]} is no longer finite")
+        broken = (name for name, value in pl_module.named_parameters() if not value.isfinite().all())
+        if name := next(broken, None):
+            self.write(trainer, pl_module, "collapsed", f"{name} is no longer finite")
         elif not counted:
             diagnosis = "held-out views have no figure: what is rendered is not finite, or no pixel of theirs is known"
             self.write(trainer, pl_module, "collapsed", diagnosis)
@@ -180,13 +187,8 @@ class Results(Renders):
         """Of the test split: means, the worst view, and how many views they are of; None without one."""
         if self.test_views is None or not isinstance(scene, Scene) or scene.test is None:
             return None
-        return {
-            "psnr": statistic_of(self.test_views, fmean, "psnr"),
-            "ssim": statistic_of(self.test_views, fmean, "ssim"),
-            "psnr_worst_view": statistic_of(self.test_views, min, "psnr"),
-            "views": len(self.test_views),
-            "views_in_split": len(scene.test),
-        }
+        counts = {"views": len(self.test_views), "views_in_split": len(scene.test)}
+        return {**summarize(self.test_views), **counts}
 
     def write(self, trainer: L.Trainer, pl_module: System, status: str, diagnosis: str) -> None:
         """Writes the file with what is known so far; what was not measured is null."""
@@ -195,9 +197,9 @@ class Results(Renders):
         guard = attached(trainer, Guard)
         curve = [] if held_out is None else [point for point in held_out.curve if math.isfinite(point[2])]
 
-        quality = statistic_of(self.views, fmean, "psnr")
-        if quality is not None:
-            curve = [*curve, [round(budget.seconds, 3), trainer.global_step, quality]]
+        figures = summarize(self.views)
+        if figures["psnr"] is not None:
+            curve = [*curve, [round(budget.seconds, 3), trainer.global_step, figures["psnr"]]]
         state = pl_module.state_dict().values()
         corrections = pl_module.corrections if isinstance(pl_module, NeRF3D) else None
         found = {
@@ -222,10 +224,8 @@ class Results(Renders):
             "train_seconds": round(budget.seconds, 3),
             "steps": trainer.global_step,
             "rays_per_second": round(throughput.rays / budget.seconds, 1) if throughput and budget.seconds else None,
-            "psnr": quality,
+            **figures,
             "psnr_aligned": round(fmean(self.aligned), 4) if self.aligned else None,
-            "ssim": statistic_of(self.views, fmean, "ssim"),
-            "psnr_worst_view": statistic_of(self.views, min, "psnr"),
             "rows_measured": None if held_out is None else round(held_out.rows, 4),
             "test": self.test_figures(scene),
             "render_seconds_per_view": statistic_of(self.views, median, "seconds"),

@@ -19,8 +19,8 @@ from nerf_lightning.system import System
 
 LOGGED_WIDTH = 640
 """Widest picture for TensorBoard, in pixels: it takes 0.1 s for each megabyte."""
-TRUTH = "truth.png"
-"""What the view should look like, below the run folder: written once."""
+FOLDER, FINAL, TRUTH = "snapshots", "final.png", "truth.png"
+"""Below the run folder: all snapshots, the latest render alone, and what it should look like, which is written once."""
 MIN_PIXELS, MAX_PIXELS = 1 << 13, 800 * 800
 """Of a snapshot of a scene, which is for looking at."""
 
@@ -33,24 +33,18 @@ def log_spaced() -> Iterator[int]:
 class Snapshots(ChecksData, Renders):
     """Writes truth, render and depth of one held-out view as PNG and to TensorBoard, and once more at the end.
 
-    `final` is the latest render alone. Of views beyond `MAX_PIXELS`, and where there is not time for all (see `RenderPlan`),
+    Of views beyond `MAX_PIXELS`, and where there is not time for all (see `RenderPlan`),
     every n-th row and column is rendered.
 
     Args:
-        folder: where the PNGs go, below the run folder.
         steps: after which steps; None means 10, 20, 50, 100, 200, 500, ...
         view: index of the held-out view.
-        final: the latest render, below the run folder.
 
     Raises:
         InputError: from `check`, if there is no such view.
     """
 
-    def __init__(
-        self, folder: str = "snapshots", steps: list[int] | None = None, view: int = 0, final: str = "final.png"
-    ):
-        self.folder = folder
-        self.final = final
+    def __init__(self, steps: list[int] | None = None, view: int = 0):
         self.steps = None if steps is None else frozenset(steps)
         self.view = view
         self._written: int | None = None  # the step of the latest
@@ -73,7 +67,7 @@ class Snapshots(ChecksData, Renders):
 
     def path(self, trainer: L.Trainer) -> Path:
         """Of the snapshot of this step."""
-        return Path(trainer.default_root_dir) / self.folder / f"step_{trainer.global_step:07d}.png"
+        return Path(trainer.default_root_dir) / FOLDER / f"step_{trainer.global_step:07d}.png"
 
     def most_pixels(self, trainer: L.Trainer) -> int:
         """Of a snapshot for which there is time."""
@@ -95,7 +89,7 @@ class Snapshots(ChecksData, Renders):
             caption = f"{data.scene.name}, step {step}, {budget.seconds:.0f} s, {result.psnr:.2f} dB"
             picture = result_panel(result, caption)
             write_png(self.path(trainer), picture)
-            write_png(Path(trainer.default_root_dir) / self.final, to_bytes(result.rgb))
+            write_png(Path(trainer.default_root_dir) / FINAL, to_bytes(result.rgb))
             truth = Path(trainer.default_root_dir) / TRUTH
             if not truth.exists():
                 write_png(truth, to_bytes(result.truth))
@@ -110,7 +104,7 @@ class Snapshots(ChecksData, Renders):
         if trainer.global_step and not self.path(trainer).exists():
             self.on_train_batch_end(trainer, pl_module)
 
-    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *step: Any) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         if self.due(trainer.global_step):
             self.write(trainer, pl_module)
 

@@ -5,8 +5,8 @@ from typing import Any
 import lightning as L
 
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.errors import InputError
 from nerf_lightning.system import System, mse_to_psnr
+from nerf_lightning.utils.options import Count
 
 TRAIN_SECONDS = "speed/train_seconds"
 """The time that a step's figures belong to, logged with them."""
@@ -17,14 +17,9 @@ class Throughput(L.Callback):
 
     Args:
         every: steps between log entries; the speeds are averages over them.
-
-    Raises:
-        InputError: where every < 1.
     """
 
-    def __init__(self, every: int = 20):
-        if every < 1:
-            raise InputError("callbacks.throughput.every", "", str(every), "at least 1")
+    def __init__(self, every: Count = 20):
         self.every = every
         self.rays = 0
         """Rays (or pixels) trained on since the run began, over all resumes."""
@@ -34,9 +29,7 @@ class Throughput(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._mark = (Budget.of(trainer).seconds, self.rays)
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         stats, step = pl_module.stats, trainer.global_step
         self.rays += stats.rays * trainer.world_size
         self._samples += stats.samples * trainer.world_size

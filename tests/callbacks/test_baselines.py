@@ -85,8 +85,8 @@ def results_with(size: int, quality: float | None) -> Results:
 def test_baselines_after_test_compare_same_bytes(size, quality, said, sunset, trainer_with, system, tmp_path, capsys):
     trainer = trainer_with(results_with(size, quality))
     trainer.datamodule = from_picture(max_side=40)
-    Baselines("same.json").on_test_end(trainer, system)
-    found = json.loads((tmp_path / "same.json").read_text())
+    Baselines().on_test_end(trainer, system)
+    found = json.loads((tmp_path / "baselines.json").read_text())
     assert found == {
         "bytes": size,
         "picture_bytes": 4800,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerf_lightning.callbacks import Budget, Guard
-from nerf_lightning.callbacks.guard import LOWER, MUCH_LOWER
+from nerf_lightning.callbacks.guard import LR_CUT, LR_CUT_AFTER_LEARNING
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Picture, PixelDataModule, save_npz
 from nerf_lightning.model import PictureField, SirenField
@@ -118,7 +118,7 @@ def test_guard_broken_step_restores_last_good_weights(
     assert run(Broken(how, 80), guard, tmp_path) < 1e-3
     (one,) = guard.recoveries
     assert words in one.cause and "last good weights" in one.action and 80 < one.step < 180
-    assert guard.rate == pytest.approx(LOWER)
+    assert guard.rate == pytest.approx(LR_CUT_AFTER_LEARNING)
     assert f"guard: step {one.step}" in capsys.readouterr().out, "never silently"
 
 
@@ -152,7 +152,7 @@ def test_guard_gives_up_after_attempts(tmp_path: Path, capsys: pytest.CaptureFix
     guard = Guard(attempts=2, every=10, patience=50)
     run(Broken("no gradient", 0), guard, tmp_path)
     assert len(guard.recoveries) == 2 and all("no gradient" in one.cause for one in guard.recoveries)
-    assert guard.rate == pytest.approx(MUCH_LOWER**2)
+    assert guard.rate == pytest.approx(LR_CUT**2)
     assert "given up after 2 attempts" in capsys.readouterr().out
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from nerf_lightning.callbacks import PictureCharts, Results, Snapshots, TrainingGif
+from nerf_lightning.callbacks import PictureCharts, Results, TrainingGif
 from nerf_lightning.callbacks.picture.charts import curve_chart, error_chart
 from nerf_lightning.drawing.panels import narrowed
 
@@ -55,11 +55,11 @@ def results_with(curve: list[list[float]]) -> Results:
     ],
 )
 def test_picture_charts_after_test_are_written(found, files, clock, system, trainer_with, tmp_path: Path):
-    charts = PictureCharts("charts")
+    charts = PictureCharts()
     charts.on_test_end(trainer_with(*found, charts), system)
-    assert {path.name for path in (tmp_path / "charts").iterdir()} == files
+    assert {path.name for path in tmp_path.iterdir()} == files
     for name in files:
-        picture = imageio.imread(tmp_path / "charts" / name)
+        picture = imageio.imread(tmp_path / name)
         assert min(picture.shape[:2]) > 300 and picture.std() > 1
 
 
@@ -96,17 +96,17 @@ def frames_of(path: Path) -> list[tuple[int, int, tuple[int, int]]]:
 
 def test_training_gif_shows_snapshots_in_order(trainer_with, system, tmp_path: Path, monkeypatch):
     levels, glob = [10, 200, 60, 120], Path.glob
-    write_snapshots(tmp_path / "shots", levels)
+    write_snapshots(tmp_path / "snapshots", levels)
     # Folders list their files in any order.
     monkeypatch.setattr(Path, "glob", lambda folder, pattern: sorted(glob(folder, pattern), reverse=True))
-    gif = TrainingGif("made/run.gif", fps=5)
-    gif.on_test_end(trainer_with(Snapshots("shots"), gif), system)
-    frames = frames_of(tmp_path / "made" / "run.gif")
+    gif = TrainingGif(fps=5)
+    gif.on_test_end(trainer_with(gif), system)
+    frames = frames_of(tmp_path / "training.gif")
     assert [level for level, _, _ in frames[:4]] == levels and {level for level, _, _ in frames[3:]} == {120}
     assert [duration for _, duration, _ in frames[:3]] == [200] * 3
     assert sum(duration for _, duration, _ in frames[3:]) == 600
     assert {size for _, _, size in frames} == {(30, 20)}
-    with Image.open(tmp_path / "made" / "run.gif") as made:
+    with Image.open(tmp_path / "training.gif") as made:
         assert made.info["loop"] == 0, "for ever"
 
 
@@ -114,5 +114,5 @@ def test_training_gif_shows_snapshots_in_order(trainer_with, system, tmp_path: P
 def test_training_gif_without_snapshots_is_not_written(levels, trainer_with, system, tmp_path: Path):
     if levels is not None:
         write_snapshots(tmp_path / "snapshots", levels)
-    TrainingGif().on_test_end(trainer_with(*([] if levels is None else [Snapshots()])), system)
+    TrainingGif().on_test_end(trainer_with(), system)
     assert not list(tmp_path.rglob("*.gif"))

@@ -18,14 +18,14 @@ def test_snapshots_due_at_given_steps(steps, expected):
 
 
 def test_snapshots_are_written_when_due_with_clock_stopped(clock, system, trainer_with, tmp_path):
-    budget, snapshots = Budget(steps=9), Snapshots("pictures", steps=[2, 4], view=3)
+    budget, snapshots = Budget(steps=9), Snapshots(steps=[2, 4], view=3)
     trainer = trainer_with(budget, snapshots)
     budget.on_train_start(trainer, system)
     for trainer.global_step in range(1, 6):
         clock.wait(1)
         snapshots.on_train_batch_end(trainer, system, None, None, 0)
     snapshots.on_train_end(trainer, system)
-    names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
+    names = sorted(path.name for path in (tmp_path / "snapshots").iterdir())
     assert names == ["step_0000002.png", "step_0000004.png", "step_0000005.png"]
     assert system.asked == [0, 3, 3, 3] and budget.seconds == 5
     trainer.global_step = 4

@@ -92,14 +92,7 @@ def words(psnr_db: float | None) -> str:
 
 
 class Baselines(L.Callback):
-    """After the test, compares the field with a JPEG and with a shrunk picture of the same bytes: prints, baselines.json.
-
-    Args:
-        path: the file, below the run folder.
-    """
-
-    def __init__(self, path: str = "baselines.json"):
-        self.path = path
+    """After the test, compares the field with a JPEG and with a shrunk picture of the same bytes: prints, baselines.json."""
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         results = attached(trainer, Results)
@@ -116,7 +109,7 @@ class Baselines(L.Callback):
             "bicubic": small,
             "jpeg_as_good": None if quality is None else jpeg_as_good(image, quality),
         }
-        write_json(Path(trainer.default_root_dir) / self.path, found)
+        write_json(Path(trainer.default_root_dir) / "baselines.json", found)
         coded = "none that small" if same is None else words(same["psnr"])
         told = f"in {size_of(size)} (the picture's pixels have {size_of(image.nbytes)}): JPEG {coded}"
         told += f"; shrunk and enlarged by bicubic interpolation {words(small['psnr'])}"

@@ -46,14 +46,7 @@ def curve_chart(curve: list[list[float]], title: str) -> Figure:
 
 
 class PictureCharts(L.Callback):
-    """Writes error.png, spectrum.png and curve.png after the test.
-
-    Args:
-        folder: where they go, below the run folder.
-    """
-
-    def __init__(self, folder: str = "."):
-        self.folder = folder
+    """Writes error.png, spectrum.png and curve.png into the run folder after the test."""
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         if not trainer.is_global_zero:
@@ -61,7 +54,7 @@ class PictureCharts(L.Callback):
         data, results = data_of(trainer), attached(trainer, Results)
         (result,) = pl_module.evaluate_held_out(data, [0])
         title = f"{data.scene.name}, step {trainer.global_step}, {result.psnr:.2f} dB"
-        folder = Path(trainer.default_root_dir) / self.folder
+        folder = Path(trainer.default_root_dir)
         write_png(folder / "error.png", pixels_of(error_chart(result.rgb, result.truth, title)))
         spectrum = spectrum_chart(result.truth.numpy(), result.rgb.numpy(), title)
         write_png(folder / "spectrum.png", pixels_of(spectrum))

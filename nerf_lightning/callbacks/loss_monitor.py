@@ -1,0 +1,144 @@
+"""LossMonitor: judges from losses, gradients and opacities whether training works, is stuck, or diverges."""
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+EMA_DECAY = 0.96
+"""Of the running mean of the loss: it looks back about 25 steps."""
+LEARNED_RATIO = 0.85
+"""A field whose error is above this share of that of one plain colour has not learned the scene."""
+STALL_RATIO, SLOW_RATIO = 0.98, 0.9
+"""An error above this share of what it was some steps ago has not fallen: below that of a plain colour, and above it."""
+DIVERGED_RATIO, WORSE_RATIO = 4.0, 1.1
+"""Training diverges when the error is above the first times its lowest, or stays above the second ..."""
+HALF_LEARNED_RATIO = 0.3
+"""... while it is more than this share of that of one plain colour."""
+EMPTY_OPACITY, FULL_OPACITY = 1e-3, 0.999
+"""Mean opacity of rays: below the first there is no density, above the second there is density everywhere."""
+
+
+@dataclass(frozen=True)
+class TrainingFailure:
+    """Why training will not get better by itself."""
+
+    cause: str
+    diverged: bool
+    """Whether training diverges; otherwise it is stuck."""
+
+
+@dataclass
+class LossHistory:
+    """What a monitor has seen since training began, or began again; a checkpoint keeps it."""
+
+    start_step: int = 0
+    ema_loss: float | None = None
+    """The loss, averaged over the last steps; not finite once a loss was not."""
+    earlier: list[float] = field(default_factory=list)
+    """The same, at the checks within the last `patience` steps."""
+    lowest: float = math.inf
+    num_risen: int = 0
+    """Checks in a row at which the loss was far above its lowest."""
+    num_dead: int = 0
+    """Checks in a row at which no gradient came back."""
+
+
+class LossMonitor:
+    """The running state of a training, judged at regular checks.
+
+    Args:
+        every: steps between checks.
+        patience: steps within which the loss must fall below that of a plain colour, or at least fall.
+        plain_loss: the loss of one plain colour.
+    """
+
+    def __init__(self, every: int, patience: int, plain_loss: float = 0.0):
+        self.every = every
+        self.patience = patience
+        self.plain_loss = plain_loss
+        self.history = LossHistory()
+
+    def reset(self, start_step: int | None = None) -> None:
+        """Forgets everything; with a step, training has started again there."""
+        self.history = LossHistory(self.history.start_step if start_step is None else start_step)
+
+    def is_due(self, step: int) -> bool:
+        """Whether to check at this step."""
+        return step % self.every == 0
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether the field has learned more than one plain colour."""
+        loss = self.history.ema_loss
+        return loss is not None and loss < LEARNED_RATIO * self.plain_loss
+
+    @property
+    def is_healthy(self) -> bool:
+        """Whether the field has learned something, and is not losing it: its weights are worth keeping."""
+        return self.has_learned and not self.history.num_risen
+
+    def add_loss(self, loss: float) -> None:
+        """Adds a step's squared error."""
+        mean = self.history.ema_loss
+        self.history.ema_loss = loss if mean is None else EMA_DECAY * mean + (1 - EMA_DECAY) * loss
+
+    def add_gradient(self, alive: bool) -> None:
+        """Adds whether any gradient came back, at a check before the field has begun to learn."""
+        self.history.num_dead = 0 if alive else self.history.num_dead + 1
+
+    def check(self, step: int, opacity: float | None) -> TrainingFailure | None:
+        """Judges training at a step; None if it may go on.
+
+        Args:
+            step: since the run began.
+            opacity: mean of the step's rays; None for pictures.
+        """
+        history, loss = self.history, self.history.ema_loss
+        if loss is None:
+            return None
+        divergence = self._divergence_cause(step, loss)
+        if cause := divergence or self._stall_cause(step, loss, opacity):
+            return TrainingFailure(cause, bool(divergence))
+        history.earlier = [*history.earlier, loss][-(self.patience // self.every + 1) :]
+        history.lowest = min(history.lowest, loss)
+        return None
+
+    def _has_waited(self, step: int) -> bool:
+        """Whether there have been enough checks to judge by."""
+        enough = len(self.history.earlier) > self.patience // self.every
+        return enough and step - self.history.start_step >= self.patience
+
+    def _divergence_cause(self, step: int, loss: float) -> str:
+        """How what was learned is being lost; "" if it is not."""
+        history = self.history
+        risen = history.lowest < LEARNED_RATIO * self.plain_loss and loss > DIVERGED_RATIO * history.lowest
+        # A short spike does not matter.
+        stays = bool(history.earlier) and loss > STALL_RATIO * history.earlier[-1]
+        history.num_risen = history.num_risen + 1 if risen and stays else 0
+        if history.num_risen >= 3:
+            return f"the loss rose to {loss / history.lowest:.0f} times its lowest"
+        least = min([*history.earlier[1:], loss])
+        if self._has_waited(step) and least > max(WORSE_RATIO * history.lowest, HALF_LEARNED_RATIO * self.plain_loss):
+            lowest = history.lowest / self.plain_loss
+            return f"the loss fell to {lowest:.2f} times that of one plain colour, and has stayed above that since"
+        return ""
+
+    def _stall_cause(self, step: int, loss: float, opacity: float | None) -> str:
+        """Why nothing is being learned; "" if something is, or training has only just begun."""
+        if self.has_learned or not self.plain_loss:
+            return ""  # a scene of one colour is learned as soon as its colour is
+        if self.history.num_dead < 2:  # without a gradient, waiting does not help
+            if not self._has_waited(step):
+                return ""
+            falling = all(after < before for before, after in pairwise([*self.history.earlier, loss]))
+            enough = SLOW_RATIO if loss > self.plain_loss and not falling else STALL_RATIO
+            if loss < enough * self.history.earlier[0]:
+                return ""
+        stuck = f"the loss stands at {loss / self.plain_loss:.2f} times that of one plain colour"
+        if opacity is not None and opacity < EMPTY_OPACITY:
+            return f"there is no density anywhere, so no gradient comes back; {stuck}"
+        if self.history.num_dead:
+            return f"no gradient reaches any weight; {stuck}"
+        if opacity is not None and opacity > FULL_OPACITY:
+            return f"there is density everywhere, a wall before every camera; {stuck}"
+        return stuck
