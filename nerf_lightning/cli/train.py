@@ -105,6 +105,10 @@ def run_hydra(overrides: Sequence[str]) -> None:
     flags = parser.parse_args(list(overrides))
     if flags.experimental_rerun:  # it unpickles a file, which may run anything
         refuse("--experimental-rerun")
+    for word in flags.overrides:
+        if ("=" not in word and not word.startswith("~")) or os.path.exists(word):
+            todo = f"to train on photos: dataset=photos {shlex.quote(f'dataset.path={word}')}"
+            raise InputError("command line", "", word, "KEY=VALUE", todo)
     given = replace_nulls(_find_experiments(_resume_overrides(overrides)))
     sys.argv[1:] = _make_folders_absolute(quote_texts(given, (*TEXT_KEYS, *FOLDER_KEYS), flags.multirun or None))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing a report and exiting with 1
