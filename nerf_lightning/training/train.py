@@ -3,6 +3,7 @@
 import copy
 import logging
 import math
+import shlex
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Annotated
@@ -312,7 +313,7 @@ def report(results: dict, folder: Path, logger: L.pytorch.loggers.Logger | None)
         share = (
             f"{results['rows_measured']:.0%} of the rows of each held-out photo, as all would take longer than training"
         )
-        print(f"measured on {share}; python -m nerf_lightning.evaluate run={folder} measures all")
+        print(f"measured on {share}; nerf_lightning evaluate {shlex.quote(str(folder))} measures all")
     if results["diagnosis"]:
         print(results["diagnosis"])
     crowded = crowding(results)
