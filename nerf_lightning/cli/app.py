@@ -29,9 +29,18 @@ from nerf_lightning.utils.signals import exit_on_signal
 TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
 """Environment variable: set to 1, errors come with the full traceback."""
 
+FIRST_STEPS = """From a folder of photos to a page to send, and a mesh:
+
+    nerf_lightning train dataset=photos dataset.path=PHOTOS
+    nerf_lightning export html -o page.html
+    nerf_lightning export mesh -o mesh.glb
+
+nerf_lightning COMMAND --help says more of each."""
+
 app = App(
     name="nerf_lightning",
     help="Turn photos into a radiance field, on the machine you have.",
+    help_epilogue=FIRST_STEPS,
     version=__version__,
     default_parameter=Parameter(negative=(), show_choices=False),
     print_error=False,
@@ -51,6 +60,7 @@ for _command in _commands:
         app.command(_command)
 for _number, _name in enumerate(app.resolved_commands()):
     app[_name].sort_key = _number
+    app[_name].help_epilogue = ""  # its own, not that of the front page
 app.register_install_completion_command()
 for _name in ("--help", "--version", "--install-completion"):
     app[_name].group = "Options"

@@ -24,7 +24,7 @@ def check(
     """Check a scene's photos and cameras before training: one page, and a line for all that looks wrong.
 
     Args:
-        scene: Photos with cameras in any format that training reads.
+        scene: A folder of photos, a video, or photos with cameras; train --help lists the formats.
         output: The page; default: check.html where the command runs.
         resize: Longest side of the photos in pixels, as in training; null for their size.
         holdout: Every N-th photo is held out, unless the files say which.

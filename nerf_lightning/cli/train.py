@@ -43,9 +43,14 @@ def describe_groups() -> str:
 def train(*overrides: Annotated[str, Parameter(allow_leading_hyphen=True, show=False)]) -> None:
     """Train a field from photos, or from a single image.
 
-    train +experiment=lego             the Lego scene, or built-in bricks; 90 s
-    train +experiment=picture          a single image: dataset.path=IMAGE
-    train dataset=photos dataset.path=SCENE
+    train dataset=photos dataset.path=SCENE    for 90 s; then view, or export html
+    train +experiment=lego                     the Lego scene, or built-in bricks
+    train +experiment=picture                  a single image: dataset.path=IMAGE
+
+    SCENE: a folder of photos, or a video, whose cameras COLMAP finds (pycolmap);
+    or photos with cameras: a folder of nerfstudio or instant-ngp (transforms.json),
+    Blender (transforms_train.json), COLMAP (sparse/0), LLFF (poses_bounds.npy); or
+    FILE.npz, as capture writes it
 
     budget.seconds=60   for a minute; or budget.steps=1000
     model=mlp           another field; recipe=NAME brings settings that suit it
@@ -103,6 +108,10 @@ def run_hydra(overrides: Sequence[str]) -> None:
     flags = parser.parse_args(list(overrides))
     if flags.experimental_rerun:  # it unpickles a file, which may run anything
         refuse("--experimental-rerun")
+    for word in flags.overrides:
+        if ("=" not in word and not word.startswith("~")) or os.path.exists(word):
+            todo = f"to train on photos: dataset=photos {shlex.quote(f'dataset.path={word}')}"
+            raise InputError("command line", "", word, "KEY=VALUE", todo)
     given = replace_nulls(_find_experiments(_resume_overrides(overrides)))
     sys.argv[1:] = _make_folders_absolute(quote_texts(given, (*TEXT_KEYS, *FOLDER_KEYS), flags.multirun or None))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing a report and exiting with 1

@@ -23,11 +23,13 @@ from nerf_lightning.runs.scene_file import frame_from
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.memory import check_memory
-from nerf_lightning.utils.parsing import VALUE_ERRORS, existing_file, parse_json, read_content, read_npz
+from nerf_lightning.utils.parsing import VALUE_ERRORS, Headers, existing_file, parse_json, read_content, read_npz
 
 FORMAT, VERSION = "nerf_lightning compact", 1
 WORTH_BYTES = 2048
 """Arrays with at least this many numbers are coded as bytes; smaller ones, such as networks, stay half floats."""
+MAX_HEADER_BYTES = 16 << 20
+"""Of JSON, which takes up to 32 times as much memory: a thousand cameras are 4 MB. Compressed, zeros are a thousandth."""
 Arrays = dict[str, Any]  # of numpy arrays
 
 
@@ -135,7 +137,13 @@ def _unpacked(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]
         InputError: as `decode`.
     """
     expected = "a compact file of this package"
-    arrays = read_npz(content, None, lambda headers: require_keys(path, headers, ["header"]), path, expected)
+
+    def check(headers: Headers) -> None:
+        require_keys(path, headers, ["header"])
+        if (size := headers["header"].nbytes) > MAX_HEADER_BYTES:
+            raise InputError(path, "header", f"{size} bytes", f"{expected}: at most {MAX_HEADER_BYTES}")
+
+    arrays = read_npz(content, None, check, path, expected)
     header = parse_json(arrays.pop("header").tobytes(), f"{path}: header", expected)
     format_, version = (header.get(key) for key in ("format", "version")) if isinstance(header, dict) else (None, None)
     if (format_, version) != (FORMAT, VERSION):

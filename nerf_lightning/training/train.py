@@ -3,6 +3,7 @@
 import copy
 import logging
 import math
+import shlex
 from contextlib import nullcontext, suppress
 from pathlib import Path
 
@@ -279,7 +280,7 @@ def report(results: dict, folder: Path, logger: L.pytorch.loggers.Logger | None)
     print(f"{scene}: {quality} after {seconds:.0f} s of training ({results['status']})")
     if (results["rows_measured"] or 1.0) < 1.0:
         share = f"{results['rows_measured']:.0%} of the rows of each held-out photo, to take no longer than training"
-        print(f"measured on {share}; nerf_lightning evaluate {folder} measures all")
+        print(f"measured on {share}; nerf_lightning evaluate {shlex.quote(str(folder))} measures all")
     if results["diagnosis"]:
         print(results["diagnosis"])
     crowded = crowding(results)

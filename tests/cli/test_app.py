@@ -44,6 +44,11 @@ def test_without_arguments_lists_commands_in_the_order_of_the_work(inside):
     assert places == sorted(places)
 
 
+def test_front_page_alone_shows_the_first_steps(inside):
+    step = "export mesh -o mesh.glb"
+    assert step in inside()[1] and step not in inside("export", "--help")[1]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

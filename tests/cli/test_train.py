@@ -33,6 +33,7 @@ ROOT = Path(__file__).resolve().parents[2]
         (["+buget.steps=1"], ["buget", "did you mean budget?"]),
         (["+limits.chnk=1"], ["limits.chnk", "did you mean chunk?"]),
         (["--experiment=lego"], ["did you mean +experiment=lego?"]),
+        (["my photos"], ["found my photos", "dataset=photos 'dataset.path=my photos'"]),
         (["--experimental-rerun=notes.txt"], ["--experimental-rerun"]),
         (["model=nope"], ["model/nope", "hashgrid hashgrid2d"]),
         (["+experiment=nope"], ["experiment/nope", "lego"]),

@@ -15,7 +15,7 @@ from nerf_lightning.dataset.picture import builtin_picture
 from nerf_lightning.dataset.pixels import Picture
 from nerf_lightning.errors import InputError
 from nerf_lightning.export import smallest
-from nerf_lightning.runs.compact import decode, encode, load_compact, without_folders
+from nerf_lightning.runs.compact import MAX_HEADER_BYTES, decode, encode, load_compact, without_folders
 from nerf_lightning.runs.folder import plain_config
 from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.synthetic.objects import MARBLE, make_scene
@@ -101,6 +101,12 @@ def with_header(content: bytes, **values: object) -> bytes:
     return out.getvalue()
 
 
+def zeros_for_header() -> bytes:
+    """Of a few bytes, which unpacked take much memory."""
+    np.savez_compressed(out := io.BytesIO(), header=np.zeros(MAX_HEADER_BYTES + 1, np.uint8))
+    return out.getvalue()
+
+
 def test_damaged_or_untrusted_compact_file_is_refused(tmp_path: Path):
     content = make_compact(make_run(tmp_path, "recipe=hashgrid_small", "model.log2_entries=10"))
     with np.load(io.BytesIO(content)) as file:
@@ -109,6 +115,7 @@ def test_damaged_or_untrusted_compact_file_is_refused(tmp_path: Path):
         (b"", "expected a compact file"),
         (content[: len(content) // 2], "expected a compact file"),
         (with_header(content, version=99), "version 99"),
+        (zeros_for_header(), "header: found 16777217 bytes"),
         (with_header(content, config={**config, "version": "9.9"}), "version 9.9"),
         (with_header(content, config={**config, "model": {"_target_": "os.system"}}), "a class of this package"),
         (with_header(content, arrays={}), "the weights of the model"),
