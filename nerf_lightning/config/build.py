@@ -35,7 +35,7 @@ from nerf_lightning.utils.options import check_options
 KNOWN = ("cpu", "cuda", "mps")
 """Devices that Lightning knows; for any other it would silently take the CPU."""
 
-MAX_DEVICES = 1024
+MAX_DEVICES = 64
 """Lightning starts a process for each: a slip would bring the machine down."""
 
 PRECISIONS = ("32-true", "16-mixed", "bf16-mixed", 32, "32", 16, "16", "bf16")
@@ -59,8 +59,7 @@ def make(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> Any:
     if missing:
         raise InputError("config", missing[0], "nothing", "a value", f"give {missing[0]}=...")
     late = node.get("_partial_") or False
-    options = {key: value for key, value in resolved(node).items() if key not in ("_target_", "_partial_")}
-    check_options(path, target, options, extra, complete=not late)
+    check_options(path, target, options_of(node), extra, complete=not late)
     # Hydra only binds the options: it would turn dataclasses among `extra` into configs.
     literal = escape(escape(resolved(node)))  # Hydra resolves what it is given twice
     bound = hydra.utils.instantiate(literal, _partial_=True, _convert_="all")
@@ -75,6 +74,24 @@ def make(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> Any:
         wanted = " or ".join(kind.__name__ for kind in kinds)
         raise InputError("config", f"{path}._target_", f"what makes a {type(made).__name__}", f"what makes a {wanted}")
     return made
+
+
+def options_of(node: DictConfig) -> dict[str, Any]:
+    """A node's options, without what is Hydra's."""
+    return {key: value for key, value in resolved(node).items() if key not in ("_target_", "_partial_")}
+
+
+def check_groups(cfg: DictConfig) -> None:
+    """Checks the options of all groups by their targets' annotations, before photos are read or fetched.
+
+    Raises:
+        InputError: for an unknown option, and one of the wrong type or out of its bounds.
+    """
+    build_budget(cfg)
+    groups = ["dataset", "model", "sampler", "renderer", "optimizer", "schedule", "refine", "logger", "trainer"]
+    for path in [*groups, *(f"callbacks.{name}" for name in cfg.get("callbacks") or {})]:
+        if isinstance(node := OmegaConf.select(cfg, path), DictConfig):
+            check_options(path, target_of(cfg, path), options_of(node), complete=False)
 
 
 def target_of(cfg: DictConfig, path: str) -> Any:

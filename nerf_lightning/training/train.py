@@ -22,6 +22,7 @@ from nerf_lightning.config.build import (
     build_system,
     build_trainer,
     check_background,
+    check_groups,
     corrects_poses,
     device_of,
     frame_of,
@@ -94,6 +95,7 @@ def train(
     prepare(cfg, may_compile=True)
     if cfg.compile:
         check_compiler(device, BACKEND)
+    check_groups(cfg)
     data = load_data(cfg, scene, folder if resumed else None)
     data.enlarge(limits_of(cfg, device).batch)
     doubts = check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []
