@@ -29,7 +29,7 @@ from tests.helpers.train_models import MODELS
 
 
 @pytest.fixture(autouse=True)
-def without_lightnings_hints() -> None:
+def silence_lightning_hints() -> None:
     silence_lightning()
 
 
@@ -48,15 +48,6 @@ def run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
         return folder
 
     return make_once(tmp_path_factory, "any_device", make)
-
-
-def test_fake_device_tensor_beside_cpu_tensor_is_refused(device: torch.device):
-    there, here = torch.ones(3, device=device), torch.ones(3)
-    with pytest.raises(RuntimeError, match="some tensors are on the device, some on the CPU"):
-        there + here
-    with pytest.raises(TypeError, match="no numpy"):
-        there.numpy()
-    assert torch.equal((there + torch.tensor(1.0)).cpu(), torch.full((3,), 2.0)), "a single number may come along"
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -81,7 +72,7 @@ def test_run_on_device_resumes(name: str, device: torch.device, tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "precision"), list(zip(MODELS, itertools.cycle(["bf16-mixed", "16-mixed"]), strict=False))
 )
-def test_mixed_precision_trains_each_model(name: str, precision: str, device: torch.device, tmp_path: Path):
+def test_mixed_precision_on_device_trains_each_model(name: str, precision: str, device: torch.device, tmp_path: Path):
     quick = ["callbacks.snapshots=null", "callbacks.heldout=null", "callbacks.orbit=null", "budget.steps=2"]
     cfg = composed([*options(name), *ON_IT, *quick, f"trainer.precision={precision}"], tmp_path)
     data = build_data(cfg)
@@ -113,7 +104,6 @@ class Spoil(L.Callback):
     [
         ("tensorf", "nan", ["callbacks.guard.keep_every=5"], "last good weights"),
         ("mlp", "dead", ["model.density=relu"], "softplus"),
-        ("hashgrid2d", "nan", ["callbacks.guard.keep_every=500"], "started again"),
         ("mlp", "", ["optimizer.lr=0.5"], "times the learning rate"),
     ],
 )

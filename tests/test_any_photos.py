@@ -51,17 +51,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_a_run_on_any_photos(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_run_on_mixed_masked_fisheye_photos_writes_outputs(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     scene = nl.load_scene(folder)
     assert scene.train.known is not None and scene.train.cameras.lenses is not None
     assert sorted(map(tuple, scene.val.cameras.sizes.tolist())) == [(24, 24), (24, 24)]
     assert {tuple(size) for size in scene.train.cameras.sizes.tolist()} == {(24, 24), (48, 24)}
-    options = [
-        "callbacks.snapshots=null",
-        "callbacks.orbit.frames=2",
-        "~logger",
-        "sampler.samples=32",
-    ]
+    options = ["callbacks.snapshots=null", "callbacks.orbit.frames=2", "~logger", "sampler.samples=32"]
     run = nl.train(scene, steps=STEPS, seed=1, device="cpu", folder=tmp_path / "run", options=options)
     assert np.isfinite(run.psnr) and run.psnr > 10
 
@@ -87,7 +84,7 @@ QUICK = [
 ]
 
 
-def test_a_held_out_photo_of_which_nothing_is_known_does_not_count(folder: Path, tmp_path: Path):
+def test_run_masked_held_out_photo_does_not_count(folder: Path, tmp_path: Path):
     scene = nl.load_scene(folder)
     mask = scene.val.mask.clone()
     mask[: 24 * 24] = False
@@ -98,7 +95,7 @@ def test_a_held_out_photo_of_which_nothing_is_known_does_not_count(folder: Path,
 
 
 @pytest.mark.parametrize("cameras_too", [False, True])
-def test_pictures_that_are_no_numbers_are_told(
+def test_run_nan_pictures_is_collapsed(
     cameras_too: bool, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """As where weights are finite and what they add up to is not; or where corrections of cameras are not either."""

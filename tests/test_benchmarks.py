@@ -11,31 +11,14 @@ import torch
 from torch import Tensor
 
 from benchmarks import __main__ as command
-from benchmarks import agreement, cameras, cases, drawn, methods, overhead, photos, pictures, speed
+from benchmarks import agreement, cameras, cases, overhead, photos, pictures, speed
 from benchmarks.tables import differences
 from nerf_lightning import kernels
 from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
-from nerf_lightning.dataset.picture import load_picture
 from nerf_lightning.utils.device import CPU
 from tests.helpers.soft_ball import cameras_around_ball
-
-CURVE = [[2.0, 100, 20.0], [8.0, 400, 24.5], [10.5, 500, 26.0], [30.0, 1500, 29.0]]
-
-
-def run(curve: list[list[float]], **figures) -> dict:
-    common = {"steps": 1500, "train_seconds": 30.0, "rays_per_second": 1e5, "render_seconds_per_view": 0.1}
-    return common | {"peak_memory_bytes": 1e9, "parameters": 1000, "psnr": curve[-1][2], "curve": curve} | figures
-
-
-def test_summary_several_budgets_takes_each_figure_from_the_one_that_fits():
-    assert [methods.seconds_to(CURVE, db) for db in (20.0, 24, 26.0, 29.5)] == [2.0, 8.0, 10.5, None]
-    assert methods.middle([3.0, None, 5.0]) == 5.0 and methods.middle([3.0, None, None]) is None
-    short = run([[5.0, 1, 25.0], [10.0, 2, 27.5]], train_seconds=10.0)
-    row = methods.summary("m", {30.0: [run(CURVE)] * 3, 10.0: [short] * 3})
-    assert row["seconds_to_24_db"] == 5.0 and row["seconds_to_27_db"] == 10.0 and row["seconds_to_30_db"] is None
-    assert row["db_at_10_s"] == 27.5 and row["db_at_30_s"] == 29.0 and "db_at_60_s" not in row
 
 
 def test_camera_errors_common_motion_does_not_count():
@@ -86,53 +69,6 @@ def test_compare_kernels_right_ones_are_equal_and_wrong_ones_named(few_samples: 
     ]
 
 
-def samples_on_two_rays(*distances: float) -> list[Tensor]:
-    """As packed: those below 10 on the first ray, 10 less of the others on the second."""
-    along = torch.tensor(distances, dtype=torch.float32)
-    t, ray = along % 10, (along >= 10).long()
-    return [t, torch.ones_like(t), ray, torch.tensor([0, int((ray == 0).sum()), len(ray)])]
-
-
-def test_compare_packed_samples_meet_counterparts_on_same_ray():
-    wanted = samples_on_two_rays(1, 2, 3, 11, 12)
-    assert agreement.compare_packed(samples_on_two_rays(1, 2.00001, 3, 11, 12), wanted)[1] == 0
-    assert agreement.compare_packed(samples_on_two_rays(1, 3, 11, 12), wanted) == (0, 0.2)
-    assert agreement.compare_packed(samples_on_two_rays(1, 2, 3, 11, 13), wanted) == (0, 0.4)
-    longer = samples_on_two_rays(1, 2, 3, 11, 12)
-    longer[1][4] = 1.5
-    assert agreement.compare_packed(longer, wanted) == (0.5, 0)
-    longer[3][1] = 2
-    assert agreement.compare_packed(longer, wanted)[1] == 1, "offsets that do not fit the rays"
-
-
-@pytest.mark.parametrize(
-    ("there", "seeds", "differs"),
-    [([29.5, 30.1], 2, ""), ([29.2], 4, "0.8 dB below the CPU"), ([math.nan], 4, "nan dB below the CPU")],
-)
-def test_compare_training_in_doubt_asks_more_seeds(there, seeds, differs, monkeypatch, tmp_path):
-    def trained(overrides: list[str], version: str, seed: int, *rest: object) -> float:
-        return there[min(seed, len(there) - 1)] if version == "auto" else 30.0
-
-    monkeypatch.setattr(agreement, "train_quietly", trained)
-    row = agreement.compare_training([], CPU, 0, tmp_path)
-    assert (row["seeds"], row["differs"]) == (seeds, differs)
-
-
-@pytest.mark.parametrize("kind", ["text", "leaves", "cut_out"])
-def test_drawn_picture_depends_on_seed_alone(kind: str, tmp_path: Path):
-    first, again, other = (drawn.write_picture(kind, 48, seed, tmp_path / str(n)) for n, seed in enumerate((0, 0, 1)))
-    pixels = load_picture(first)
-    assert pixels.shape == (48, 48, 3) and pixels.float().std() > 5
-    assert first.read_bytes() == again.read_bytes() != other.read_bytes()
-
-
-def test_parse_unknown_part_or_device_is_refused(capsys):
-    for words, named in ((["colonels"], "colonels"), (["speed", "--device", "abacus"], "abacus")):
-        with pytest.raises(SystemExit) as stopped:
-            command.parse(words)
-        assert stopped.value.code == 2 and named in capsys.readouterr().err
-
-
 TINY = {
     cases: {"RAYS": 16, "SAMPLES": 64},
     agreement: {"ROUNDS": 1, "STEPS": 2, "SCENE": ("dataset=bricks", "dataset.size=16", "dataset.train_views=10")},
@@ -157,18 +93,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.long
 def test_main_tiny_parts_write_table_and_json(tiny: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     size = ["dataset.size=16", "dataset.train_views=10", "sampler.update_every=2"]
-    options = [
-        "--experiments",
-        "smoke_3d",
-        "--budgets",
-        "0.2",
-        "--seeds",
-        "0",
-        "--device",
-        "cpu",
-        "--output",
-        str(tmp_path),
-    ]
+    options = f"--experiments smoke_3d --budgets 0.2 --seeds 0 --device cpu --output {tmp_path}".split()
     monkeypatch.setattr("sys.argv", ["benchmarks", "agreement", "speed", "methods", *size, *options])
     with pytest.raises(SystemExit) as stopped:
         command.main()
@@ -188,16 +113,7 @@ def test_main_tiny_parts_write_table_and_json(tiny: None, tmp_path: Path, monkey
 @pytest.mark.long
 def test_measure_tiny_scenes_and_pictures_give_rows(tiny: None, tmp_path: Path):
     save_npz(bricks(size=16, train_views=6, val_views=2), tmp_path / "scene.npz")
-    words = [
-        "--scenes",
-        str(tmp_path / "scene.npz"),
-        "--recipes",
-        "hashgrid_medium",
-        "--seeds",
-        "0",
-        "--output",
-        str(tmp_path),
-    ]
+    words = f"--scenes {tmp_path / 'scene.npz'} --recipes hashgrid_medium --seeds 0 --output {tmp_path}".split()
     args = command.parse([*words, "dataset.max_side=16", "budget.steps=2", "budget.seconds=null"])
     found = pictures.measure(args)
     assert {row["table"] for row in found} == {"pictures", "2D fields", "kinds of pictures"}

@@ -42,10 +42,7 @@ SMALLER: list[tuple[str, str]] = [
     ("experiment=lego", SCENE),
     ("-m +experiment=picture", f"{PICTURE} {PLAIN}"),
     ("experiment=picture", PICTURE),
-    (
-        "model=ball",
-        "dataset.size=16 dataset.train_views=4 dataset.val_views=1 budget.steps=2 callbacks.orbit.frames=2",
-    ),
+    ("model=ball", "dataset.size=16 dataset.train_views=4 dataset.val_views=1 budget.steps=2 callbacks.orbit.frames=2"),
     ("capture --calibration", f"--tag-size {SIZE} --resize 60"),
     ("nerf_lightning render", "--frames 2"),
     ("export compact", "--loss-db 100"),
@@ -119,7 +116,7 @@ def smaller(line: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_command_of_a_page_works(
+def test_docs_page_commands_succeed(
     page: Path,
     shell: Callable[[str], int],
     tmp_path: Path,
@@ -146,7 +143,7 @@ def test_every_command_of_a_page_works(
         assert code == 0, f"{line}\n{capfd.readouterr().err}"
 
 
-def test_every_page_is_linked_and_every_link_leads_somewhere():
+def test_docs_links_lead_to_files():
     readme = (DOCS.parent / "README.md").read_text()
     for page in PAGES:
         assert f"docs/{page.name}" in readme, page.name

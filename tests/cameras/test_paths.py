@@ -14,19 +14,15 @@ CAPTURES = {
     "ring": ring(),
     "framed to one side": ring(yaw=20),
     "arc": ring(degrees=150),
-    "short arc": ring(degrees=70),
     "dome": dome(),
     "converging": forward(-0.3),
-    "parallel": forward(0.0),
     "diverging": forward(0.2),
     "pan": pan(),
-    "noisy pan": pan(0.02),
     "half a pan": pan(degrees=150),
     "walk": walk(),
     "corridor": corridor(),
     "one": ring(1),
     "two": ring(2),
-    "four": ring(4),
     "all in one pose": ring(1).repeat(5, 1, 1),
 }
 
@@ -35,7 +31,7 @@ def cameras_at(c2w: torch.Tensor) -> Cameras:
     return Cameras.of_size(torch.eye(3).repeat(len(c2w), 1, 1) * 20, c2w.float(), 32, 24)
 
 
-@pytest.mark.parametrize("frames", [1, 7, 60])
+@pytest.mark.parametrize("frames", [1, 60])
 @pytest.mark.parametrize("c2w", CAPTURES.values(), ids=CAPTURES.keys())
 def test_orbit_like_and_spiral_stay_near_the_photos(c2w: torch.Tensor, frames: int):
     cameras = cameras_at(c2w)
@@ -63,7 +59,9 @@ def test_orbit_like_and_spiral_stay_near_the_photos(c2w: torch.Tensor, frames: i
 
 @pytest.mark.parametrize("yaw", [0, 20])
 def test_orbit_like_ring_is_a_full_turn(yaw: int):
-    orbit = orbit_like(cameras_at(ring(yaw=yaw)), 8)
+    cameras = cameras_at(ring(yaw=yaw))
+    orbit = orbit_like(cameras, 8)
+    assert (orbit.width, orbit.height) == (32, 24) and torch.equal(orbit.K, cameras.K[:8])
     offset = orbit.centres - CENTRE.float()
     torch.testing.assert_close(offset.norm(dim=1), torch.full((8,), RADIUS), atol=0.05, rtol=0)
     torch.testing.assert_close(orbit.c2w[:, :3, 2], -normalize(offset, dim=1), atol=0.05, rtol=0)

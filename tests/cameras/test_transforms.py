@@ -4,7 +4,7 @@ import torch
 
 from nerf_lightning.cameras import pixel_to_camera, transform, transform_directions
 
-BATCHES = [((), ()), ((5,), (5,)), ((), (5,)), ((5,), ()), ((4, 1), (1, 3)), ((2, 3), (2, 3)), ((3,), (2, 1))]
+BATCHES = [((), ()), ((), (5,)), ((5,), ()), ((4, 1), (1, 3))]
 
 
 @pytest.mark.parametrize(("cameras", "points"), BATCHES)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 from capture.views import SIZE
-from once import once
 
 from benchmarks.synthetic.photos import Truth
 from nerf_lightning.capture.run import Capture, capture_scene
+from tests.helpers.shared_fixtures import make_once
 
 
 @pytest.fixture(scope="session")
@@ -18,4 +18,4 @@ def packed(made: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -
         photos = made[0] / "calibration", made[0] / "photos"
         return folder, capture_scene(*photos, SIZE, folder / "scene.npz", longest=200, holdout=4)
 
-    return once(tmp_path_factory, "packed", make)
+    return make_once(tmp_path_factory, "packed", make)

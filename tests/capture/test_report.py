@@ -14,9 +14,9 @@ from nerf_lightning.capture.photo_status import PhotoStatus, calibration_statuse
 from nerf_lightning.capture.poses.calibrate import calibrate
 from nerf_lightning.capture.poses.geometry import inverse, project
 from nerf_lightning.capture.poses.solve import solve
-from nerf_lightning.capture.report.coverage_chart import describe_lens, displacement
+from nerf_lightning.capture.report.coverage_chart import displacement
 from nerf_lightning.capture.report.error_chart import collect_residuals
-from nerf_lightning.capture.report.write import tag_corners, write_report
+from nerf_lightning.capture.report.write import write_report
 from nerf_lightning.capture.run import Capture, PlacedPhoto
 from nerf_lightning.capture.tags.detect import Mark, Sighting
 from nerf_lightning.capture.tags.layout import SQUARE
@@ -100,15 +100,6 @@ def test_photo_statuses_hold_residuals_of_their_own_photo(capture):
     assert all(status.error is None and not status.residuals for status in statuses[6:])
 
 
-def test_captions_name_error_or_reason(capture):
-    captions = {s.path.name: s.caption for s in [*calibration_statuses(capture), *photo_statuses(capture)]}
-    assert len(captions) == 16 and all(name in caption for name, caption in captions.items())
-    for name, caption in captions.items():
-        assert ("left out" in caption) == name.startswith(("blank", "turned"))
-        assert (TURNED in caption) == name.startswith("turned")
-    assert f"{capture.photos[0].reprojection_px:.2f} px" in captions[capture.photos[0].name]
-
-
 def test_subsample_photos_keeps_those_left_out():
     photos = [
         PhotoStatus(n, Path("x.png"), {}, {}, 0.1, "blurred" if n in (17, 18, 120) else "") for n in range(1, 201)
@@ -132,18 +123,6 @@ def test_displacement_is_the_lens_polynomial():
     # At a tangent of 1, k1 pulls in by a tenth: 10 pixels at a focal length of 100.
     moved = displacement(lens, np.array([[200.0, 50.0], [100.0, 50.0]]))
     np.testing.assert_allclose(moved, [[-10, 0], [0, 0]], atol=1e-9)
-
-
-def test_describe_lens_gives_free_parameters_with_deviation(capture):
-    text = describe_lens(capture.calibration)
-    assert f"focal {capture.calibration.lens.fx:.0f}"[:8] in text and "±" in text
-    assert all(name in text.split("kept")[0] for name in capture.calibration.deviations)
-
-
-def test_tag_corners_are_a_tag_apart(capture):
-    corners = tag_corners(capture)
-    assert set(corners) == set(capture.solved.tags)
-    assert all(np.linalg.norm(c[0] - c[1]) == pytest.approx(SHEET.size) for c in corners.values())
 
 
 def test_ink_magnification_takes_round_steps_and_names_stay_readable():

@@ -4,7 +4,6 @@ import json
 import struct
 from pathlib import Path
 
-import cv2
 import imageio.v3 as imageio
 import numpy as np
 import torch
@@ -129,8 +128,3 @@ def write_scene(format: str, folder: Path, views: Views) -> Path:
             content = {"camera_angle_x": 2 * float(np.arctan(0.5 * width / focal)), "frames": part}
             (folder / f"transforms_{split}.json").write_text(json.dumps(content))
     return folder
-
-
-def rotated(image: np.ndarray) -> np.ndarray:
-    """By a quarter turn."""
-    return cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)

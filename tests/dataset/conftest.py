@@ -2,14 +2,12 @@
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
 
 from nerf_lightning.cameras import Bounds, Cameras, orbit_around
 from nerf_lightning.dataset import Scene, Views
-from nerf_lightning.errors import InputError
 
 CENTRE = torch.tensor([0.3, -0.2, 0.1])
 RADIUS = 0.5
@@ -53,16 +51,3 @@ def ball() -> Scene:
     train, val = ball_views(3), ball_views(1, turn=0.4)
     orbit = ball_views(4, (0.3,)).cameras
     return Scene("ball", "test", train, val, orbit, Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])))
-
-
-@pytest.fixture(scope="session")
-def says() -> Callable[..., None]:
-    """Asserts that an InputError is one line that holds all the given words."""
-
-    def check(error: InputError, *words: str | Path) -> None:
-        line = str(error)
-        assert "\n" not in line
-        for word in words:
-            assert str(word) in line, line
-
-    return check

@@ -48,33 +48,6 @@ def test_load_blender_plain_folder_returns_its_images(folder: Path):
     assert len(scene.orbit) == 60 and not scene.bounds.unbounded
 
 
-def test_load_blender_known_point_is_on_the_ray_of_its_pixel(folder: Path):
-    # (1.25, 0.75, 0) is 1.25 right of, 0.75 above and 5 before the camera: u = 4 + 2.5, v = 3 - 1.5, a pixel's centre.
-    cameras = load_blender(folder).train.cameras
-    ray = cameras.rays(torch.tensor([0]), torch.tensor([1]), torch.tensor([6]))
-    point = torch.tensor([1.25, 0.75, 0.0])
-    torch.testing.assert_close(ray.directions[0], torch.nn.functional.normalize(point - ray.origins[0], dim=0))
-    torch.testing.assert_close(ray.origins[0], torch.tensor([0.0, 0.0, 5.0]))
-
-
-def test_load_blender_without_val_holds_out_test(folder: Path):
-    (folder / "transforms_val.json").rename(folder / "transforms_test.json")
-    assert len(load_blender(folder).val) == 1
-
-
-@pytest.mark.parametrize(("border", "background"), [(255, 1.0), (0, 0.0), (51, 0.2), (None, 0.0)])
-def test_load_blender_rgb_border_colour_decides_bounded(border: int | None, background: float, folder: Path):
-    random = np.random.default_rng(0).integers(0, 256, (1, 6, 8, 3), dtype=np.uint8)
-    train = random if border is None else np.full_like(random, border)
-    train[:, 2:4, 3:5] = 128
-    write_split(folder, "train", train, np.eye(4)[None])
-    write_split(folder, "val", np.full((1, 6, 8, 3), 9, np.uint8), np.eye(4)[None])
-    scene = load_blender(folder, "named")
-    assert scene.name == "named" and scene.train.images.shape == (1, 6, 8, 3)
-    assert scene.background == pytest.approx((background,) * 3, abs=1e-6)
-    assert scene.bounds.unbounded is (border is None)
-
-
 def edit_all(folder: Path, **keys: object) -> None:
     for path in folder.glob("transforms_*.json"):
         path.write_text(json.dumps({**json.loads(path.read_text()), **keys}))
@@ -100,16 +73,16 @@ def test_load_blender_split_without_photos_is_the_orbit(folder: Path):
     assert scene.orbit.size(0) == (8, 6)
 
 
-def test_load_blender_val_and_test_are_kept_apart(folder: Path):
+def test_load_blender_splits_follow_the_files(folder: Path):
+    """Test photos are kept apart from val, or held out instead of it; without both, some training photos are held out."""
     write_split(folder, "test", make_images(), np.stack([np.eye(4)] * 3))
     scene = load_blender(folder)
     assert (len(scene.train), len(scene.val), len(scene.test)) == (2, 1, 3)
-
-
-def test_load_blender_train_alone_holds_some_out(folder: Path, caplog: pytest.LogCaptureFixture):
     (folder / "transforms_val.json").unlink()
+    assert len(load_blender(folder).val) == 3
+    (folder / "transforms_test.json").unlink()
     scene = load_blender(folder)
-    assert (len(scene.train), len(scene.val)) == (1, 1) and "no held-out photos" in caplog.text
+    assert (len(scene.train), len(scene.val)) == (1, 1)
 
 
 def test_load_blender_several_sizes_keep_the_angle(folder: Path):

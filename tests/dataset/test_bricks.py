@@ -15,7 +15,6 @@ from nerf_lightning.dataset.bricks.solids import Builder, Material
 from nerf_lightning.dataset.bricks.trace import nearest, shadow, trace, visible
 
 SMALL = {"size": 40, "train_views": 4, "val_views": 2, "orbit_views": 3}
-TINY = {"size": 8, "train_views": 1, "val_views": 1, "orbit_views": 1}
 MATERIAL = Material((1.0, 1.0, 1.0))
 
 

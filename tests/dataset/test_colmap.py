@@ -10,11 +10,11 @@ import pycolmap
 import pytest
 import torch
 
-from nerf_lightning.cameras import Distortion, Projection, in_other_frame
-from nerf_lightning.dataset import Reading, Scene, Views, open_scene
+from nerf_lightning.cameras import Distortion, Projection
+from nerf_lightning.cameras.lenses import to_directions, undistort
+from nerf_lightning.dataset import Scene, Views, open_scene
 from nerf_lightning.dataset.formats.colmap_cameras import NUMBERS, optics_of
 from nerf_lightning.dataset.optics import Optics
-from nerf_lightning.errors import InputError
 from tests.dataset.colmap_files import cameras_of, photos, write_colmap, write_llff, write_transforms
 
 
@@ -48,7 +48,7 @@ def test_open_scene_colmap_llff_transforms_agree(views: Views, tmp_path: Path):
     same(binary, open_scene(str(tmp_path / "llff")))
 
 
-@pytest.mark.parametrize("where", ["sparse/0", "sparse", "colmap/sparse/0", "distorted/sparse/0", "."])
+@pytest.mark.parametrize("where", ["sparse/0", "colmap/sparse/0", "."])
 def test_open_scene_model_is_found_in_usual_folders(where: str, views: Views, tmp_path: Path):
     folder = colmap(tmp_path / "scene", views, where)
     scene = open_scene(str(folder))
@@ -65,18 +65,6 @@ def test_open_scene_several_models_takes_the_largest(views: Views, tmp_path: Pat
     with caplog.at_level(logging.WARNING):
         assert len(open_scene(str(folder)).train) == 15
     assert "the model with most photos (18); others: 0 (4)" in caplog.text
-
-
-def test_open_scene_missing_and_unplaced_photos_are_named(
-    views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
-    folder = colmap(tmp_path, views)
-    (folder / "images" / "0005.png").rename(folder / "images" / "9999.png")
-    with caplog.at_level(logging.WARNING):
-        scene = open_scene(str(folder))
-    assert len(scene.train) + len(scene.val) == 17
-    assert "1 of 18 photos are not there, 0005.png" in caplog.text
-    assert "1 photos have no place in the model, 9999.png" in caplog.text
 
 
 PARAMETERS: dict[str, tuple[float, ...]] = {
@@ -108,36 +96,9 @@ def test_optics_of_agrees_with_pycolmap():
 
 def rays_of(optics: Optics, uv: np.ndarray) -> np.ndarray:
     """Directions of places in a photo, camera frame."""
-    from nerf_lightning.cameras.lenses import to_directions, undistort
-
     seen = torch.from_numpy((uv - (optics.cx, optics.cy)) / (optics.fx, optics.fy))
     flat = undistort(seen, torch.tensor([optics.distortion], dtype=torch.float64))
     return to_directions(flat, torch.tensor([optics.projection])).numpy()
-
-
-def test_open_scene_llff_reduced_photos_keep_the_angle(views: Views, tmp_path: Path):
-    names = photos(tmp_path / "images", views)
-    write_llff(tmp_path / "poses_bounds.npy", views)
-    whole = open_scene(str(tmp_path), reading=Reading(resize=24))
-    for name in names:
-        image = imageio.imread(tmp_path / "images" / name)
-        (tmp_path / "images" / name).unlink()
-        (tmp_path / "images_2").mkdir(exist_ok=True)
-        imageio.imwrite(tmp_path / "images_2" / name, image[::2, ::2])
-    small = open_scene(str(tmp_path))
-    torch.testing.assert_close(whole.train.cameras.K, small.train.cameras.K, atol=1e-4, rtol=0)
-
-
-@pytest.mark.real_data
-def test_open_scene_cup_is_the_same_in_both_formats(real_data: Path, tmp_path: Path):
-    a = open_scene(str(real_data / "cup"), reading=Reading(resize=40))
-    (tmp_path / "images").symlink_to(real_data / "cup" / "images")
-    (tmp_path / "poses_bounds.npy").symlink_to(real_data / "cup" / "poses_bounds.npy")
-    b = open_scene(str(tmp_path), reading=Reading(resize=40))
-    # The model's points move the region of detail: poses agree in the files' frame.
-    poses = [in_other_frame(scene.train.cameras.c2w, scene.to_source).float() for scene in (a, b)]
-    torch.testing.assert_close(*poses, atol=1e-4, rtol=0)
-    assert a.bounds.unbounded and len(a.train) == 67
 
 
 def test_open_scene_points_decide_near(views: Views, tmp_path: Path):
@@ -172,35 +133,30 @@ def test_open_scene_llff_depth_decides_near(views: Views, tmp_path: Path):
 @pytest.mark.parametrize(
     ("focal", "distortion", "projection"),
     [
-        (30.6, Distortion(k3=-3e5, d2=-8e12), Projection.FISHEYE),
         (111.0, Distortion(k1=6e9, d2=-6e12), Projection.FISHEYE),
-        (38.0, Distortion(k1=-4e9, d1=-7e6), Projection.PERSPECTIVE),
         (6443.0, Distortion(k3=2e3, d1=-6e7), Projection.PERSPECTIVE),
     ],
 )
-def test_sees_every_pixel_extreme_lens_is_refused(focal: float, distortion: Distortion, projection: Projection):
+def test_sees_every_pixel_only_extreme_lens_is_refused(focal: float, distortion: Distortion, projection: Projection):
     """Their borders unfold in double precision; between, or in single precision, rays go elsewhere."""
     assert not Optics(640, 480, focal, focal, 320, 240, distortion, projection).sees_every_pixel()
-
-
-@pytest.mark.parametrize(("focal", "k1"), [(1e5, -0.2), (1e5, 900.0), (4000.0, 0.1), (6000.0, -0.3)])
-def test_sees_every_pixel_strong_lens_is_accepted(focal: float, k1: float):
-    assert Optics(6000, 4000, focal, focal, 3000, 2000, Distortion(k1=k1)).sees_every_pixel()
+    for focal, k1 in ((1e5, 900.0), (6000.0, -0.3)):
+        assert Optics(6000, 4000, focal, focal, 3000, 2000, Distortion(k1=k1)).sees_every_pixel(), (
+            "strong, but it unfolds"
+        )
 
 
 VARIANTS: dict[str, tuple[str, str, str, str]] = {
     "reduced photos alone": ("sparse/0", "images_4", "{:04d}.png", "{:04d}.png"),
     "two spaces": ("sparse/0", "images", "my  photo {:d}.png", "my  photo {:d}.png"),
     "undistorted below dense/0": ("dense/0/sparse", "dense/0/images", "{:04d}.png", "{:04d}.png"),
-    "upper case": ("sparse/0", "images", "{:04d}.PNG", "{:04d}.png"),
-    "another machine": ("sparse/0", "images", "/home/me/images/{:04d}.png", "{:04d}.png"),
     "Windows": ("sparse/0", "images", "cam0\\{:04d}.png", "cam0/{:04d}.png"),
     "photos elsewhere": ("sparse/0", "pictures", "{:04d}.png", "{:04d}.png"),
 }
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_open_scene_colmap_variants(variant: str, views: Views, tmp_path: Path):
+def test_open_scene_colmap_variant_matches_the_plain_folder(variant: str, views: Views, tmp_path: Path):
     model, folder, stated, stored = VARIANTS[variant]
     expected = open_scene(str(colmap(tmp_path / "plain", views)))
     for i in range(len(views)):
@@ -218,10 +174,3 @@ def test_open_scene_colmap_variants(variant: str, views: Views, tmp_path: Path):
     assert float(scene.train.cameras.K[0, 0, 0]) == pytest.approx(float(expected.train.cameras.K[0, 0, 0]) / factor)
     if factor == 1 and "spaces" not in variant:
         assert torch.equal(scene.train.image(0), expected.train.image(0))
-
-
-def test_open_scene_several_scenes_raise(views: Views, tmp_path: Path):
-    for name in ("a", "b"):
-        colmap(tmp_path / name, views)
-    with pytest.raises(InputError, match="several COLMAP models: a/sparse/0, b/sparse/0, expected one"):
-        open_scene(str(tmp_path))

@@ -95,9 +95,8 @@ MISTAKES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
 }
 
 
-@pytest.mark.parametrize("outward", [False, True], ids=["inward", "outward"])
+@pytest.mark.parametrize(("outward", "opengl"), [(False, True), (True, False)], ids=["inward OpenGL", "outward OpenCV"])
 @pytest.mark.parametrize("name", MISTAKES)
-@pytest.mark.parametrize("opengl", [False, True], ids=["OpenCV file", "OpenGL file"])
 def test_convention_hypotheses_each_mistake_is_named(name: str, outward: bool, opengl: bool):
     """What a file holds, in its own axes, is spoilt; matches are exact."""
     if opengl and name in ("mirrored", "on their sides"):
@@ -202,11 +201,9 @@ def test_order_hypotheses_restore_the_order(name: str):
     ("change", "words"),
     [
         (MISTAKES["other axes"][0], "camera axes of the other convention"),
-        (np.linalg.inv, "world-to-camera matrices"),
-        (MISTAKES["transposed"][0], "transposed rotations"),
         (lambda c2w: c2w[np.random.default_rng(1).permutation(len(c2w))], "they belong to other photos"),
     ],
-    ids=["axes", "inverse", "transposed", "shuffled"],
+    ids=["axes", "shuffled"],
 )
 def test_check_scene_wrong_convention_raises_its_name(
     forward: Scene, change: Callable[[np.ndarray], np.ndarray], words: str

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from nerf_lightning.dataset import Views, open_scene
-from nerf_lightning.dataset.formats.colmap_model import read_model
 from nerf_lightning.errors import InputError
 from tests.dataset.colmap_files import write_scene
 
@@ -83,11 +82,6 @@ def edit(change: Callable[[dict], object]) -> Spoil:
     return apply
 
 
-def top(**keys: object) -> Spoil:
-    """Keys of all frames."""
-    return edit(lambda c: (c.update(keys), [entry.pop(key, None) for entry in c["frames"] for key in keys]))
-
-
 def frame(**keys: object) -> Spoil:
     return edit(lambda c: c["frames"][3].update(keys))
 
@@ -111,114 +105,73 @@ PICKLED = np.array([Payload()], dtype=object)
 ALL = [f"images/{i:04d}.png" for i in range(12)]
 NPZ = [
     (entries(images_train=None), "images_train: found no such key"),
-    (entries(focal=None), "focal: found no such key"),
     (entries(images_train=lambda x: x[0]), "images_train: found shape"),
-    (entries(images_train=lambda x: x[..., :2]), "images_train: found shape"),
-    (entries(images_train=lambda x: x.astype(int)), "int64"),
     (entries(images_val=lambda x: x * 1.0), "floats from"),
-    (entries(images_val=lambda x: x * np.nan), "floats from nan"),
     (entries(images_val=lambda x: x[:, :4]), "as in images_train"),
     (entries(images_val=lambda x: x[:0]), "0 views"),
-    (entries(c2ws_test=np.zeros((0, 4, 4))), "c2ws_test: found 0 views"),
     (entries(c2ws_train=lambda x: x[:2]), "9 images for 2 poses"),
     (entries(c2ws_train=np.zeros((9, 3, 4))), "c2ws_train: found shape (9, 3, 4)"),
-    (entries(c2ws_train=np.array(3.0)), "0 poses"),
     (pose(lambda p: p * np.nan), "c2ws_train[1]: found nan"),
     (pose(lambda p: p * [2, 2, 3, 1]), "c2ws_train[1]: found no rotation"),
-    (pose(lambda p: p * [1e300, 1e300, -1e300, 1]), "c2ws_train[1]: found no rotation"),
     (pose(lambda p: p * [-1, 1, 1, 1]), "c2ws_train[1]: found a mirror"),
     (pose(lambda p: p.T), "c2ws_train[1]: found another bottom row"),
     (pose(lambda p: p + 1e30 * np.eye(4, k=3)), "c2ws_train[1]: found a camera at"),
     (entries(focal=-3.0), "focal: found -3"),
-    (entries(focal=np.nan), "focal: found"),
-    (entries(focal=[1.0, 1.0]), "focal: found shape (2,)"),
-    (entries(focal=1e39), "focal: found 1e+39"),
     (entries(K=EYE), "K: found shape (4, 4)"),
-    (entries(K=[[60.0, 0, 0], [0, 60, 0], [24, 20, 1]]), "K: found"),
     (entries(K=[[60.0, 0, 1e9], [0, 60, 3], [0, 0, 1]]), "principal point"),
     (entries(K=[[600.0, 0, 240], [0, 600, 200], [0, 0, 1]]), "the middle of photos 10 times as large"),
     (entries(near=3.0, far=2.0), "far: found 2"),
-    (entries(near=-1.0), "near: found -1"),
     (entries(near=np.zeros(17)), "at most 16 numbers"),
     (entries(aabb=[[1.0, 1, 1], [0, 2, 2]]), "aabb: found"),
-    (entries(aabb=[[0, 0, 0], [1e39, 1, 1]]), "aabb: found"),
     (entries(aabb=[[0.0, 0, 0], [1, 1, 1]], unbounded=1), "unbounded: found"),
     (entries(to_source=np.zeros((4, 4))), "to_source: found"),
     (entries(to_source=EYE + np.eye(4, k=1) * [0, 1, 0, 0]), "a similarity"),
-    (entries(to_source=np.diag([1, 1, -1, 1])), "a similarity"),
     (entries(background=[0, 2, 0.5]), "background: found"),
     (entries(focal=PICKLED), "Object arrays"),
     (entries(c2ws_train=lambda x: x * np.array([*[[1, 1, 1, 1e-14]] * 3, [1] * 4])), "take another unit"),
     (Path.unlink, "nothing there"),
-    (lambda file: (file.unlink(), file.mkdir()), "folder"),
-    (lambda file: file.write_bytes(b""), "BadZipFile"),
     (lambda file: file.write_bytes(file.read_bytes()[:-200]), "BadZipFile"),
-    (lambda file: file.write_bytes(file.read_bytes()[:300] + 40 * b"U" + file.read_bytes()[340:]), "BadZipFile"),
 ]
 JSON = [
     (text("transforms.json", '{"frames": [}'), "broken JSON"),
     (text("transforms.json", "[]"), "a JSON list"),
-    (lambda scene: (scene / "transforms.json").write_bytes(b'{"\xff"}'), "no JSON"),
     (edit(lambda c: c.pop("frames")), "frames: found no such key"),
     (edit(lambda c: c.update(frames=[])), "frames: found []"),
-    (edit(lambda c: c.update(frames=[3])), "frames: found [3]"),
-    (edit(lambda c: c["frames"][3].pop("file_path")), "frames[3]: file_path"),
-    (edit(lambda c: c["frames"][3].pop("transform_matrix")), "frames[3]: transform_matrix"),
     (frame(file_path=3), "frames[3].file_path: found 3"),
     (frame(transform_matrix=np.eye(3).tolist()), "frames[3].transform_matrix: found shape"),
-    (frame(transform_matrix=[[1, 2], [3]]), "frames[3].transform_matrix: found no matrix"),
     (frame(transform_matrix=[[math.nan] * 4] * 4), "frames[3].transform_matrix: found nan"),
-    (frame(mask_path=3), "mask_path: found 3"),
     (frame(mask_path="no.png"), "which is not there"),
     (no_photos, "(nor are 11 more)"),
     (frame(fl_x=None, fl_y=None), "no focal length"),
-    (frame(fl_x=-3), "fl_x: found -3"),
-    (frame(fl_x=1e39), "a focal length of"),
     (frame(fl_x=None, fl_y=None, camera_angle_x=62.0), "write 1.0821"),
-    (frame(fl_x=None, fl_y=None, camera_angle_x=0), "camera_angle_x: found 0"),
-    (frame(fl_x=None, fl_y=None, camera_angle_x="wide"), "camera_angle_x: found 'wide'"),
     (frame(cx=1e39), "principal point"),
-    (frame(cx=10**400), "one finite number"),
     (frame(k1=[1]), "k1: found [1]"),
     (frame(k1=-50.0), "folds the photo over"),
     (frame(k4=0.1), "k4: found 0.1"),
     (frame(rolling_shutter=[0, 0, 0.03, 0]), "rolling_shutter: found"),
-    (frame(ftheta_p1=0.3), "ftheta_p1: found"),
     (frame(camera_model="EUCM"), "'EUCM'"),
     (frame(w=60, h=40), "found 48x40 pixels, expected 60x40"),
-    (frame(w=0, h=40), "the pixels of a photo"),
     (edit(lambda c: c.update(applied_transform=[[1, 0], [0, 1]])), "applied_transform: found shape"),
     (edit(lambda c: c.update(val_filenames=["images/x.png"])), "which is no frame"),
-    (edit(lambda c: c.update(val_filenames="images/0000.png")), "val_filenames: found"),
     (edit(lambda c: c.update(train_filenames=ALL, val_filenames=ALL[:1])), "which is in train_filenames too"),
     (edit(lambda c: c.update(val_filenames=ALL)), "train split: found 0 views"),
 ]
 BLENDER = [
     (edit(lambda c: c.pop("camera_angle_x")), "no focal length"),
-    (lambda scene: (scene / "transforms_val.json").write_text("[]"), "transforms_val.json: found a JSON list"),
     (no_photos, "which is not there"),
     (text("images/0005.png", "no"), "0005.png: found 2 bytes"),
 ]
 COLMAP = [
     (cut(f"{MODEL}/cameras.bin", 30), "cameras.bin: found a damaged file"),
-    (cut(f"{MODEL}/images.bin", 74), "images.bin: found a damaged file"),
-    (cut(f"{MODEL}/points3D.bin", 40), "points3D.bin: found a damaged file"),
     (put(f"{MODEL}/images.bin", 0, "Q", 2**60), "images.bin: found a damaged file"),
     (put(f"{MODEL}/cameras.bin", 12, "i", 99), "model number 99"),
-    (put(f"{MODEL}/cameras.bin", 16, "Q", 0), "0x40 pixels"),
     (put(f"{MODEL}/cameras.bin", 32, "d", math.nan), "a focal length of"),
-    (put(f"{MODEL}/cameras.bin", 32, "d", -60.0), "a focal length of"),
     (put(f"{MODEL}/cameras.bin", 48, "d", 1e39), "principal point"),
-    (put(f"{MODEL}/images.bin", 44, "d", 1e300), "0000.png: found the pose"),
     (put(f"{MODEL}/images.bin", 44, "d", math.nan), "0000.png: found the pose"),
-    (put(f"{MODEL}/images.bin", 12, "4d", 0, 0, 0, 0), "0000.png: found the pose"),
     (put(f"{MODEL}/images.bin", 68, "i", 77), "camera 77 of 0000.png"),
-    (put(f"{MODEL}/images.bin", 72, "B", 0xFF), "images.bin: found a damaged file"),
     (lambda scene: (scene / MODEL / "images.bin").write_bytes(bytes(8)), "0 photos"),
     (lambda scene: (scene / MODEL / "images.bin").unlink(), "a folder with images, sparse"),
     (no_photos, "a photo for at least half"),
-    (picture("images/0003.png", 1, 1, 3), "0003.png: found 1x1 pixels"),
-    (picture("images/0003.png", 2, 2, 3), "0003.png: found 2x2 pixels"),
     (picture("images/0003.png", 48, 40, 3), "0003.png: found 40x48 pixels, expected 48x40"),
     (text("images/0003.png", "a photo"), "0003.png: found 7 bytes"),
     (cut("images/0003.png", 200), "0003.png: found"),
@@ -231,23 +184,17 @@ COLMAP = [
 TEXT = [
     (replaced(f"{MODEL}/cameras.txt", "48 40", "48 forty"), "forty"),
     (replaced(f"{MODEL}/cameras.txt", "PINHOLE", "EUCM"), "'EUCM'"),
-    (replaced(f"{MODEL}/cameras.txt", "48 40", "48"), "3 parameters"),
     (text(f"{MODEL}/images.txt", "1 1 0 0 0\n\n"), "images.txt: found"),
-    (text(f"{MODEL}/images.txt", "1 a b c d e f g 1 0.png\n\n"), "images.txt: found"),
     (replaced(f"{MODEL}/images.txt", "0001.png", "0000.png"), "two photos of one name"),
     (text(f"{MODEL}/points3D.txt", "1 2\n"), "points3D.txt: found"),
-    (put(f"{MODEL}/images.txt", 0, "4B", 255, 254, 0, 1), "images.txt: found"),
     (text(f"{MODEL}/images.txt", "# none\n"), "0 photos"),
 ]
 LLFF = [
     (rows(lambda a: a[:-2]), "10 poses, but 12 in images"),
     (rows(lambda a: a[:, :15]), "shape (12, 15)"),
-    (rows(lambda a: a[:0]), "no photo"),
     (cell(2, 3, np.nan), "row 2: found nan"),
     (cell(1, [0, 5, 10], 0), "row 1: found no rotation"),
-    (cell(0, 3, 1e39), "row 0: found a camera at"),
     (cell(0, 14, 1e-300), "a focal length of"),
-    (cell(0, 9, 1e39), "row 0: found"),
     (text("poses_bounds.npy", "poses"), "unreadable"),
     (lambda scene: np.save(scene / "poses_bounds.npy", PICKLED, allow_pickle=True), "unreadable"),
     (picture("images/0003.png", 48, 40, 3), "0003.png: found 40x48 pixels, expected 48x40"),
@@ -279,20 +226,3 @@ def test_open_scene_of_damaged_files_raises_one_line(
     line = str(caught.value)
     assert "\n" not in line and str(scene) in line and words in line and ", expected " in line, line
     assert sorted(tmp_path.rglob("*")) == before, "nothing is written or executed"
-
-
-@pytest.mark.parametrize("format", ["colmap", "text"])
-def test_read_model_of_truncated_files_raises_one_line(format: str, whole: dict[str, Path], tmp_path: Path):
-    shutil.copytree(whole[format] / MODEL, tmp_path / "model")
-    for path in sorted((tmp_path / "model").iterdir()):
-        content = path.read_bytes()
-        refused = 0
-        for size in range(0, len(content), 1 + len(content) // 40):
-            path.write_bytes(content[:size])
-            try:
-                read_model(tmp_path / "model")
-            except InputError as error:
-                assert "\n" not in str(error)
-                refused += 1
-        assert refused > (20 if format == "colmap" else 0), "text may end after any line"
-        path.write_bytes(content)

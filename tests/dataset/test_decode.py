@@ -26,8 +26,7 @@ def save(path: Path, pixels: np.ndarray, orientation: int = 1) -> Path:
     return path
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize(("orientation", "upright"), [*((tag, True) for tag in range(1, 9)), (6, False)])
 def test_read_pixels_reduced_jpeg_is_the_area_average(orientation: int, upright: bool, tmp_path: Path):
     path = save(tmp_path / "a.jpg", photo(160, 96), orientation)
     whole = read_pixels(path, upright)
@@ -45,7 +44,6 @@ def test_read_pixels_reduced_jpeg_is_the_area_average(orientation: int, upright:
         ((4032, 3024), (1008, 756), 4),
         ((4032, 3024), (504, 378), 8),
         ((4032, 3024), (500, 375), 4),  # two pixels for each at least, where it is no exact fraction
-        ((4032, 3024), (1344, 1008), 1),
         ((4032, 3024), (1000, 750), 2),
         ((4030, 3024), (1008, 756), 1),  # reduced, it would end beside the pixel grid
         ((4032, 3024), (4032, 3024), 1),

@@ -1,11 +1,10 @@
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.dataset import Views, estimate_bounds, load_blender, load_npz
+from nerf_lightning.dataset import Views, estimate_bounds
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
@@ -67,12 +66,3 @@ def test_estimate_bounds_one_spot_gives_a_box():
     noise = torch.randint(0, 256, (2, 8, 8, 3), generator=torch.manual_seed(0)).to(torch.uint8)
     box = estimate_bounds(Views.of(noise, Cameras.of_size(K, c2w, 8, 8)), BLACK).aabb
     torch.testing.assert_close(box, torch.tensor([1.0, 2.0, 3.0]) + cube(0.5))
-
-
-@pytest.mark.real_data
-@pytest.mark.parametrize("kind", ["course", "blender"])
-def test_estimate_bounds_lego_is_snug(kind: str, real_data: Path):
-    course, blender = real_data / "lego_200x200.npz", real_data / "nerf_synthetic/lego"
-    scene = load_npz(course) if kind == "course" else load_blender(blender)
-    truth = torch.tensor([[-0.64, -1.16, -0.56], [0.64, 1.18, 1.04]])
-    assert_snug(scene.bounds.aabb, truth, 1.25)

@@ -39,10 +39,3 @@ def test_shot_zoom_is_another_lens(tmp_path: Path):
     wide, far = (shot(photo(tmp_path, tags(focal_35mm=focal, **CANON)), 600, 400) for focal in (26, 52))
     assert wide != far and wide == shot(photo(tmp_path, tags(focal_35mm=26, **CANON)), 600, 400)
     assert wide != shot(photo(tmp_path, tags(focal_35mm=26, **CANON)), 400, 600)
-
-
-@pytest.mark.parametrize("start", range(6, 60, 9))
-def test_shot_broken_tags_are_ignored(start: int, tmp_path: Path):
-    exif = bytearray(tags(focal=50.0, focal_35mm=26, **CANON))
-    exif[start : start + 9] = b"\xff" * 9
-    assert shot(photo(tmp_path, bytes(exif)), 600, 400).width == 600

@@ -1,6 +1,5 @@
 """Names in scene files, and the files on disk that they mean."""
 
-import logging
 import unicodedata
 from pathlib import Path
 
@@ -56,10 +55,6 @@ def test_image_finder_folders_decide(tmp_path: Path):
         find(root, "0.jpg")
 
 
-def test_image_finder_reduced_copy_is_last(tmp_path: Path):
-    assert find(make_files(tmp_path, "images_4/0.png", "masks/1.png"), "images/0.png") == tmp_path / "images_4/0.png"
-
-
 def test_image_finder_file_has_one_name(tmp_path: Path):
     """Test poses whose photos are not there must not take the training photos of the same numbers."""
     finder = ImageFinder(make_files(tmp_path, "images_train/1.png"))
@@ -69,12 +64,3 @@ def test_image_finder_file_has_one_name(tmp_path: Path):
     assert moved.find("images_test/1.png", "test", "") == tmp_path / "images_train/1.png"
     with pytest.raises(InputError, match="'images_test/1.png' and 'images_train/1.png', of which only"):
         moved.find("images_train/1.png", "train", "")
-
-
-def test_image_finder_substitutions_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    finder = ImageFinder(make_files(tmp_path, "a.png", "b.png", "c.png"))
-    for name in ("a.PNG", "b.PNG", ".\\c.png"):
-        finder.find(name, "file", "key")
-    with caplog.at_level(logging.WARNING):
-        finder.report("file")
-    assert len(caplog.records) == 1 and "2 names" in caplog.text and "a.png for 'a.PNG'" in caplog.text

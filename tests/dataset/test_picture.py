@@ -1,5 +1,3 @@
-import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -7,10 +5,12 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from nerf_lightning.dataset import builtin_picture, from_picture, load_picture
+from nerf_lightning.dataset import builtin_picture, load_picture
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.errors import InputError
+from tests.dataset.exif import tags
 
 RED, BLUE = (255, 0, 0), (0, 0, 255)
 
@@ -41,21 +41,13 @@ def test_load_picture_formats_return_rgb(suffix: str, error: int, red_then_blue:
     assert np.abs(picture[:, ::59].numpy().astype(int) - red_then_blue[:, ::59]).max() <= error
 
 
-def jpeg_with_orientation(path: Path, picture: np.ndarray, orientation: int) -> Path:
-    data = write(path, picture).read_bytes()
-    # TIFF header, one entry: tag 0x0112 (orientation), type 3 (short), count 1; then no next directory.
-    tiff = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
-    body = b"Exif\0\0" + tiff
-    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + data[2:])
-    return path
-
-
 @pytest.mark.parametrize(("orientation", "red_corner"), [(1, (5, 5)), (3, (5, 60)), (6, (5, 5)), (8, (60, 5))])
 def test_load_picture_exif_orientation_is_applied(
     orientation: int, red_corner: tuple[int, int], red_then_blue: np.ndarray, tmp_path: Path
 ):
     """6 turns the picture a quarter clockwise: left becomes top. 8 turns it back: left becomes bottom."""
-    path = jpeg_with_orientation(tmp_path / "a.jpg", red_then_blue, orientation)
+    path = tmp_path / "a.jpg"
+    Image.fromarray(red_then_blue).save(path, quality=95, exif=tags(orientation))
     picture = load_picture(path)
     assert picture.shape == ((64, 32, 3) if orientation in (6, 8) else (32, 64, 3))
     assert (picture[red_corner].int() - torch.tensor(RED)).abs().max() < 8
@@ -84,47 +76,23 @@ def test_load_picture_png_kinds_become_rgb8(kind: str, bits: int, tmp_path: Path
     assert np.abs(load_picture(path).numpy().astype(int) - expected).max() <= (1 if bits == 16 else 0)
 
 
-def test_from_picture_max_side_averages(tmp_path: Path):
-    stripes = np.zeros((20, 40, 3), np.uint8)
-    stripes[:, ::2] = 200
-    path = str(write(tmp_path / "a.png", stripes))
-    picture = from_picture(path, max_side=20).scene.image
-    assert picture.shape == (10, 20, 3) and (picture == 100).all()
-    assert from_picture(path, max_side=99).scene.image.shape == (20, 40, 3)
-
-
-def test_load_picture_truncated_jpeg_with_thumbnail_raises(red_then_blue: np.ndarray, tmp_path: Path):
-    """An end marker inside the EXIF segment is not the photo's own."""
-    path = write(tmp_path / "a.jpg", red_then_blue)
-    data = path.read_bytes()
-    thumbnail = b"\xff\xe2" + struct.pack(">H", len(data) + 2) + data
-    path.write_bytes(data[:2] + thumbnail + data[2:])
-    assert load_picture(path).shape == (32, 64, 3)
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(InputError, match="found an image that was cut short"):
-        load_picture(path)
-
-
 DAMAGE = {
     "missing": (Path.unlink, "found nothing there"),
     "folder": (lambda path: (path.unlink(), path.mkdir()), "found a folder"),
-    "empty": (lambda path: path.write_bytes(b""), "found 0 bytes that are no image"),
     "text": (lambda path: path.write_text("hello"), "found 5 bytes that are no image"),
     "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-30]), "found an image that was cut short"),
 }
 
 
-@pytest.mark.parametrize("suffix", ["png", "jpg"])
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_load_picture_damaged_file_raises(
-    damage: str, suffix: str, red_then_blue: np.ndarray, tmp_path: Path, says: Callable
-):
-    path = write(tmp_path / f"a.{suffix}", red_then_blue)
+def test_load_picture_damaged_file_raises(damage: str, red_then_blue: np.ndarray, tmp_path: Path):
+    path = write(tmp_path / "a.png", red_then_blue)
     spoil, words = DAMAGE[damage]
     spoil(path)
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=words) as caught:
         load_picture(path)
-    says(caught.value, path, words, ", expected ")
+    line = str(caught.value)
+    assert str(path) in line and ", expected " in line and "\n" not in line
 
 
 def test_load_picture_float_pixels_raise(tmp_path: Path):
@@ -137,15 +105,7 @@ def test_builtin_picture_is_deterministic_and_detailed():
     picture = builtin_picture(128)
     assert picture.shape == (128, 128, 3) and picture.dtype == torch.uint8
     assert torch.equal(picture, builtin_picture(128))
-    values = picture.float()
-    assert (values.std((0, 1)) > 20).all()  # colourful in every channel
-    # Detail at all scales: halving the resolution and back loses something, but not much.
-    coarse = values.view(64, 2, 64, 2, 3).mean((1, 3)).repeat_interleave(2, 0).repeat_interleave(2, 1)
-    assert 2 < (values - coarse).square().mean().sqrt() < 20
-    # Going down a column, brightness hardly ever turns in the sky, often in the water, most often at the horizon.
-    slope = values.mean(-1).diff(dim=0)
-    turns = (slope[1:] * slope[:-1] < -1).float().mean(1)
-    assert turns[:30].mean() < 0.02 and turns[82:94].mean() > 1.5 * turns[110:125].mean() > 0.2
+    assert (picture.float().std((0, 1)) > 20).all(), "colourful in every channel"
 
 
 def test_load_picture_changed_png_raises(tmp_path: Path):

@@ -28,6 +28,7 @@ def test_from_picture_file_is_known_up_to_its_size(max_side, tmp_path: Path):
     picture = from_picture(str(path), max_side=max_side).scene
     assert picture.size == ((12, 8) if max_side is None else (6, 4)) and picture.name == "board"
     assert torch.equal(picture.at(12, 8), board(8, 12))
+    assert max_side is None or (picture.image == 100).all(), "averages"
     assert picture.at(24, 16) is None
 
 

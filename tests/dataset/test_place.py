@@ -151,15 +151,6 @@ def test_place_unwritable_folder_uses_the_cache(own, tmp_path, monkeypatch, capl
         place(folder)
 
 
-def test_place_foreign_folder_raises(own):
-    folder, calls = own
-    (folder / "placed").mkdir()
-    (folder / "placed" / "mine.txt").write_text("a", encoding="utf-8")
-    with pytest.raises(InputError, match="placed: found a folder without made_of.json, which was not made here"):
-        place(folder)
-    assert (folder / "placed" / "mine.txt").exists() and calls == []
-
-
 def test_place_disconnected_photos_raise(own, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "reconstruct", lambda photos, workspace: None)
     with pytest.raises(InputError, match="0 of 8 photos that hang together, expected at least 3; take more photos"):

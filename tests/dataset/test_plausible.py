@@ -36,39 +36,29 @@ def pile() -> Scene:
     [
         lambda: make_scene(PILE, size=32),
         lambda: make_scene(PILE, None, size=32),
-        lambda: make_scene(MARBLE, WHITE, size=32),
         lambda: make_scene(ROD, WHITE, size=32),
-        lambda: make_scene(PILE, size=32, views=3),
         lambda: bricks(size=32, train_views=12, val_views=2),
     ],
-    ids=["pile", "alpha", "white", "rod", "few", "bricks"],
+    ids=["pile", "alpha", "rod", "bricks"],
 )
 def test_check_scene_good_scene_has_no_doubt(scene: Callable[[], Scene]):
     assert check_scene(scene()) == []
 
 
-HOPELESS: list[tuple[Change, str]] = [
-    (lambda scene: flip_axes(scene, 0), "axes of the other convention"),
-    (lambda scene: replace(scene, background=WHITE), "while the background is said to be"),
-    (limited(0.2, 0.6), "far=0.6 cuts"),
-    (limited(20.0, None), "near=20 cuts"),
-    (lambda scene: replace(scene, bounds=Bounds(0.2 * scene.bounds.aabb)), "beyond the box"),
-]
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
-    HOPELESS,
+    [
+        (lambda scene: flip_axes(scene, 0), "axes of the other convention"),
+        (lambda scene: replace(scene, background=WHITE), "while the background is said to be"),
+        (limited(0.2, 0.6), "far=0.6 cuts"),
+        (limited(20.0, None), "near=20 cuts"),
+        (lambda scene: replace(scene, bounds=Bounds(0.2 * scene.bounds.aabb)), "beyond the box"),
+    ],
     ids=["opengl", "flag", "far", "near", "box"],
 )
 def test_check_scene_hopeless_scene_raises(change: Change, words: str, pile: Scene):
     with pytest.raises(InputError, match=words):
         check_scene(change(pile))
-
-
-def test_check_scene_shuffled_poses_raise(pile: Scene):
-    with pytest.raises(InputError, match="belong to other photos"):
-        check_scene(shuffle_poses(pile, 0))
 
 
 @pytest.fixture
@@ -78,24 +68,15 @@ def no_matches(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_matches")
-def test_check_scene_without_matches_judges_outlines(pile: Scene, monkeypatch: pytest.MonkeyPatch):
+def test_check_scene_without_matches_judges_outlines(pile: Scene):
     assert check_scene(pile) == []
     with pytest.raises(InputError, match="outlines that no body has"):
         check_scene(flip_axes(pile, 0))
     with pytest.raises(InputError, match="outlines that no body has"):
         check_scene(replace(pile, train=change_poses(pile.train, torch.linalg.inv)))
 
-    inexact = shuffle_poses(pile, 0)
-    (doubt,) = check_scene(inexact)
+    (doubt,) = check_scene(shuffle_poses(pile, 0))
     assert "outlines that no body has" in doubt.text and not doubt.far_off
-    monkeypatch.setattr(plausible, "FITS", 0.97)
-    with pytest.raises(InputError, match="outlines that no body has"):
-        check_scene(inexact)
-    (doubt,) = check_scene(inexact, corrected=True)
-    assert "outlines that no body has" in doubt.text and not doubt.far_off
-    monkeypatch.setattr(plausible, "FITS_BADLY", 0.97)
-    (doubt,) = check_scene(inexact, corrected=True)
-    assert doubt.far_off
 
 
 @pytest.mark.usefixtures("no_matches")
@@ -105,8 +86,8 @@ def test_check_scene_cameras_looking_away_are_doubted(pile: Scene):
     assert "cameras with their backs to the point" in doubt.text and not doubt.hopeless
 
 
-def filled(value: int) -> Change:
-    return lambda scene: replace(scene, train=replace(scene.train, pixels=torch.full_like(scene.train.pixels, value)))
+def black(scene: Scene) -> Scene:
+    return replace(scene, train=replace(scene.train, pixels=torch.zeros_like(scene.train.pixels)))
 
 
 def transparent(scene: Scene) -> Scene:
@@ -121,22 +102,20 @@ def alike(scene: Scene) -> Scene:
 
 
 def masked(scene: Scene) -> Scene:
-    return replace(
-        scene, train=replace(scene.train, known=Runs.of(torch.zeros(len(scene.train.pixels), dtype=torch.bool)))
-    )
+    unknown = Runs.of(torch.zeros(len(scene.train.pixels), dtype=torch.bool))
+    return replace(scene, train=replace(scene.train, known=unknown))
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda scene: replace(scene, train=scene.train[torch.tensor([3])]), "one photo to train on"),
-        (filled(0), "one colour: nothing is visible"),
-        (filled(255), "one colour: nothing is visible"),
+        (black, "one colour: nothing is visible"),
         (transparent, "alpha is 0 everywhere"),
         (masked, "masks that leave out every pixel"),
         (alike, "all alike"),
     ],
-    ids=["one", "black", "white", "transparent", "masked", "alike"],
+    ids=["one", "black", "transparent", "masked", "alike"],
 )
 def test_check_scene_empty_data_raises(change: Change, words: str, pile: Scene):
     with pytest.raises(InputError, match=words):
@@ -162,12 +141,9 @@ def test_check_scene_doubtful_scene_warns(pile: Scene):
 
 def test_border_colour_is_the_background(pile: Scene, tmp_path: Path):
     assert border_colour(pile.train) == (0.0, 0.0, 0.0)
-    assert border_colour(make_scene(PILE, WHITE, size=32).train) == WHITE
     assert border_colour(make_scene(PILE, None, size=32).train) is None
-    assert (
-        border_colour(replace(pile.train, pixels=torch.randint(0, 255, pile.train.pixels.shape, dtype=torch.uint8)))
-        is None
-    )
+    noise = torch.randint(0, 255, pile.train.pixels.shape, dtype=torch.uint8)
+    assert border_colour(replace(pile.train, pixels=noise)) is None
 
     path = tmp_path / "white.npz"
     save_npz(make_scene(MARBLE, WHITE, size=32), path)

@@ -95,8 +95,7 @@ def test_over_alpha_blends_with_background(alpha: int, expected: float):
     torch.testing.assert_close(target, torch.tensor([[expected] * 3, [1.0, 0, 0]]))
 
 
-@pytest.mark.parametrize("samples_per_ray", [0.5, 3.0, 40.0])
-@pytest.mark.parametrize("first", [100, 1000])
+@pytest.mark.parametrize(("first", "samples_per_ray"), [(100, 0.5), (100, 40.0), (1000, 3.0)])
 def test_note_samples_settles_at_the_aim(first: int, samples_per_ray: float, scene: Scene):
     data = RayDataModule(scene, rays=first, samples=6000)
     most = 0

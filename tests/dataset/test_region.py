@@ -38,18 +38,22 @@ def size_of(scene: Scene) -> float:
     return float(torch.linalg.det(scene.to_source[:3, :3].double()) ** (1 / 3))
 
 
-def folder_of(folder: Path, c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | None = None) -> Path:
-    """A capture of what is drawn, or of noise, as transforms.json."""
+def views_at(c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | None = None) -> Views:
+    """Photos of what is drawn, or of noise."""
     K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]).repeat(len(c2w), 1, 1)
     cameras = Cameras.of_size(K, c2w.float(), WIDTH, HEIGHT)
     noise = torch.randint(0, 255, (len(c2w), HEIGHT, WIDTH, 3), generator=torch.manual_seed(0)).to(torch.uint8)
-    views = Views.of(noise if draw is None else draw(cameras), cameras)
+    return Views.of(noise if draw is None else draw(cameras), cameras)
+
+
+def folder_of(folder: Path, c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | None = None) -> Path:
+    """A capture of what is drawn, or of noise, as transforms.json."""
+    views = views_at(c2w, draw)
     write_transforms(folder / "transforms.json", views, photos(folder, views), w=WIDTH, h=HEIGHT)
     return folder
 
 
-@pytest.mark.parametrize("distance", [0.5, 1.0, 2.0])
-@pytest.mark.parametrize("yaw", [0, 10, 20])
+@pytest.mark.parametrize(("yaw", "distance"), [(0, 0.5), (10, 2.0), (20, 1.0)])
 def test_find_region_ring_is_centred_on_its_subject(yaw: int, distance: float):
     radius = RADIUS * distance
     for elevation in (10.0, 25.0, 40.0):
@@ -59,16 +63,15 @@ def test_find_region_ring_is_centred_on_its_subject(yaw: int, distance: float):
         assert region.unit == pytest.approx(radius, rel=0.05)
 
 
-@pytest.mark.parametrize("yaw", [0, 15])
-def test_find_region_arc_is_centred_by_points(yaw: int):
+def test_find_region_arc_is_centred_by_points():
     """A subject, and a wall behind it that few of the photos show."""
     points = torch.cat([scattered((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), scattered((-6, -6, -1), (-5, 6, 4))])
-    region = find_region(ring(24, yaw, degrees=150), points)
+    region = find_region(ring(24, 15, degrees=150), points)
     assert float((region.centre - CENTRE).norm()) < 0.1 * RADIUS
     assert region.unit == pytest.approx(RADIUS, rel=0.1)
 
 
-@pytest.mark.parametrize("diverging", [-0.3, 0.0, 0.2])
+@pytest.mark.parametrize("diverging", [-0.3, 0.2])
 def test_find_region_forward_is_centred_on_points(diverging: float):
     region = find_region(forward(diverging), scattered((2.5, -1, -0.7), (3.5, 1, 0.7)))
     assert region.has_subject
@@ -150,12 +153,9 @@ def test_open_scene_pan_orbit_turns_on_the_spot(noise: float, tmp_path: Path, ca
 
 
 def test_open_scene_colmap_points_are_in_the_scenes_frame(tmp_path: Path):
-    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]).repeat(16, 1, 1)
-    cameras = Cameras.of_size(K, ring(16).float(), WIDTH, HEIGHT)
-    images = torch.randint(0, 255, (16, HEIGHT, WIDTH, 3), generator=torch.manual_seed(0)).to(torch.uint8)
-    views, points = Views.of(images, cameras), scattered((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
+    views, points = views_at(ring(16)), scattered((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
     names = photos(tmp_path / "images", views)
-    write_colmap(tmp_path / "sparse/0", cameras.c2w.numpy(), names, cameras_of(views), points=points.numpy())
+    write_colmap(tmp_path / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views), points=points.numpy())
     scene = open_scene(str(tmp_path))
     assert scene.points is not None
     back = scene.points.double() @ scene.to_source[:3, :3].double().T + scene.to_source[:3, 3]

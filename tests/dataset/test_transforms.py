@@ -37,18 +37,18 @@ def seen_at(pose: np.ndarray, intrinsics: dict, point: np.ndarray) -> np.ndarray
     return pixel.reshape(2)
 
 
-def dot(at: np.ndarray, channels: int = 3) -> np.ndarray:
+def dot(at: np.ndarray) -> np.ndarray:
     """A soft bright dot on black, centred on an OpenCV index."""
     x, y = np.meshgrid(np.arange(W), np.arange(H))
     value = np.rint(250 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * 2.5**2))).astype(np.uint8)
-    return np.repeat(value[..., None], channels, axis=2)
+    return np.repeat(value[..., None], 3, axis=2)
 
 
-def write(folder: Path, extra: dict, frames: int = 12, per_frame: Callable[[int], dict] = lambda i: {}) -> Path:
+def write(folder: Path, extra: dict, per_frame: Callable[[int], dict] = lambda i: {}) -> Path:
     """A capture whose photos show POINT as a dot; `per_frame` adds intrinsics to one frame."""
     (folder / "images").mkdir(parents=True)
     entries = []
-    for i in reversed(range(frames)):  # out of order: loaders sort by file_path
+    for i in reversed(range(12)):  # out of order: loaders sort by file_path
         pose, own = opengl_pose(0.5 * i), per_frame(i)
         cv2.imwrite(str(folder / f"images/{i:04d}.png"), dot(seen_at(pose, {**extra, **own}, POINT)))
         entries.append({"file_path": f"images/{i:04d}.png", "transform_matrix": pose.tolist(), **own})
@@ -83,18 +83,7 @@ def test_load_transforms_plain_capture_returns_its_views(capture: Path):
     assert (scene.val.images[0].numpy() == first).all()  # sorted; frames 0 and 8 are held out
     expected = torch.tensor([[140.0, 0, 83], [0, 150, 56], [0, 0, 1]])
     torch.testing.assert_close(scene.train.cameras.K, expected.repeat(10, 1, 1))
-    assert not scene.bounds.unbounded and scene.background == (0.0, 0.0, 0.0), (
-        "all that shows stands before plain black"
-    )
-
-
-def test_load_transforms_noise_background_is_unbounded(capture: Path):
-    for i in range(12):
-        cv2.imwrite(
-            str(capture / f"images/{i:04d}.png"), np.random.default_rng(i).integers(0, 255, (H, W, 3), np.uint8)
-        )
-    bounds = load_transforms(capture).bounds
-    assert bounds.unbounded and bounds.aabb.tolist() == [[-1.0] * 3, [1.0] * 3]
+    assert not scene.bounds.unbounded and scene.background == (0.0, 0.0, 0.0), "the subject is on plain black"
 
 
 def test_load_transforms_normalises_and_to_source_inverts(capture: Path):
@@ -107,12 +96,7 @@ def test_load_transforms_normalises_and_to_source_inverts(capture: Path):
     np.testing.assert_allclose(back, expected, atol=1e-5)
 
 
-def test_load_transforms_known_point_projects_to_its_dot(capture: Path):
-    assert dot_error(load_transforms(capture)) < 0.02
-
-
-@pytest.mark.parametrize("undistort", [False, True])
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("sign", "undistort"), [(1, False), (-1, True)])
 def test_load_transforms_distortion_is_followed_or_undone(sign: int, undistort: bool, tmp_path: Path):
     lens = {key: sign * value for key, value in LENS.items()}
     folder = write(tmp_path / "capture", {**INTRINSICS, **lens})
@@ -160,14 +144,6 @@ def change(capture: Path, edit: Callable[[dict], object]) -> None:
     path.write_text(json.dumps(content))
 
 
-def test_load_transforms_filenames_split_the_views(capture: Path):
-    names = [f"images/{i:04d}.png" for i in range(12)]
-    change(capture, lambda c: c.update(train_filenames=names[3:], val_filenames=names[1:3]))
-    scene = load_transforms(capture)
-    assert (len(scene.train), len(scene.val)) == (9, 2)
-    assert (scene.val.images[1].numpy() == cv2.imread(str(capture / "images/0002.png"))).all()
-
-
 def test_load_transforms_mask_path_is_read(capture: Path, caplog: pytest.LogCaptureFixture):
     mask = np.full((H, W), 255, np.uint8)
     mask[:50] = 0
@@ -188,26 +164,6 @@ def test_load_transforms_missing_photos_are_left_out_with_a_warning(capture: Pat
     # Poses stay with their photos: the dots still agree.
     assert dot_error(scene) < 0.02
     assert "3 of 12 photos are not there" in caplog.text
-
-
-def test_load_transforms_alpha_is_bounded(capture: Path):
-    for i in range(12):
-        at = seen_at(opengl_pose(0.5 * i), INTRINSICS, POINT)
-        cv2.imwrite(str(capture / f"images/{i:04d}.png"), dot(at, 4))
-    scene = load_transforms(capture)
-    assert scene.train.channels == 4 and not scene.bounds.unbounded
-    centre = transform(scene.to_source, scene.bounds.centre)
-    np.testing.assert_allclose(centre, POINT, atol=0.15)
-
-
-@pytest.mark.real_data
-def test_load_transforms_fox(real_data: Path):
-    scene = load_transforms(real_data / "fox", reading=Reading(resize=120))
-    assert scene.name == "fox" and (len(scene.train), len(scene.val)) == (43, 7)
-    assert scene.resolution == (68, 120) and scene.bounds.unbounded
-    # The head hangs between the cameras and what they look at is in view of all of them.
-    seen = [bool(scene.train.cameras.project(torch.zeros(1, 3), view)[2]) for view in range(len(scene.train))]
-    assert np.mean(seen) > 0.9
 
 
 def test_load_transforms_applied_transform_and_scale_are_undone(capture: Path):
@@ -245,9 +201,8 @@ def test_load_transforms_scaled_rotations_are_divided_out(capture: Path, caplog:
     torch.testing.assert_close(after.train.cameras.c2w, before.train.cameras.c2w, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("factor", [2, 4])
-def test_load_transforms_reduced_photos_keep_their_angle(factor: int, capture: Path):
-    before = load_transforms(capture)
+def test_load_transforms_reduced_photos_keep_their_angle(capture: Path):
+    before, factor = load_transforms(capture), 4
     for file in (capture / "images").iterdir():
         image = cv2.imread(str(file))
         cv2.imwrite(str(file), cv2.resize(image, (W // factor, H // factor), interpolation=cv2.INTER_AREA))
@@ -258,34 +213,10 @@ def test_load_transforms_reduced_photos_keep_their_angle(factor: int, capture: P
     assert dot_error(after) < 0.1
 
 
-def test_load_transforms_text_numbers_utf16_and_3x4_are_read(capture: Path):
-    before = load_transforms(capture)
-
-    def rewrite(content: dict) -> None:
-        content["fl_x"] = str(content["fl_x"])
-        for frame in content["frames"]:
-            frame["transform_matrix"] = frame["transform_matrix"][:3]
-
-    change(capture, rewrite)
-    path = capture / "transforms.json"
-    path.write_bytes(path.read_text().encode("utf-16"))
-    after = load_transforms(capture)
-    assert torch.equal(after.train.cameras.K, before.train.cameras.K)
-    assert torch.equal(after.train.cameras.c2w, before.train.cameras.c2w)
-
-
 def test_load_transforms_test_filenames_are_kept_apart(capture: Path):
     names = [f"./images/{i:04d}.png" for i in range(12)]
     change(capture, lambda c: c.update(train_filenames=names[4:], val_filenames=names[:1], test_filenames=names[1:4]))
     scene = load_transforms(capture)
     assert (len(scene.train), len(scene.val), len(scene.test)) == (8, 1, 3)
     assert scene.test.names == ("images/0001.png", "images/0002.png", "images/0003.png")
-
-
-def test_load_transforms_unknown_keys_are_listed_once(capture: Path, caplog: pytest.LogCaptureFixture):
-    change(
-        capture, lambda c: [c.update(rolling_shutter=[0, 0, 0, 0], mystery=1), [f.update(hue=2) for f in c["frames"]]]
-    )
-    with caplog.at_level(logging.INFO):
-        load_transforms(capture)
-    assert caplog.text.count("keys that are not used: hue, mystery") == 1
+    assert (scene.test.images[1].numpy() == cv2.imread(str(capture / "images/0002.png"))).all()

@@ -45,14 +45,6 @@ def test_weights_any_density_match_loop_over_samples(counts, scale, weights_of):
     assert (opacity[torch.tensor(counts) == 0] == 0).all()
 
 
-@pytest.mark.parametrize("wall", [0, 4])
-def test_weights_huge_density_takes_all(wall, weights_of):
-    samples = ragged_samples([3, 5, 2])
-    density = torch.zeros(10)
-    density[3 + wall] = 1e9
-    assert torch.equal(weights_of(density, samples), torch.eye(10)[3 + wall])
-
-
 @pytest.mark.parametrize(("splits", "sigma"), [(1, 0.7), (7, 0.0), (7, 20.0), (100, 0.01)])
 def test_weights_constant_density_split_keep_opacity(splits, sigma, weights_of):
     samples = ragged_samples([splits, 3, splits])
@@ -82,9 +74,8 @@ def test_weights_after_thick_rays_stay_exact(weights_of):
     torch.testing.assert_close(weights[-6:], weights_of(density[-6:], thin), rtol=1e-5, atol=0)
 
 
-@pytest.mark.parametrize("counts", [[3, 0, 5]])
-def test_volume_weights_gradients_match_differences(counts):
-    samples = ragged_samples(counts, torch.float64)
+def test_volume_weights_gradients_match_differences():
+    samples = ragged_samples([3, 0, 5], torch.float64)
     density = (2 * torch.rand(len(samples), dtype=torch.float64)).requires_grad_()
     dt = samples.dt.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda s, d: volume_weights(s, d, samples.ray, samples.offsets), (density, dt))

@@ -1,7 +1,6 @@
 import itertools
 import math
 
-import jaxtyping
 import pytest
 import torch
 from torch import Tensor
@@ -71,10 +70,3 @@ def test_hash_interpolate_dense_level_reproduces_linear_function(cells: tuple[in
     tables, unit = places @ slopes + 0.1, torch.rand(200, len(cells))
     actual = hash_interpolate(tables, unit, [cells], [len(tables)])
     torch.testing.assert_close(actual, unit @ slopes + 0.1, atol=1e-5, rtol=1e-5)
-
-
-def test_hash_interpolate_other_axes_or_shapes_are_refused():
-    with pytest.raises(ValueError, match="reshape"):
-        hash_interpolate(torch.zeros(27, 2), torch.rand(4, 2), [(2, 2, 2)], [27])
-    with pytest.raises(jaxtyping.TypeCheckError):
-        hash_interpolate(torch.zeros(27, 2), torch.rand(4), [(2, 2, 2)], [27])

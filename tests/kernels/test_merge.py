@@ -66,12 +66,3 @@ def test_merge_faint_pixels_hardly_change(kernels: str):
     assert len(t) < 0.9 * len(samples)
     torch.testing.assert_close(whole[1:], part[1:], rtol=1e-5, atol=1e-5)
     assert 0 < (whole[0] - part[0]).abs().max() < 0.01
-
-
-def test_merge_faint_nan_thickness_stays_alone(kernels: str):
-    samples = ragged_samples([3, 5, 2])
-    thickness = torch.full((10,), 1e-3)
-    thickness[5] = math.nan
-    merged, (t, _, _, offsets) = merge_faint(thickness, packed(samples), FAINT)
-    assert merged.isnan().sum() == 1 and float(samples.t[5]) in t.tolist() and t.isfinite().all()
-    assert offsets[:3].tolist() == [0, 2, 6]

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf_lightning.kernels import mlp, mlp_heads
+from nerf_lightning.kernels import mlp
 from tests.helpers.assert_close import run_with_threads, values_and_gradients
 
 
@@ -39,13 +39,6 @@ def test_mlp_any_widths_match_loop_over_neurons(widths: tuple[int, ...], further
     torch.testing.assert_close(mlp(x, pairs(flat), extra), expected, rtol=1e-4, atol=1e-5)
     if not further:
         assert torch.equal(mlp(x, pairs(flat)), mlp(x, pairs(flat), extra))
-
-
-@pytest.mark.parametrize("first", [0, 3])
-def test_mlp_heads_are_slices_of_output(first: int, kernels: str):
-    flat, x, extra = network((12, 32, 7), 2), torch.randn(200, 12), torch.randn(200, 2)
-    whole, (head, rest) = mlp(x, pairs(flat), extra), mlp_heads(x, pairs(flat), first, extra)
-    assert head.shape == (200, first) and torch.equal(torch.cat([head, rest], dim=1), whole)
 
 
 def test_mlp_further_inputs_get_no_gradient(kernels: str):

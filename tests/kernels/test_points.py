@@ -6,23 +6,17 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import mark_cells, points
-from tests.helpers.assert_close import assert_agrees
 
 
-@pytest.mark.parametrize("count", [0, 5000])
-def test_points_any_distance_lie_on_rays(count: int):
+def test_points_any_distance_lie_on_rays(kernels: str):
     origins, directions = torch.randn(40, 3), normalize(torch.randn(40, 3), dim=-1)
-    ray, t = torch.randint(0, 40, (count,)), 5 * torch.rand(count)
+    ray, t = torch.randint(0, 40, (500,)), 5 * torch.rand(500)
     expected = [
         [o + d * x for o, d in zip(origins[r].tolist(), directions[r].tolist(), strict=True)]
         for r, x in zip(ray, t.tolist(), strict=True)
     ]
-    assert_agrees(points, [origins, directions, ray, t], constants=(0, 1, 3), rtol=0, atol=0)
-    torch.testing.assert_close(
-        points(origins, directions, ray, t), torch.tensor(expected).view(-1, 3), rtol=1e-5, atol=1e-5
-    )
-    assert_agrees(points, [origins, directions, ray, t], constants=(3,), atol=3e-6)  # with gradients
-    assert_agrees(points, [origins, directions, ray, t])
+    found = points(origins, directions, ray, t)
+    torch.testing.assert_close(found, torch.tensor(expected).view(-1, 3), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("unbounded", [False, True])

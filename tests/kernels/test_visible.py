@@ -16,9 +16,7 @@ def packed(samples: Samples):
     ("counts", "early_stop_eps", "min_thickness", "dropped"),
     [
         ([3, 0, 5, 1], 1e-4, 0.0, math.inf),
-        ([0, 0, 7, 0], 0.5, 1e-3, math.inf),
         ([0], 1e-4, 0.2, math.inf),
-        ([1] * 6, 0.5, 0.2, 0.3),
         ([30, 0, 2, 11, 0], 1e-4, 0.2, math.inf),
         ([30, 0, 2, 11, 0], 0.5, 0.0, math.inf),
         ([30, 0, 2, 11, 0], 1e-4, 0.2, 0.3),

@@ -68,15 +68,6 @@ def test_read_voxels_any_position_matches_loop_over_vertices(kernels: str):
         torch.testing.assert_close(rgb[n].double(), expected, atol=1e-5, rtol=1e-5)
 
 
-def test_read_voxels_pruned_vertex_gets_no_gradient(kernels: str):
-    index, unit = sparse_index(), places(100)
-    free = [table.requires_grad_() for table in tables(index, 3)]
-    raw, rgb = read_voxels(*free, *locate(index, unit), basis_of(len(unit), 3))
-    (raw.sum() + rgb.sum()).backward()
-    for table in free:
-        assert not table.grad[0].any() and table.grad[1:].any()
-
-
 def test_read_voxels_nan_input_shows(kernels: str):
     index, unit = torch.arange(1, SIDE**3 + 1, dtype=torch.int32), places(20)
     unit[3, 0], unit[5, 2], unit[7] = NAN, NAN, NAN
@@ -118,17 +109,3 @@ def test_roughness_matches_loop_over_neighbours(kernels: str):
                 if 0 <= other[axis] < SIDE and grid[tuple(place)] > 0 and grid[tuple(other)] > 0:
                     squares += float(values[grid[tuple(place)]] - values[grid[tuple(other)]]) ** 2
     assert float(roughness(values, vertex, index, 1, rows)) == pytest.approx(squares / (rows - 1), rel=1e-5)
-
-
-def test_roughness_pieces_pull_as_whole(kernels: str):
-    index = sparse_index()
-    (values, *_) = tables(index, 0)
-    vertex, rows = vertices_of(index), rows_of(index)
-    values.requires_grad_()
-
-    def pull(first: int, last: int) -> Tensor:
-        return (last - first) * torch.autograd.grad(roughness(values, vertex, index, first, last), values)[0]
-
-    torch.testing.assert_close(pull(1, 30) + pull(30, rows), pull(1, rows))
-    smoother = values.detach() - 0.01 * pull(1, rows)
-    assert roughness(smoother, vertex, index, 1, rows) < roughness(values, vertex, index, 1, rows)

@@ -3,7 +3,6 @@ import math
 import pytest
 import torch
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.model import density_activation, truncated_exp
 
 
@@ -34,9 +33,3 @@ def test_density_activation_half_precision_stays_finite(name: str, dtype: torch.
     values.float().sum().backward()
     assert values.isfinite().all() and x.grad.isfinite().all()
     assert values[3] > 0.9 * (11 if name == "softplus" else math.exp(12)), "e^12 is beyond half precision"
-
-
-@pytest.mark.parametrize("name", ["", "ReLU"])
-def test_density_activation_unknown_name_is_refused(name):
-    with pytest.raises(InputError, match="model.density"):
-        density_activation(name)

@@ -5,7 +5,6 @@ import torch
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.errors import InputError
 from nerf_lightning.model import HashGridField, TensoRFField
 
 BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
@@ -29,10 +28,3 @@ def test_colours_vary_with_direction_up_to_degree(kind: type, degree: int, kerne
     waves = torch.fft.rfft(logits - logits.mean(0), dim=0).abs()
     assert waves[degree + 1 :].max() < 1e-3
     assert degree == 0 or waves[degree].max() > 1e-2
-
-
-@pytest.mark.parametrize("degree", [-1, 4])
-@pytest.mark.parametrize("kind", [TensoRFField, HashGridField])
-def test_field_degree_out_of_range_is_refused(kind: type, degree: int):
-    with pytest.raises(InputError, match="model.degree.*0 to 3"):
-        kind(BOX, degree=degree)

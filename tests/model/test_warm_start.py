@@ -45,12 +45,10 @@ def mlp(width: int = 8, depth: int = 2, skip: int | None = None) -> Field:
 
 SAME = [
     (hashgrid, {}, {"entries": 13, "width": 12}),
-    (hashgrid, {"degree": 0}, {"degree": 2, "width": 16}),
     (tensorf, {}, {"finest": 12, "width": 16, "components": 8, "colours": 8}),
     (tensorf, {"degree": 1}, {"degree": 3, "colours": 8}),
     (voxels, {}, {"degree": 2}),
     (voxels, {}, {"finest": 12}),
-    (mlp, {}, {"width": 24, "depth": 4}),
     (mlp, {"depth": 4, "skip": 2}, {"depth": 4, "skip": 2, "width": 16}),
 ]
 

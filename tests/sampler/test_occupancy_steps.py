@@ -90,19 +90,7 @@ def test_training_steps_keep_thin_fog(density: float, box: Bounds, rays: Rays):
     assert torch.equal(samples.t, everything.t[~short]) and short.float().mean() < 0.1
 
 
-def test_steps_nan_density_is_kept(box: Bounds, rays: Rays, kernels: str):
-    sampler = OccupancySampler(box, samples=40, resolution=6)
-    samples = sampler(rays, lambda x: torch.where(x[:, 2] > 0.5, float("nan"), 0.0))
-    assert (samples.positions(rays)[:, 2] > 0.5).any()
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("early_stop_eps", 0.0),
-        ("alpha_thre", 1.0),
-    ],
-)
+@pytest.mark.parametrize(("key", "value"), [("early_stop_eps", 0.0), ("alpha_thre", 1.0)])
 def test_occupancy_threshold_out_of_range_is_refused(key: str, value: float):
     with pytest.raises(InputError, match=f"sampler.{key}"):
         OccupancySampler(CUBE, **{key: value})

@@ -6,7 +6,7 @@ import torch
 from nerf_lightning.sampler import pack, split
 
 
-@pytest.mark.parametrize("most", [1, 3, 7, 1000])
+@pytest.mark.parametrize("most", [1, 7, 1000])
 def test_split_any_size_holds_whole_rays(most: int):
     keep = torch.rand(40, 6) < 0.5
     keep[7:10] = False

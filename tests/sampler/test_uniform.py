@@ -50,9 +50,3 @@ def test_uniform_sampler_jitter_stays_in_stratum(count: int, unbounded: bool, bo
         assert share.amin() < 0.05 and share.amax() > 0.95
         if not unbounded:
             assert abs(float(share.mean()) - 0.5) < 0.05
-
-
-def test_uniform_sampler_no_hits_give_no_samples(box: Bounds, rays: Rays):
-    assert len(UniformSampler(box, 8)(rays[:0], nowhere)) == 0
-    missing = UniformSampler(box, 8)(rays[-1:], nowhere)
-    assert len(missing) == 0 and missing.offsets.tolist() == [0, 0]

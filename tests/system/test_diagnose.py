@@ -30,7 +30,7 @@ def shifted(field: PictureField, layer: int, by: float) -> PictureField:
     return field
 
 
-@pytest.mark.parametrize(("make", "layer"), [(PictureMLP, 0), (PictureMLP, 2), (FourierField, 1)])
+@pytest.mark.parametrize(("make", "layer"), [(PictureMLP, 2), (FourierField, 1)])
 def test_diagnose_dead_relus_are_named(make, layer: int, view):
     field = shifted(make(SIZE, width=16), layer, -1e4)
     told = diagnosis(field, view)
@@ -46,9 +46,8 @@ def test_diagnose_healthy_field_is_silent(make, view):
     assert diagnosis(make(SIZE), view) == ""
 
 
-@pytest.mark.parametrize("by", [100.0, -100.0])
-def test_diagnose_saturated_field_names_sigmoid(by: float, view):
-    told = diagnosis(shifted(PictureMLP(SIZE, width=16), -1, by), view)
+def test_diagnose_saturated_field_names_sigmoid(view):
+    told = diagnosis(shifted(PictureMLP(SIZE, width=16), -1, 100.0), view)
     assert "sigmoid" in told and "lower learning rate" in told and "ReLU" not in told
 
 

@@ -1,4 +1,0 @@
-"""Moved to tests/helpers/fake_device.py."""
-
-# ruff: noqa
-from tests.helpers.fake_device import *
