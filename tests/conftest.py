@@ -186,7 +186,7 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Truth]:
     """A synthetic capture with a sheet of six tags: folders `calibration` and `photos`, eight photos each, those of
     the object a third of the way around it. Read only."""
-    from capture.views import SIX, SMALL
+    from tests.helpers.tag_views import SIX, SMALL
 
     def make(folder: Path) -> tuple[Path, Truth]:
         return folder, write_capture(folder, SIX, SMALL, 8, 8, Flaws(), seed=3, steps=24, samples=2)

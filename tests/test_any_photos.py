@@ -22,7 +22,7 @@ from nerf_lightning.renderer import Rendered
 from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.view.drawing import frusta
-from tests.dataset.colmap_files import cameras_of, photos, write_colmap
+from tests.helpers.colmap_files import cameras_of, photos, write_colmap
 
 K1, STEPS = 0.02, 12
 

@@ -13,13 +13,13 @@ from typing import Any
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from capture.views import SIZE
-from commands import BARE
 
 from nerf_lightning.cli.app import main
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.export.photos import write_photos
 from nerf_lightning.utils.signals import Interrupted
+from tests.helpers.command_line import BARE
+from tests.helpers.tag_views import SIZE
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = sorted(DOCS.glob("*.md"))

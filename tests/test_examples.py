@@ -9,12 +9,12 @@ from pathlib import Path
 import imageio.v3 as imageio
 import nbformat
 import pytest
-from capture.views import SIZE
 from nbclient import NotebookClient
 
 from benchmarks.synthetic.photos import Truth
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.synthetic.objects import PILE, make_scene
+from tests.helpers.tag_views import SIZE
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"

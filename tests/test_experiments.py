@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import BARE
 from omegaconf import DictConfig
 
 from nerf_lightning.config import conf_dir
@@ -15,6 +14,7 @@ from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.seeding import Stream, step_generator
+from tests.helpers.command_line import BARE
 
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("*.yaml"))
 GROUPS = ("model", "sampler", "optimizer", "schedule")

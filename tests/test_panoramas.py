@@ -8,7 +8,6 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
-from export.balls import CENTRE, RADIUS, ball_run
 
 import nerf_lightning as nl
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at, orbit_around
@@ -27,6 +26,7 @@ from nerf_lightning.synthetic.objects import trace_rays
 from nerf_lightning.synthetic.rooms import make_pile, make_walls
 from nerf_lightning.utils.device import CPU
 from tests.cameras.test_equirectangular import panoramas
+from tests.helpers.ball_runs import CENTRE, RADIUS, ball_run
 
 WIDTH, HEIGHT, STEPS = 64, 32, 80
 ROOM = [*make_pile(0.5, 2.0), *make_walls(3.0, -0.5, 2.5, 0.6, 0.8)]

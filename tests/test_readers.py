@@ -26,7 +26,7 @@ from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
 from nerf_lightning.runs.compact import encode, load_compact
 from nerf_lightning.runs.folder import load_config, load_run, plain_config
 from nerf_lightning.utils.parsing import read_json, read_npy, read_yaml
-from tests.dataset.colmap_files import write_scene
+from tests.helpers.colmap_files import write_scene
 
 MAX_BYTES, MAX_SECONDS = 1 << 30, 10
 EXAMPLES = 20

@@ -5,7 +5,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerf_lightning.cameras import Layout, classify_layout, gaze_point
-from tests.cameras.captures import CENTRE, RADIUS, corridor, dome, forward, pan, ring, toward, walk
+from tests.helpers.camera_paths import CENTRE, RADIUS, corridor, dome, forward, pan, ring, toward, walk
 
 EVERY = [
     *((f"ring {yaw}", ring(yaw=yaw), Layout.INWARD) for yaw in (0, 10, 20, 30)),

@@ -8,7 +8,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Cameras, orbit_like, pivot_of, spiral_like
 from nerf_lightning.cameras.paths import walking_order
-from tests.cameras.captures import CENTRE, RADIUS, UP, corridor, dome, forward, pan, ring, walk
+from tests.helpers.camera_paths import CENTRE, RADIUS, UP, corridor, dome, forward, pan, ring, walk
 
 CAPTURES = {
     "ring": ring(),

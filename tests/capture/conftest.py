@@ -3,11 +3,11 @@
 from pathlib import Path
 
 import pytest
-from capture.views import SIZE
 
 from benchmarks.synthetic.photos import Truth
 from nerf_lightning.capture.run import Capture, capture_scene
 from tests.helpers.shared_fixtures import make_once
+from tests.helpers.tag_views import SIZE
 
 
 @pytest.fixture(scope="session")

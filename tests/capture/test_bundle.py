@@ -2,13 +2,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from capture.views import LENS, SIX, SIZE, cameras, sightings
 
 from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS, Bundle, Problem, lens_vector, simplified
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, move, project, to_matrix
 from nerf_lightning.capture.poses.refine import refine
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import SQUARE
+from tests.helpers.tag_views import LENS, SIX, SIZE, cameras, sightings
 
 
 def bundle(photos: int = 8, noise: float = 0.0, off: float = 0.0, seed: int = 0) -> Bundle:

@@ -1,7 +1,6 @@
 from dataclasses import replace
 
 import numpy as np
-from capture.views import LENS, SIX, SIZE, camera, cameras, sightings
 
 from benchmarks.capture import count_flips
 from nerf_lightning.capture.poses.flips import resolve_flips
@@ -17,6 +16,7 @@ from nerf_lightning.capture.poses.geometry import (
 from nerf_lightning.capture.poses.pose import mark_poses, photo_poses
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import SQUARE
+from tests.helpers.tag_views import LENS, SIX, SIZE, camera, cameras, sightings
 
 
 def test_to_vector_inverts_to_matrix():

@@ -6,7 +6,6 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from capture.views import SIX as SHEET
 
 from benchmarks.synthetic.viewpoints import in_frame, object_cameras, sheet_cameras
 from nerf_lightning.capture.pack import pack
@@ -22,6 +21,7 @@ from nerf_lightning.capture.tags.detect import Mark, Sighting
 from nerf_lightning.capture.tags.layout import SQUARE
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.drawing.ink import magnification, readable, shortened
+from tests.helpers.tag_views import SIX as SHEET
 
 LENS = Lens(320, 240, 290.0, 290.0, 160.0, 120.0, (-0.2, 0.0, 0.0, 0.0, 0.0))
 TURNED = "240x320 pixels, held the other way: 320x240 is what was calibrated"

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from capture.views import SIX, SIZE, SMALL
 from PIL import Image
 
 from benchmarks.capture import home
@@ -24,6 +23,7 @@ from nerf_lightning.cli.capture import capture
 from nerf_lightning.dataset import open_scene
 from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.errors import InputError
+from tests.helpers.tag_views import SIX, SIZE, SMALL
 
 
 def test_capture_scene_of_synthetic_photos_finds_their_cameras(made: tuple[Path, Truth], packed: tuple[Path, Capture]):

@@ -3,7 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture.views import LENS, ONE, SIX, SIZE, cameras, sightings
 
 from nerf_lightning.capture.poses.calibrate import calibrate
 from nerf_lightning.capture.poses.geometry import angle_between, inverse
@@ -12,6 +11,7 @@ from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import SQUARE
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.errors import InputError
+from tests.helpers.tag_views import LENS, ONE, SIX, SIZE, cameras, sightings
 
 FOLDER = Path("calibration")
 

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from capture.views import SIX as SHEET
 
 from benchmarks.synthetic.photos import Flaws, render_photo
 from benchmarks.synthetic.tabletop import INK, PAPER, Tabletop
@@ -12,6 +11,7 @@ from nerf_lightning.capture.poses.geometry import inverse, project
 from nerf_lightning.capture.tags.detect import tag_detector
 from nerf_lightning.capture.tags.layout import TagLayout, flat_pose
 from nerf_lightning.dataset.lens import Lens
+from tests.helpers.tag_views import SIX as SHEET
 
 LENS = Lens(320, 240, 290.0, 292.0, 163.0, 118.0, (-0.25, 0.08, 0.001, -0.0015, -0.01))
 EXACT = Flaws(blur=0, noise=0)

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
-from capture.views import SIX, SIZE, SMALL
 
 from benchmarks.capture import home
 from benchmarks.synthetic.photos import Flaws, Truth, render_photo
 from nerf_lightning.capture.photo_status import photo_statuses
 from nerf_lightning.capture.poses.geometry import angle_between
 from nerf_lightning.capture.run import capture_scene
+from tests.helpers.tag_views import SIX, SIZE, SMALL
 
 
 def test_capture_scene_with_hidden_tags_places_photos_by_texture(made: tuple[Path, Truth], tmp_path: Path):

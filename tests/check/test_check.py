@@ -16,7 +16,7 @@ from nerf_lightning.dataset import Views, open_scene
 from nerf_lightning.drawing.camera_map import camera_map
 from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
-from tests.dataset.colmap_files import cameras_of, photos, write_colmap
+from tests.helpers.colmap_files import cameras_of, photos, write_colmap
 
 Edit = Callable[[np.ndarray], np.ndarray]
 

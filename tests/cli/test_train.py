@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from commands import BARE, popen
 
 from nerf_lightning.config import conf_dir
 from nerf_lightning.config.compose import composed
@@ -20,6 +19,7 @@ from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.scene import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.owner import owned
+from tests.helpers.command_line import BARE, popen
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -8,9 +8,9 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import yaml
-from made_runs import MakeRun, results
 
 from nerf_lightning.runs.index import Run, read_run
+from tests.helpers.run_results import MakeRun, results
 
 
 def run_maker(root: Path) -> MakeRun:

@@ -1,9 +1,9 @@
 import pandas as pd
 import pytest
-from made_runs import MakeRun
 
 from nerf_lightning.comparison.advice import list_caveats, recommend
 from nerf_lightning.comparison.points import compute_points
+from tests.helpers.run_results import MakeRun
 
 
 @pytest.fixture

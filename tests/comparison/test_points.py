@@ -6,9 +6,9 @@ import random
 import numpy as np
 import pandas as pd
 import pytest
-from made_runs import MakeRun
 
 from nerf_lightning.comparison.points import compute_points, conditions_of, find_frontier, format_bytes, typical_run
+from tests.helpers.run_results import MakeRun
 
 
 def test_compute_points_seeds_of_one_configuration_are_one_point(make_run: MakeRun):

@@ -7,8 +7,6 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from comparison.conftest import run_maker
-from made_runs import MakeRun
 
 from nerf_lightning.cli.compare import compare
 from nerf_lightning.comparison.charts import MAX_NAMED, draw_cost, draw_quality
@@ -17,6 +15,8 @@ from nerf_lightning.comparison.points import compute_points
 from nerf_lightning.comparison.references import PUBLISHED, read_references
 from nerf_lightning.comparison.report import choose_columns
 from nerf_lightning.errors import InputError
+from tests.comparison.conftest import run_maker
+from tests.helpers.run_results import MakeRun
 
 ENTRY = "  source: a paper\n  hardware: a cluster\n  scene: Toy\n  conditions: 800x800\n"
 METHODS = "  methods: {theirs: [35.5, 120], slower: [36, 90000.0]}\n"

@@ -15,7 +15,7 @@ from nerf_lightning.cameras.lenses import to_directions, undistort
 from nerf_lightning.dataset import Scene, Views, open_scene
 from nerf_lightning.dataset.formats.colmap_cameras import NUMBERS, optics_of
 from nerf_lightning.dataset.optics import Optics
-from tests.dataset.colmap_files import cameras_of, photos, write_colmap, write_llff, write_transforms
+from tests.helpers.colmap_files import cameras_of, photos, write_colmap, write_llff, write_transforms
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ import pytest
 
 from nerf_lightning.dataset import Views, open_scene
 from nerf_lightning.errors import InputError
-from tests.dataset.colmap_files import write_scene
+from tests.helpers.colmap_files import write_scene
 
 Spoil = Callable[[Path], object]
 MODEL = "sparse/0"

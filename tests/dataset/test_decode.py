@@ -1,5 +1,6 @@
 """Decoding: JPEG at reduced scale, legal oddities, files cut short, headers."""
 
+import zlib
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,7 @@ from PIL import Image
 from nerf_lightning.dataset.formats.decode import draft_scale, image_header, read_pixels
 from nerf_lightning.dataset.resize import area_resize
 from nerf_lightning.errors import InputError
-from tests.dataset.exif import tags
+from tests.helpers.exif_tags import tags
 
 
 def photo(width: int, height: int) -> np.ndarray:
@@ -24,6 +25,17 @@ def photo(width: int, height: int) -> np.ndarray:
 def save(path: Path, pixels: np.ndarray, orientation: int = 1) -> Path:
     Image.fromarray(pixels).save(path, quality=95, exif=tags(orientation))
     return path
+
+
+def _png_chunk(name: bytes, content: bytes) -> bytes:
+    return len(content).to_bytes(4, "big") + name + content + zlib.crc32(name + content).to_bytes(4, "big")
+
+
+PNG_WITHOUT_ROWS = (
+    b"\x89PNG\r\n\x1a\n"
+    + _png_chunk(b"IHDR", bytes([0, 0, 0, 24, 0, 0, 0, 0, 8, 2, 0, 0, 0]))
+    + _png_chunk(b"IEND", b"")
+)
 
 
 @pytest.mark.parametrize(("orientation", "upright"), [*((tag, True) for tag in range(1, 9)), (6, False)])
@@ -80,3 +92,13 @@ def test_read_pixels_grey_and_cmyk_become_rgb(mode: str, tmp_path: Path):
     expected = Image.fromarray(photo(32, 16)).convert(mode).convert("RGB")
     assert np.abs(whole.astype(int) - np.asarray(expected)).mean() < 4
     assert np.abs(reduced.astype(int) - area_resize(whole, 16, 8)).mean() < 4
+
+
+@pytest.mark.parametrize("data", [b"GIF89a" + bytes(100), PNG_WITHOUT_ROWS], ids=["gif", "png"])
+def test_read_pixels_of_no_image_prints_nothing_of_opencv(
+    data: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    (tmp_path / "a.jpg").write_bytes(data)
+    with pytest.raises(InputError, match="no image"):
+        read_pixels(tmp_path / "a.jpg")
+    assert capfd.readouterr() == ("", "")

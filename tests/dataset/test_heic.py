@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dataset.exif import tags
 from PIL import Image
 
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.dataset.placing.lenses import Shot, shot
 from nerf_lightning.errors import InputError
+from tests.helpers.exif_tags import tags
 
 installed = pytest.mark.skipif(importlib.util.find_spec("pillow_heif") is None, reason="pillow-heif is not installed")
 

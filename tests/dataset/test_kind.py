@@ -10,7 +10,7 @@ import torch
 from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.dataset import Reading, Scene, Views, open_scene, save_npz
 from nerf_lightning.errors import InputError
-from tests.dataset.colmap_files import write_scene
+from tests.helpers.colmap_files import write_scene
 
 FORMATS = ("npz", "blender", "transforms", "colmap", "llff")
 

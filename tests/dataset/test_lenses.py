@@ -2,11 +2,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dataset.exif import tags
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from nerf_lightning.dataset.placing.lenses import Shot, focal_pixels, shot
+from tests.helpers.exif_tags import tags
 
 CANON = {"make": "Canon", "model": "Canon EOS 5D Mark II"}
 

@@ -14,7 +14,7 @@ from nerf_lightning.dataset import RayDataModule, Scene, Views, draw_rays, open_
 from nerf_lightning.dataset.shots import Reading
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.errors import InputError
-from tests.dataset.colmap_files import cameras_of, photos, write_colmap
+from tests.helpers.colmap_files import cameras_of, photos, write_colmap
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,7 @@ import torch
 
 from nerf_lightning.dataset import Reading, Views, open_scene
 from nerf_lightning.errors import InputError
-from tests.dataset.colmap_files import write_scene
+from tests.helpers.colmap_files import write_scene
 
 
 @pytest.fixture

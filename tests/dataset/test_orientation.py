@@ -11,8 +11,8 @@ from PIL import Image
 
 from nerf_lightning.dataset import Reading, Views, open_scene
 from nerf_lightning.errors import InputError
-from tests.dataset.colmap_files import cameras_of, write_colmap, write_llff, write_transforms
-from tests.dataset.exif import tags
+from tests.helpers.colmap_files import cameras_of, write_colmap, write_llff, write_transforms
+from tests.helpers.exif_tags import tags
 
 
 def write_sideways(format: str, folder: Path, views: Views) -> Path:

@@ -10,7 +10,7 @@ from PIL import Image
 from nerf_lightning.dataset import builtin_picture, load_picture
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.errors import InputError
-from tests.dataset.exif import tags
+from tests.helpers.exif_tags import tags
 
 RED, BLUE = (255, 0, 0), (0, 0, 255)
 

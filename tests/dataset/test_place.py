@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from dataset.exif import tags
 from PIL import Image
 
 from benchmarks.synthetic.photos import Truth
@@ -22,6 +21,7 @@ from nerf_lightning.dataset.placing.kept import RECORD
 from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.dataset.placing.place import place
 from nerf_lightning.errors import InputError
+from tests.helpers.exif_tags import tags
 
 SMALLER = ("3.jpg", "4.jpg")
 """Taken by a second camera."""

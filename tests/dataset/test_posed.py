@@ -13,8 +13,8 @@ from nerf_lightning.dataset import Reading, Views, open_scene
 from nerf_lightning.dataset.formats.exif import stated_exposure
 from nerf_lightning.dataset.posed import normalize_poses
 from nerf_lightning.dataset.region import find_region
-from tests.dataset.colmap_files import photos, write_transforms
-from tests.dataset.exif import tags
+from tests.helpers.colmap_files import photos, write_transforms
+from tests.helpers.exif_tags import tags
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 

@@ -15,8 +15,8 @@ from torch import Tensor
 from nerf_lightning.cameras import Cameras, Layout, spiral_like
 from nerf_lightning.dataset import Reading, Scene, Views, open_scene
 from nerf_lightning.dataset.region import PAN_DEPTH, find_region
-from tests.cameras.captures import CENTRE, RADIUS, forward, pan, ring, walk
-from tests.dataset.colmap_files import cameras_of, photos, write_colmap, write_transforms
+from tests.helpers.camera_paths import CENTRE, RADIUS, forward, pan, ring, walk
+from tests.helpers.colmap_files import cameras_of, photos, write_colmap, write_transforms
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
 

@@ -22,7 +22,7 @@ from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.scene_file import load_scene, save_scene
 from nerf_lightning.utils.device import CPU
-from tests.dataset.colmap_files import write_scene
+from tests.helpers.colmap_files import write_scene
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_runs import results
 
 from nerf_lightning.cli.export import (
     export_compact,
@@ -21,6 +20,7 @@ from nerf_lightning.cli.export import (
 from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
 from nerf_lightning.training.train import train
+from tests.helpers.run_results import results
 
 
 def read_about(page: Path) -> dict[str, Any]:

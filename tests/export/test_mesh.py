@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from export.balls import CENTRE, DENSE, RADIUS, ball_run, ball_system
 from scipy.spatial import cKDTree
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.mesh import mesh_file, points_file, voxels_file
 from nerf_lightning.export.volume import cells_across, region_of, sample_volume, volume_of
+from tests.helpers.ball_runs import CENTRE, DENSE, RADIUS, ball_run, ball_system
 
 UTM = torch.tensor([5e5, 5.4112e6, 300.0], dtype=torch.float64)
 """Metres, as georeferenced files have coordinates."""

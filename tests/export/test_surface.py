@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from export.balls import CENTRE, RADIUS, ball_run
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.surface import box_around, find_surface, lit_cells, solid_from
 from nerf_lightning.export.volume import Volume, sample_volume
+from tests.helpers.ball_runs import CENTRE, RADIUS, ball_run
 
 N, CELL, SOFT, DENSE = 40, 0.05, 0.02, 60.0
 LIT = np.ones((N, N, N), bool)

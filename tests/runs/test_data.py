@@ -17,7 +17,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.scene_file import load_scene, save_scene
-from tests.dataset.colmap_files import cameras_of, photos, write_colmap
+from tests.helpers.colmap_files import cameras_of, photos, write_colmap
 
 URL = "http://stranger.example/published.npz"
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from every_model import ANOTHER, MODELS, fingerprints
+
+from tests.helpers.train_models import ANOTHER, MODELS, fingerprints
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -27,7 +28,7 @@ def threads() -> Iterator[None]:
 
 
 def test_same_seed_same_weights_in_another_process_and_across_an_interruption(threads: None, tmp_path: Path):
-    line = [sys.executable, str(ROOT / "tests" / "every_model.py"), str(tmp_path / "broken"), "6"]
+    line = [sys.executable, str(ROOT / "tests" / "helpers" / "train_models.py"), str(tmp_path / "broken"), "6"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(line, env={**os.environ, "PYTHONPATH": str(ROOT)}, **pipes) as process:
         first = fingerprints(tmp_path / "whole", 0)

@@ -7,9 +7,9 @@ import signal
 from pathlib import Path
 
 import pytest
-from commands import BARE, command
 
 from nerf_lightning.runs.owner import owned
+from tests.helpers.command_line import BARE, command
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3"]
 

@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import ROOT
 
 from nerf_lightning.evaluate import perceptual
 from nerf_lightning.utils.libraries import SPIN_COUNT, shorten_openmp_waits
+from tests.helpers.command_line import ROOT
 
 BROKEN = "raise RuntimeError('operator torchvision::nms does not exist')"
 FITTING = {

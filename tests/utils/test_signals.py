@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from commands import ROOT
 
 from nerf_lightning.utils.files import atomic, atomic_folder
 from nerf_lightning.utils.signals import (
@@ -20,6 +19,7 @@ from nerf_lightning.utils.signals import (
     raise_if_signalled,
     received_signal,
 )
+from tests.helpers.command_line import ROOT
 
 
 @pytest.fixture(params=SIGNALS, ids=lambda signum: signum.name)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 import viser
-from export.balls import CENTRE, RADIUS, ball_system
 from viser.transforms import SO3
 
 from nerf_lightning.cameras import Cameras, look_at, orbit_around
@@ -20,6 +19,7 @@ from nerf_lightning.runs.folder import load_run
 from nerf_lightning.training.train import train
 from nerf_lightning.view.field_page import FieldPage, Visitor, home_of
 from nerf_lightning.view.painter import Painter, Wish
+from tests.helpers.ball_runs import CENTRE, RADIUS, ball_system
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 BLUE = (0.0, 0.0, 1.0)

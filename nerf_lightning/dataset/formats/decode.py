@@ -20,6 +20,8 @@ from nerf_lightning.utils.libraries import require
 from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.parsing import existing_file
 
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # `read_pixels` says what is wrong with a file
+
 THREADS = 4
 TURNS = {
     2: Transpose.FLIP_LEFT_RIGHT,
