@@ -1,4 +1,4 @@
-"""From the command line to objects: conf/ composed, checked and built. Hydra is known here, in training/ and in cli/train.py."""
+"""From the command line to objects: conf/ composed, checked, built. Hydra is known here, in training/ and in cli/train.py."""
 
 from pathlib import Path
 
