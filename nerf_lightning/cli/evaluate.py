@@ -53,7 +53,7 @@ def evaluate(
 
     where, source = the_device(device), find_run(run)
     found = open_run(source, where)
-    data = data_again(found.cfg, found.scene, None if photos is None else str(photos))
+    data = data_again(found.cfg, found.scene, photos)
     if split == "test":
         if not isinstance(data, RayDataModule) or data.scene.test is None:
             raise InputError("evaluate", "split", "test", "val: these photos have no test split")

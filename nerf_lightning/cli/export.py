@@ -111,7 +111,7 @@ def export_compact(
 
     where, source = the_device(device), find_run(run)
     target = _target(source, output, "compact.npz", (".npz",))
-    return _write(target, *compact_run(source, where, loss_db, precision, _text(photos)))
+    return _write(target, *compact_run(source, where, loss_db, precision, photos))
 
 
 @export.command(name="html")
@@ -141,7 +141,7 @@ def export_html(
     from nerf_lightning.runs.find import OUTPUTS
     from nerf_lightning.utils.device import the_device
 
-    where, options = the_device(device), PageOptions(cells, precision, loss_db, _text(photos))
+    where, options = the_device(device), PageOptions(cells, precision, loss_db, photos)
     if all:
         folder = run or OUTPUTS
         target = _target(folder, output, "gallery.html", (".html",))
@@ -166,12 +166,8 @@ def export_transforms(run: RunPath = None, /, *, output: Output = None, photos: 
 
     source = find_run(run)
     target = source / "posed" if output is None else output_path(output)
-    print(f"{target}: {write_posed_photos(source, target, _text(photos))}")
+    print(f"{target}: {write_posed_photos(source, target, photos)}")
     return target
-
-
-def _text(photos: Path | None) -> str | None:
-    return None if photos is None else str(photos)
 
 
 def _target(source: Path, output: Path | None, name: str, suffixes: tuple[str, ...]) -> Path:
@@ -222,5 +218,5 @@ def _write_shape(
         raise InputError("export", "box", " ".join(map(str, box)), "the lower, then the upper corner: X Y Z X Y Z")
     if kind != "voxels":
         require("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
-    shape = export_shape(source, where, kind, target.suffix.lower(), resolution, box, threshold, _text(photos))
+    shape = export_shape(source, where, kind, target.suffix.lower(), resolution, box, threshold, photos)
     return _write(target, shape.content, shape.words)

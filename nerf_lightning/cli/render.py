@@ -75,7 +75,7 @@ def render(
     found = open_scene_run(source, where)
     scene: Any = None
     if path in SPLITS:
-        scene = data_again(found.cfg, found.scene, None if photos is None else str(photos)).scene
+        scene = data_again(found.cfg, found.scene, photos).scene
     route = build_path(path, frames, found.orbit, scene, found.to_source, path_frame)
     if scale != 1:
         route = CameraPath(route.cameras.scaled(scale), route.views)

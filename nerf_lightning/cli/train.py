@@ -113,7 +113,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
             todo = f"to train on photos: dataset=photos {shlex.quote(f'dataset.path={word}')}"
             raise InputError("command line", "", word, "KEY=VALUE", todo)
     given = replace_nulls(_find_experiments(_resume_overrides(overrides)))
-    sys.argv[1:] = _make_folders_absolute(quote_texts(given, (*TEXT_KEYS, *FOLDER_KEYS), flags.multirun or None))
+    sys.argv[1:] = _expand_folders(quote_texts(given, (*TEXT_KEYS, *FOLDER_KEYS), flags.multirun or None))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing a report and exiting with 1
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job)()
@@ -198,7 +198,7 @@ def _find_experiments(arguments: Sequence[str]) -> list[str]:
     return rewritten
 
 
-def _make_folders_absolute(arguments: Sequence[str]) -> list[str]:
+def _expand_folders(arguments: Sequence[str]) -> list[str]:
     """Rewrites the folders that Hydra makes, with ~ filled in.
 
     Raises:

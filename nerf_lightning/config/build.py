@@ -126,7 +126,7 @@ def device_of(cfg: DictConfig) -> torch.device:
     return the_device(str(OmegaConf.select(cfg, "trainer.accelerator", default="auto")))
 
 
-def build_data(cfg: DictConfig, path: str | None = None) -> RayDataModule | PixelDataModule:
+def build_data(cfg: DictConfig, path: str | Path | None = None) -> RayDataModule | PixelDataModule:
     """The data module, with its scene loaded; `path` names other photos than the configuration does."""
     chosen = {}
     if cfg.dataset.get("resize") == AUTO:
@@ -136,13 +136,13 @@ def build_data(cfg: DictConfig, path: str | None = None) -> RayDataModule | Pixe
     return make(source, "dataset", RayDataModule, PixelDataModule, **chosen)
 
 
-def with_photos(cfg: DictConfig, path: str) -> DictConfig:
+def with_photos(cfg: DictConfig, path: str | Path) -> DictConfig:
     """A copy of a configuration that reads other photos: those at `path`, in place of a built-in scene too."""
     moved = copy.deepcopy(cfg)
     if "path" not in inspect.signature(target_of(cfg, "dataset")).parameters:
         shared = {key: value for key, value in cfg.dataset.items() if key in inspect.signature(from_photos).parameters}
         moved.dataset = {"_target_": "nerf_lightning.dataset.from_photos", **shared}
-    OmegaConf.update(moved, "dataset.path", escape(path), force_add=True)
+    OmegaConf.update(moved, "dataset.path", escape(str(path)), force_add=True)
     return moved
 
 

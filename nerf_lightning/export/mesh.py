@@ -50,7 +50,7 @@ def export_shape(
     resolution: int | None = None,
     box: Sequence[float] | None = None,
     threshold: float | None = None,
-    photos: str | None = None,
+    photos: Path | None = None,
 ) -> Shape:
     """A run as a mesh, points or voxels.
 
@@ -75,7 +75,7 @@ def export_shape(
     return Shape(shape.content, words)
 
 
-def training_views(run: SceneRun, photos: str | None = None) -> Cameras:
+def training_views(run: SceneRun, photos: Path | None = None) -> Cameras:
     """Some of the views that a field was trained from; without photos, its orbit and a spiral above it."""
     try:
         data = data_again(run.cfg, run.scene, photos)

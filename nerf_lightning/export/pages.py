@@ -38,7 +38,7 @@ class PageOptions:
     precision: str | None = None
     loss_db: float = 0.1
     """See `smallest`."""
-    photos: str | None = None
+    photos: Path | None = None
     """Where the photos are, if they have moved."""
 
 

@@ -20,7 +20,7 @@ STATED = {Projection.PERSPECTIVE: ("k1", "k2", "k3", "p1", "p2"), Projection.FIS
 """Coefficients of a lens that the format knows."""
 
 
-def write_posed_photos(source: Path, output: Path, photos: str | None = None) -> str:
+def write_posed_photos(source: Path, output: Path, photos: Path | None = None) -> str:
     """Writes a run's photos, as it saw them, and their cameras, as it corrected them, into a new folder.
 
     Args:

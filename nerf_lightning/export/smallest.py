@@ -104,7 +104,7 @@ def smallest(
 
 
 def compact_run(
-    source: Path, device: torch.device, loss_db: float, precision: str | None = None, photos: str | None = None
+    source: Path, device: torch.device, loss_db: float, precision: str | None = None, photos: Path | None = None
 ) -> tuple[bytes, str]:
     """A run as one small file, and what to say of it; see `smallest`."""
     found = open_run(source, device)

@@ -5,6 +5,7 @@ import inspect
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -75,7 +76,7 @@ def seen_by_corrected(scene: Scene, content: Mapping[str, Any]) -> Scene:
 
 
 def data_again(
-    cfg: DictConfig, scene: Mapping[str, Any], photos: str | None = None, corrected: bool = True
+    cfg: DictConfig, scene: Mapping[str, Any], photos: str | Path | None = None, corrected: bool = True
 ) -> RayDataModule | PixelDataModule:
     """The data module of a run. The network is never used, as the run may be a stranger's.
 

@@ -123,8 +123,8 @@ def count_jobs(config: "DictConfig") -> int | None:
     """Number of jobs of a sweep over a grid; None where the sweeper chooses them as it goes."""
     if not config.hydra.sweeper._target_.endswith("BasicSweeper"):
         return None
-    values = {key: f"{key}={value}" for key, value in (config.hydra.sweeper.get("params") or {}).items()}
-    parsed = OverridesParser.create().parse_overrides([*values.values(), *config.hydra.overrides.task])
+    params = [f"{key}={value}" for key, value in (config.hydra.sweeper.get("params") or {}).items()]
+    parsed = OverridesParser.create().parse_overrides([*params, *config.hydra.overrides.task])
     choices = {one.key_or_group: len([*one.sweep_iterator()]) if one.is_sweep_override() else 1 for one in parsed}
     return math.prod(choices.values())
 
