@@ -1,6 +1,5 @@
 """nerf_lightning train: Hydra's command line. Imports nothing heavy."""
 
-import difflib
 import os
 import re
 import shlex
@@ -14,6 +13,7 @@ from cyclopts import Parameter
 from nerf_lightning.config import conf_dir
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import output_path, remove_empty, user_path
+from nerf_lightning.utils.text import suggest
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -234,9 +234,8 @@ def translate_error(error: Exception) -> InputError:
     if (unknown := re.match(r"Could not override '([^']+)'", line)) is not None:
         node = getattr(error.__cause__, "parent_node", None)
         known = [str(key) for key in node] if node is not None else []
-        near = difflib.get_close_matches(unknown[1].rpartition(".")[2], known, 1)
-        prefix = unknown[1].rpartition(".")[0]
-        todo = f"did you mean {prefix}{'.' if prefix else ''}{near[0]}?" if near else "--cfg job lists all"
+        parent, dot, key = unknown[1].rpartition(".")
+        todo = suggest(key, known, parent + dot) or "--cfg job lists all"
         return InputError("command line", unknown[1], "an unknown key", f"one of {', '.join(sorted(known))}", todo)
     if re.search(r"hydra/(launcher|sweeper)", line):
         line += "; joblib, submitit_local, submitit_slurm and optuna come with pip install 'nerf_lightning[sweeps]'"

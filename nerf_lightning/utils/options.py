@@ -1,6 +1,5 @@
 """Checks options against the signature they configure, so that errors name the config's keys."""
 
-import difflib
 import inspect
 import types
 import typing
@@ -9,6 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.text import suggest
 
 MAX_INT = 2**63 - 1
 """The largest whole number that tensors hold."""
@@ -71,10 +71,8 @@ def check_options(
         if name not in parameters and open_ended:
             continue
         if name not in parameters:
-            near = difflib.get_close_matches(name, parameters, 1)
             known = ", ".join(key for key in parameters if key not in given and key != "self")
-            todo = f"did you mean {near[0]}?" if near else ""
-            raise InputError(source, prefix + name, "an unknown option", f"one of {known}", todo)
+            raise InputError(source, prefix + name, "an unknown option", f"one of {known}", suggest(name, parameters))
         hint = hints.get(name, Any)
         if not _fits(value, hint):
             raise InputError(source, prefix + name, repr(value)[:60], _describe(hint))

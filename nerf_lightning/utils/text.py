@@ -1,6 +1,7 @@
 """Small helpers for lists and sentences."""
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
 
 
 def subsample(total: int, count: int | None) -> list[int]:
@@ -8,6 +9,12 @@ def subsample(total: int, count: int | None) -> list[int]:
     if count is None or count >= total:
         return list(range(total))
     return [round((i + 0.5) * total / count - 0.5) for i in range(count)]
+
+
+def suggest(name: str, known: Iterable[str], prefix: str = "") -> str:
+    """A question with the nearest known name, after a prefix; "" where none is near."""
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f"did you mean {prefix}{near[0]}?" if near else ""
 
 
 def join_truncated(names: Sequence[str], most: int) -> str:
