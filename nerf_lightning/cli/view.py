@@ -51,7 +51,7 @@ def view(
 
     require_viser()
     resolve_host(host)
-    if path is not None and not is_run(path):
+    if path is not None and not has_run(path):
         page = _open_scene(path, resize, holdout, host, port)
     else:
         page = _open_run(find_run(path), device, side, host, port)
@@ -64,7 +64,7 @@ def view(
         page.stop()
 
 
-def is_run(path: Path) -> bool:
+def has_run(path: Path) -> bool:
     """Whether a path is a run or a folder of runs; all else may be a scene."""
     import zipfile
 

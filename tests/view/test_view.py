@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.cli.view import is_run, view
+from nerf_lightning.cli.view import has_run, view
 from nerf_lightning.dataset import Scene, Views, save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.view.drawing import colour_points
@@ -118,7 +118,7 @@ def test_is_run_tells_runs_from_scenes(scene: Scene, small_run: Path, tmp_path: 
     (tmp_path / "damaged.npz").write_bytes((tmp_path / "scene.npz").read_bytes()[:-30])
     expected = {"scene.npz": False, "runs": True, "runs/first": True, "photos": False, "compact.npz": True}
     expected |= {"damaged.npz": False, "nowhere": False}
-    assert {name: is_run(tmp_path / name) for name in expected} == expected
+    assert {name: has_run(tmp_path / name) for name in expected} == expected
 
 
 def test_view_ends_with_ctrl_c_and_writes_nothing(scene: Scene, tmp_path: Path):
