@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import nerf_lightning as nl
-from nerf_lightning.callbacks import results
+from nerf_lightning.callbacks import evaluation
 from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.cli.export import export_compact
@@ -108,7 +108,7 @@ def test_run_nan_pictures_is_collapsed(
         return replace(rendered, rgb=rendered.rgb * torch.nan)
 
     monkeypatch.setattr(NeRF3D, "render", render_badly)
-    monkeypatch.setattr(results, "aligned_psnr", lambda system, views, share: [math.nan] * len(views))  # takes long
+    monkeypatch.setattr(evaluation, "aligned_psnr", lambda system, views, share: [math.nan] * len(views))  # takes long
     options = [*QUICK, "refine=both"] if cameras_too else QUICK
     run = nl.train(nl.load_scene(folder), steps=4, seed=1, device="cpu", folder=tmp_path / "run", options=options)
     found = run.results

@@ -22,8 +22,6 @@ MAX_SAVED_SECONDS = 0.2
 """Of drawing, that can be saved up while nobody is looking."""
 IMAGE_SECONDS = 0.06
 """That one image may take."""
-PROGRESS_SECONDS = 0.5
-"""Between two updates of the page's progress."""
 
 
 class Live(ChecksData):
@@ -54,8 +52,8 @@ class Live(ChecksData):
         self.share = share
         self.side = side
         self.page: FieldPage | None = None
-        self._credit = 0.0
-        self._drawn = self._told = 0.0
+        self._credit = 0.0  # seconds that drawing may take now
+        self._drawn = 0.0
 
     def check(self, data: RayDataModule | PixelDataModule) -> None:
         if isinstance(data, PixelDataModule):
@@ -77,12 +75,9 @@ class Live(ChecksData):
     def describe(self, trainer: L.Trainer) -> str:
         """Step, held-out dB and time left."""
         held_out, progress = attached(trainer, HeldOut), attached(trainer, Progress)
-        parts = [f"step {trainer.global_step:,}"]
-        if held_out is not None and held_out.latest is not None:
-            parts.append(f"held out {held_out.latest:.2f} dB")
-        if progress is not None:
-            parts.append(progress.left(trainer)[1])
-        return ", ".join(filter(None, parts))
+        quality = held_out.latest if held_out is not None else None
+        parts = [f"step {trainer.global_step:,}", "" if quality is None else f"held out {quality:.2f} dB"]
+        return ", ".join(filter(None, [*parts, progress.left(trainer) if progress is not None else ""]))
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self._drawn = time.perf_counter()
@@ -96,9 +91,7 @@ class Live(ChecksData):
         if self._credit <= 0 or not self.page.visitors:
             return
         with Budget.of(trainer).paused():
-            if now - self._told > PROGRESS_SECONDS:
-                self.page.show_progress(pl_module.progress, self.describe(trainer))
-                self._told = now
+            self.page.show_progress(pl_module.progress, self.describe(trainer))
             self.page.again()
             self.page.paint(IMAGE_SECONDS)
         self._drawn = time.perf_counter()

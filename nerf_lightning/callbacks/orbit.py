@@ -7,12 +7,13 @@ from typing import Annotated
 
 import lightning as L
 import numpy as np
+import torch
 from jaxtyping import UInt8
 
 from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.render_plan import Need, Renders
-from nerf_lightning.callbacks.rendering import share_of
+from nerf_lightning.callbacks.render_plan import Need
+from nerf_lightning.callbacks.rendering import Renders, share_of
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.panels import panel, to_bytes, write_animation
@@ -42,55 +43,50 @@ class Orbit(Renders):
     def __init__(self, frames: Annotated[int, AtLeast(0)] | None = None, fps: FramesPerSecond = 20):
         self.frames = frames
         self.fps = fps
-        self._drawn = 0
+        self._done = 0.0  # share of the frames
 
     def needs(self, trainer: L.Trainer) -> dict[str, Need]:
         cameras = self.cameras(trainer)
-        count = self.count(cameras)
-        pixels = int(cameras.sizes[subsample(len(cameras), count)][self._drawn :].prod(1).sum())
-        least = min(1.0, MIN_FRAMES / max(count, 1)) * MIN_SCALE**2 * pixels
+        pixels = int(cameras.sizes.prod(1).sum()) * (1 - self._done)
+        least = min(1.0, MIN_FRAMES / max(len(cameras), 1)) * MIN_SCALE**2 * pixels
         return {"orbit": Need(pixels, least, asked=self.frames is not None)}
 
     def cameras(self, trainer: L.Trainer) -> Cameras:
-        """The path, at the size for which there may be time."""
+        """Of the frames for which there may be time."""
         scene = data_of(trainer).scene
         assert isinstance(scene, Scene)  # NeRF3D trains on nothing else
-        return scene.orbit if self.frames is not None else scene.orbit.scaled(min(1.0, MAX_SIDE / scene.orbit.longest))
-
-    def count(self, cameras: Cameras) -> int:
-        """Frames, likewise."""
-        return min(MAX_FRAMES if self.frames is None else self.frames, len(cameras))
-
-    def setup(self, trainer: L.Trainer, pl_module: NeRF3D, stage: str) -> None:
-        self._drawn = 0
+        chosen = select(scene.orbit, MAX_FRAMES if self.frames is None else self.frames)
+        return chosen if self.frames is not None else chosen.scaled(min(1.0, MAX_SIDE / scene.orbit.longest))
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF3D) -> None:
         if self.frames == 0 or not trainer.is_global_zero:
             return
         full = self.cameras(trainer)
-        most = self.count(full)
-        count, scale = fit_orbit(most, share_of(trainer, pl_module, "orbit"))
-        cameras = full.scaled(scale).to(pl_module.device)
-        if count < most or scale < 1:
+        count, scale = fit_orbit(len(full), share_of(trainer, pl_module, "orbit"))
+        cameras = select(full, count).scaled(scale).to(pl_module.device)
+        if count < len(full) or scale < 1:
             print(
                 f"{FILE}: {count} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
-                f" training; callbacks.orbit.frames={most} draws all at full size"
+                f" training; callbacks.orbit.frames={len(full)} draws all at full size"
             )
         with atomic(Path(trainer.default_root_dir) / FILE) as temporary:
-            write_animation(temporary, self._frames(trainer, pl_module, cameras, count), 1 / self.fps)
+            write_animation(temporary, self._draw(trainer, pl_module, cameras), 1 / self.fps)
 
-    def _frames(
-        self, trainer: L.Trainer, system: NeRF3D, cameras: Cameras, count: int
-    ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    def _draw(self, trainer: L.Trainer, system: NeRF3D, cameras: Cameras) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
         plan, caption = Budget.of(trainer).plan, f"{data_of(trainer).scene.name}, step {trainer.global_step}"
-        for number, view in enumerate(subsample(len(cameras), count), 1):
+        for view in range(len(cameras)):
             before = plan.spent
-            with plan.rendering(f"orbit, frame {number} of {count}"):
+            with plan.rendering(f"orbit, frame {view + 1} of {len(cameras)}"):
                 rgb = system.render(cameras.view_rays(view)).rgb
                 image = to_bytes(rgb.view(cameras.height, cameras.width, 3))
             plan.note(len(rgb), plan.spent - before)
-            self._drawn = number * self.count(cameras) // count
+            self._done = (view + 1) / len(cameras)
             yield panel([image], caption)
+
+
+def select(cameras: Cameras, count: int) -> Cameras:
+    """Evenly spaced views of a path."""
+    return cameras[torch.tensor(subsample(len(cameras), count), dtype=torch.long)]
 
 
 def fit_orbit(frames: int, share: float) -> tuple[int, float]:

@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-import lightning as L
-
 MIN_SECONDS = 30.0
 """Rendering may always take this long, however short the training is."""
 PRIORITY = {"final": 30.0, "aligned": 1.0, "test": 1.0, "curve": 1.0, "snapshots": 1.0, "orbit": 1.0}
@@ -31,23 +29,6 @@ class Need:
     """Whether the user asked for it: it is then rendered in any case, in time of its own."""
 
 
-class Renders(L.Callback):
-    """A callback that renders views."""
-
-    def needs(self, trainer: L.Trainer) -> dict[str, Need]:
-        """What is still to be rendered, by job."""
-        raise TypeError(f"{type(self).__name__} must define needs(trainer)")
-
-
-def needs_of(trainer: L.Trainer) -> dict[str, Need]:
-    """What all callbacks still have to render, by job."""
-    found: dict[str, Need] = {}
-    for callback in trainer.callbacks:  # type: ignore[attr-defined]
-        if isinstance(callback, Renders):
-            found |= callback.needs(trainer)
-    return found
-
-
 def allot(needs: Mapping[str, float], allowance: float) -> dict[str, float]:
     """Weighted max-min fair shares: no job gets more than it needs, and what it leaves is divided among the others.
 
@@ -55,17 +36,11 @@ def allot(needs: Mapping[str, float], allowance: float) -> dict[str, float]:
         needs: seconds by job.
         allowance: seconds for all of them.
     """
-    given: dict[str, float] = {}
-    left = dict(needs)
-    while left:
-        unit = max(0.0, allowance) / sum(PRIORITY[job] for job in left)
-        modest = [job for job in left if left[job] <= unit * PRIORITY[job]]
-        if not modest:
-            return given | {job: unit * PRIORITY[job] for job in left}
-        for job in modest:
-            allowance -= left[job]
-            given[job] = left.pop(job)
-    return given
+    shares: dict[str, float] = {}
+    for job in sorted(needs, key=lambda job: needs[job] / PRIORITY[job]):
+        weight = PRIORITY[job] / sum(PRIORITY[other] for other in needs if other not in shares)
+        shares[job] = min(needs[job], weight * max(0.0, allowance - sum(shares.values())))
+    return shares
 
 
 class RenderPlan:
@@ -113,32 +88,23 @@ class RenderPlan:
             weight = SMOOTHING * min(1.0, pixels / PROBE_PIXELS)
             self.pixel_seconds += weight * (seconds / pixels - self.pixel_seconds)
 
-    def _cost(self, need: Need) -> float:
-        """Seconds that a pixel of a job takes."""
-        return (self.pixel_seconds or 0.0) + need.scored * self.score_seconds
+    def cost(self, need: Need) -> float:
+        """Seconds that a job takes at full quality."""
+        return need.pixels * ((self.pixel_seconds or 0.0) + need.scored * self.score_seconds)
 
-    def _divide_seconds(self, needs: Mapping[str, Need], allowance: float) -> dict[str, float]:
-        """Seconds of each job: what it renders in any case, and a share of the time beside."""
-        least, more = {}, {}
-        for job, need in needs.items():
-            least[job] = self._cost(need) * (need.pixels if need.asked else min(need.least, need.pixels))
-            more[job] = self._cost(need) * need.pixels - least[job]
-        bounded = [job for job, need in needs.items() if not need.asked]
-        rest = allowance - self.spent - sum(least[job] for job in bounded)
-        shares = allot({job: more[job] for job in bounded}, rest)
-        return {job: least[job] + shares.get(job, 0.0) for job in needs}
+    def divide(self, needs: Mapping[str, Need], allowance: float) -> dict[str, float]:
+        """Seconds of each job, of an allowance for all rendering of the run."""
+        whole = {job: self.cost(need) for job, need in needs.items()}
+        bounded = {job: need for job, need in needs.items() if not need.asked}
+        least = {job: whole[job] * min(need.least / max(need.pixels, 1.0), 1.0) for job, need in bounded.items()}
+        more = allot({job: whole[job] - least[job] for job in bounded}, allowance - self.spent - sum(least.values()))
+        return whole | {job: least[job] + more[job] for job in bounded}
 
     def share(self, job: str, needs: Mapping[str, Need], allowance: float) -> float:
-        """The share of its pixels that a job may render.
-
-        Args:
-            job: one of `needs`.
-            needs: of all jobs.
-            allowance: seconds for all rendering of the run.
-        """
-        needed = self._cost(needs[job]) * needs[job].pixels
-        return min(1.0, self._divide_seconds(needs, allowance)[job] / needed) if needed else 1.0
+        """The share of its pixels that a job may render, one of `needs`."""
+        whole = self.cost(needs[job])
+        return min(1.0, self.divide(needs, allowance)[job] / whole) if whole else 1.0
 
     def seconds_left(self, needs: Mapping[str, Need], allowance: float) -> float | None:
         """Of all jobs together; None before the first view."""
-        return None if self.pixel_seconds is None else sum(self._divide_seconds(needs, allowance).values())
+        return None if self.pixel_seconds is None else sum(self.divide(needs, allowance).values())

@@ -1,4 +1,4 @@
-"""What a run's callbacks ask of its RenderPlan."""
+"""Renders: callbacks that render views, in the time that the run's RenderPlan gives them."""
 
 import time
 
@@ -6,9 +6,26 @@ import lightning as L
 
 from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.render_plan import PROBE_PIXELS, needs_of
+from nerf_lightning.callbacks.render_plan import PROBE_PIXELS, Need
 from nerf_lightning.dataset.subset import thin
 from nerf_lightning.system import System, ssim
+
+
+class Renders(L.Callback):
+    """A callback that renders views."""
+
+    def needs(self, trainer: L.Trainer) -> dict[str, Need]:
+        """What is still to be rendered, by job."""
+        raise TypeError(f"{type(self).__name__} must define needs(trainer)")
+
+
+def needs_of(trainer: L.Trainer) -> dict[str, Need]:
+    """What all callbacks still have to render, by job."""
+    found: dict[str, Need] = {}
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]
+        if isinstance(callback, Renders):
+            found |= callback.needs(trainer)
+    return found
 
 
 def share_of(trainer: L.Trainer, system: System, job: str) -> float:

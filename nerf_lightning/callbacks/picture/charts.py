@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from nerf_lightning.callbacks.attached import attached, data_of
-from nerf_lightning.callbacks.results import Results
+from nerf_lightning.callbacks.evaluation import Evaluation
+from nerf_lightning.callbacks.results import quality_curve
 from nerf_lightning.drawing.ink import BLUE, DPI, pixels_of
 from nerf_lightning.drawing.panels import averaged, write_png
 from nerf_lightning.drawing.spectra import spectrum_chart
@@ -51,12 +52,13 @@ class PictureCharts(L.Callback):
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         if not trainer.is_global_zero:
             return
-        data, results = data_of(trainer), attached(trainer, Results)
+        data, evaluation = data_of(trainer), attached(trainer, Evaluation)
         (result,) = pl_module.evaluate_held_out(data, [0])
         title = f"{data.scene.name}, step {trainer.global_step}, {result.psnr:.2f} dB"
         folder = Path(trainer.default_root_dir)
         write_png(folder / "error.png", pixels_of(error_chart(result.rgb, result.truth, title)))
         spectrum = spectrum_chart(result.truth.numpy(), result.rgb.numpy(), title)
         write_png(folder / "spectrum.png", pixels_of(spectrum))
-        if results is not None and results.summary.get("curve"):
-            write_png(folder / "curve.png", pixels_of(curve_chart(results.summary["curve"], title)))
+        curve = quality_curve(trainer, evaluation.psnr if evaluation is not None else None)
+        if curve:
+            write_png(folder / "curve.png", pixels_of(curve_chart(curve, title)))

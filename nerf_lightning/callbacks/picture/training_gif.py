@@ -30,8 +30,8 @@ class TrainingGif(L.Callback):
         files = sorted((folder / FOLDER).glob("step_*.png"))
         if not files or not trainer.is_global_zero:
             return
-        pictures = (narrowed(imageio.imread(file), self.width) for file in [*files, files[-1], files[-1]])
         height, width, _ = narrowed(imageio.imread(files[-1]), self.width).shape
-        frames = (cv2.resize(one, (width, height), interpolation=cv2.INTER_NEAREST) for one in pictures)
+        pictures = (imageio.imread(file) for file in [*files, files[-1], files[-1]])
+        frames = (cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA) for one in pictures)
         with atomic(folder / "training.gif") as temporary:
             write_animation(temporary, frames, 1 / self.fps)
