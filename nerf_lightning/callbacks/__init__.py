@@ -7,10 +7,7 @@ from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.live import Live
 from nerf_lightning.callbacks.orbit import Orbit
-from nerf_lightning.callbacks.picture.baselines import Baselines
-from nerf_lightning.callbacks.picture.charts import PictureCharts
-from nerf_lightning.callbacks.picture.enlarge import Enlarge
-from nerf_lightning.callbacks.picture.training_gif import TrainingGif
+from nerf_lightning.callbacks.pictures import Baselines, Enlarge, PictureCharts, TrainingGif
 from nerf_lightning.callbacks.progress import Progress
 from nerf_lightning.callbacks.snapshots import Snapshots
 from nerf_lightning.callbacks.throughput import Throughput

@@ -2,6 +2,7 @@
 
 import time
 from contextlib import ExitStack
+from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from nerf_lightning.callbacks.attached import agreed, attached
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.evaluation import Evaluation, statistic_of
-from nerf_lightning.callbacks.heldout import HeldOut, measured_curve
+from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.system import System
 from nerf_lightning.utils.files import atomic, link_file
 from nerf_lightning.utils.options import AtLeast
@@ -63,9 +64,9 @@ class Checkpoints(L.Callback):
         self._stepping = True
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        curve = measured_curve(trainer)
-        now = bool(curve) and curve[-1][1] == trainer.global_step
-        best = now and curve[-1] == max(curve, key=lambda point: point[2])
+        held_out = attached(trainer, HeldOut)
+        curve = held_out.curve if held_out is not None else []
+        best = bool(curve) and curve[-1] == max(curve, key=itemgetter(2)) and curve[-1][1] == trainer.global_step
         due = time.monotonic() - self._saved >= self.every_seconds
         best, due, signum = agreed(trainer, (best, due, received_signal()))
         if best:
@@ -95,8 +96,8 @@ class Checkpoints(L.Callback):
         last = Path(trainer.default_root_dir) / FOLDER / "last.ckpt"
         if evaluation is None or not trainer.is_global_zero or not last.exists():
             return
-        same = subsample(len(evaluation.views), held_out.views if held_out is not None else None)
-        final = statistic_of([evaluation.views[view] for view in same], fmean, "psnr")
-        earlier = [quality for *_, quality in measured_curve(trainer)]
-        if not earlier or (final is not None and final > max(earlier)):
+        earlier, views = ([], None) if held_out is None else (held_out.curve, held_out.views)
+        same = [evaluation.views[view] for view in subsample(len(evaluation.views), views)]
+        final = statistic_of(same, fmean, "psnr")
+        if not earlier or (final is not None and final > max(point[2] for point in earlier)):
             link_file(last, last.with_name("best.ckpt"))  # of a large picture's field each is 900 MB

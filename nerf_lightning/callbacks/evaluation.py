@@ -3,75 +3,63 @@
 import math
 import sys
 from collections.abc import Callable, Sequence
-from statistics import fmean
+from statistics import fmean, median
 from typing import Any
 
 import lightning as L
+import psutil
 import torch
 
 from nerf_lightning.callbacks.attached import agreed, data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.render_plan import Need
-from nerf_lightning.callbacks.rendering import Renders, share_of
+from nerf_lightning.callbacks.rendering import Renders
 from nerf_lightning.callbacks.throughput import TRAIN_SECONDS
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.dataset.rays import view_batch
-from nerf_lightning.dataset.subset import STRIP_ROWS, WHOLE, PixelSubset
+from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.system import RENDERED_PIXELS, NeRF3D, System, aligned_psnr, misfits, psnr_of_photos
 from nerf_lightning.utils.text import subsample
 
-try:
-    import resource
-except ImportError:  # Windows has no such module; peak memory is then not reported
-    resource = None  # type: ignore[assignment]
+FIGURES = (
+    *("psnr", "ssim", "psnr_worst_view", "psnr_aligned", "rows_measured", "test", "render_seconds_per_view"),
+    *("peak_memory_bytes", "misfits"),
+)
+"""Keys of results.json."""
 
 
 class Evaluation(Renders):
     """Measures all held-out views after training, then the scene's test split and how well photos fit.
 
-    Where rendering would take longer than training (see `RenderPlan`), held-out views are measured on strips of rows that lie
+    Where rendering would take longer than training (see `Renders`), held-out views are measured on strips of rows that lie
     evenly in each view, and fewer views of the test split, evenly chosen.
     """
 
+    weight = 30.0
+
     def __init__(self) -> None:
+        self.figures: dict[str, Any] = dict.fromkeys(FIGURES)
+        """For results.json; None for what is not measured, or not yet."""
         self.views: list[dict[str, float]] = []
         """PSNR, SSIM, seconds of rendering, and the PSNR of one plain colour, of each held-out view."""
-        self.rows = 1.0
-        """The share of each held-out view's rows that the test may measure; after it, that it has measured."""
-        self.test: dict[str, float | None] | None = None
-        """Figures of the test split, and of how many of its views; None without one, and before it is measured."""
-        self.aligned: list[float] = []
-        """PSNR of held-out photos with corrections of their own, where training photos had such."""
-        self.photos: list[float] | None = None
-        """PSNR of the training photos; None for a picture, and before they are measured."""
-        self.misfits: list[dict[str, Any]] | None = None
-        """Those of them that stand out."""
-        self.peak_memory: int | None = None
-        """Of training and measuring, bytes; charts and films take more."""
+        self.photos: list[float] = []
+        """PSNR of the training photos; none of a picture."""
+        self._rows = 1.0  # share of each held-out view's that is measured
         self._pixels = 0  # measured
 
-    @property
-    def psnr(self) -> float | None:
-        """Mean over the held-out views that have a figure, dB; None where none has."""
-        return figures_of(self.views)["psnr"]
-
-    def needs(self, trainer: L.Trainer) -> dict[str, Need]:
-        data, system = data_of(trainer), trainer.lightning_module
-        left = [data.pixels_held_out(view) for view in range(len(self.views), data.held_out_views)]
-        strips = sum(STRIP_ROWS * math.sqrt(pixels) for pixels in left)
-        needs = {"final": Need(self.rows * sum(left), strips, scored=True)}
-        if isinstance(data.scene, Scene):
-            if (test := data.scene.test) is not None and self.test is None:
-                needs["test"] = Need(len(test.pixels), len(test.pixels) / len(test), scored=True)
-            if is_corrected(system) and not self.aligned:
-                pixels = RENDERED_PIXELS * len(data.scene.val)
-                needs["aligned"] = Need(pixels, pixels / 8)
-        return needs
+    def pixels_left(self, trainer: L.Trainer) -> float:
+        data, scene = data_of(trainer), data_of(trainer).scene
+        pixels = self._rows * sum(map(data.pixels_held_out, range(len(self.views), data.held_out_views)))
+        if isinstance(scene, Scene):
+            aligned = self.figures["psnr_aligned"] is not None or not is_corrected(trainer.lightning_module)
+            pixels += 0 if aligned else RENDERED_PIXELS * len(scene.val)
+            pixels += 0 if scene.test is None or self.figures["test"] is not None else len(scene.test.pixels)
+        return pixels
 
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        self.views, self.test, self._pixels = [], None, 0
-        self.rows = agreed(trainer, share_of(trainer, pl_module, "final"))
-        data_of(trainer).test_on(PixelSubset(rows=self.rows))
+        data = data_of(trainer)
+        pixels = sum(map(data.pixels_held_out, range(data.held_out_views)))
+        self._rows = agreed(trainer, self.share(trainer, pl_module, pixels))
+        data.test_on(PixelSubset(rows=self._rows))
 
     def on_test_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
         Budget.of(trainer).plan.start(f"held-out view {batch_idx + 1} of {data_of(trainer).held_out_views}")
@@ -86,36 +74,37 @@ class Evaluation(Renders):
         self._pixels += pixels
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        data = data_of(trainer)
+        data, figures = data_of(trainer), self.figures
         data.test_on(WHOLE)
-        self.rows = self._pixels / sum(map(data.pixels_held_out, range(len(self.views))))
+        figures |= figures_of(self.views)
+        figures["rows_measured"] = round(self._pixels / sum(map(data.pixels_held_out, range(len(self.views)))), 4)
+        figures["render_seconds_per_view"] = statistic_of(self.views, median, "seconds")
         if trainer.logger is not None:
-            figures = figures_of(self.views)
             known = {f"val/{key}": figures[key] for key in ("psnr", "ssim") if figures[key] is not None}
             trainer.logger.log_metrics({**known, TRAIN_SECONDS: Budget.of(trainer).seconds}, trainer.global_step)
         if isinstance(pl_module, NeRF3D) and isinstance(data.scene, Scene):
+            train, val, test = data.scene.train, data.scene.val, data.scene.test
             if is_corrected(pl_module):
-                share = share_of(trainer, pl_module, "aligned")
+                share = self.share(trainer, pl_module)
                 with Budget.of(trainer).plan.rendering("aligned held-out photos"):
-                    self.aligned = aligned_psnr(pl_module, data.scene.val, share)
-            if data.scene.test is not None:
-                self.test = self._measure_test(trainer, pl_module, data.scene.test)
-            train, self.photos = data.scene.train, psnr_of_photos(pl_module, data.scene.train)
-            self.misfits = [
+                    figures["psnr_aligned"] = round(fmean(aligned_psnr(pl_module, val, share)), 4)
+            figures["test"] = None if test is None else self._measure_test(trainer, pl_module, test)
+            self.photos = psnr_of_photos(pl_module, train)
+            figures["misfits"] = [
                 {"photo": train.name(i), "number": i, "psnr": round(self.photos[i], 2)} for i in misfits(self.photos)
             ]
-        self.peak_memory = peak_memory_bytes(pl_module.device)
+        figures["peak_memory_bytes"] = peak_memory_bytes(pl_module.device)  # charts and films take more
 
-    def _measure_test(self, trainer: L.Trainer, system: System, views: Views) -> dict[str, float | None]:
+    def _measure_test(self, trainer: L.Trainer, system: System, views: Views) -> dict[str, Any]:
         """Figures of as many views of the test split as there is time for."""
-        share, plan, measured = share_of(trainer, system, "test"), Budget.of(trainer).plan, []
+        share, plan, measured = self.share(trainer, system), Budget.of(trainer).plan, []
         chosen = subsample(len(views), max(1, int(share * len(views))))
         for number, view in enumerate(chosen, 1):
             with plan.rendering(f"test view {number} of {len(chosen)}"):
                 (result,) = system.evaluate_views([view_batch(views, view)])
                 measured.append({"psnr": result.psnr, "ssim": result.ssim})
             plan.note(result.pixels, result.seconds)
-        return figures_of(measured) | {"views": len(measured), "views_in_split": len(views)}
+        return {**figures_of(measured), "views": len(measured), "views_in_split": len(views)}
 
 
 def is_corrected(system: L.LightningModule) -> bool:
@@ -123,7 +112,7 @@ def is_corrected(system: L.LightningModule) -> bool:
     return isinstance(system, NeRF3D) and system.corrections is not None and bool(system.corrections.since)
 
 
-def figures_of(views: Sequence[dict[str, float]]) -> dict[str, float | None]:
+def figures_of(views: Sequence[dict[str, float]]) -> dict[str, Any]:
     """Means over views, and the worst of them."""
     return {
         "psnr": statistic_of(views, fmean, "psnr"),
@@ -138,8 +127,8 @@ def statistic_of(views: Sequence[dict[str, float]], statistic: Callable[..., flo
     return round(statistic(values), 4) if values else None
 
 
-def peak_memory_bytes(device: torch.device) -> int | None:
-    """The most memory this process has held so far; None if unknown.
+def peak_memory_bytes(device: torch.device) -> int:
+    """The most memory this process has held so far.
 
     On CUDA, the peak of its tensors on the device; on MPS, which keeps no such count, what its driver holds now.
     """
@@ -147,7 +136,9 @@ def peak_memory_bytes(device: torch.device) -> int | None:
         return torch.cuda.max_memory_allocated(device)
     if device.type == "mps":
         return torch.mps.driver_allocated_memory()
-    if resource is None:
-        return None
+    if sys.platform == "win32":
+        return psutil.Process().memory_info().peak_wset
+    import resource
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024

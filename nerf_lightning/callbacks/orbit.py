@@ -12,8 +12,7 @@ from jaxtyping import UInt8
 
 from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.render_plan import Need
-from nerf_lightning.callbacks.rendering import Renders, share_of
+from nerf_lightning.callbacks.rendering import Renders
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.panels import panel, to_bytes, write_animation
@@ -24,11 +23,8 @@ from nerf_lightning.utils.text import subsample
 
 FILE = "orbit.gif"
 """Below the run folder."""
-MAX_FRAMES, MIN_FRAMES = 60, 12
-MAX_SIDE = 800
-"""Pixels along a frame's longer side by default."""
-MIN_SCALE = 0.25
-"""Smallest factor on the size of frames."""
+MAX_FRAMES, MAX_SIDE = 60, 800
+"""By default; the side is the longer one of a frame, in pixels."""
 
 
 class Orbit(Renders):
@@ -36,38 +32,37 @@ class Orbit(Renders):
 
     Args:
         frames: how many of the orbit's views, evenly chosen, at their full size; 0 makes no GIF. None takes 60 of at most
-            `MAX_SIDE` pixels, or fewer and smaller ones where there is not time for them (see `RenderPlan`).
+            `MAX_SIDE` pixels, or smaller ones where there is not time for them (see `Renders`).
         fps: frames a second.
     """
 
     def __init__(self, frames: Annotated[int, AtLeast(0)] | None = None, fps: FramesPerSecond = 20):
         self.frames = frames
         self.fps = fps
+        self.in_full = frames is not None
         self._done = 0.0  # share of the frames
 
-    def needs(self, trainer: L.Trainer) -> dict[str, Need]:
-        cameras = self.cameras(trainer)
-        pixels = int(cameras.sizes.prod(1).sum()) * (1 - self._done)
-        least = min(1.0, MIN_FRAMES / max(len(cameras), 1)) * MIN_SCALE**2 * pixels
-        return {"orbit": Need(pixels, least, asked=self.frames is not None)}
+    def pixels_left(self, trainer: L.Trainer) -> float:
+        return float(self.cameras(trainer).sizes.prod(1).sum()) * (1 - self._done)
 
     def cameras(self, trainer: L.Trainer) -> Cameras:
-        """Of the frames for which there may be time."""
+        """Of the frames, at the size for which there may be time."""
         scene = data_of(trainer).scene
         assert isinstance(scene, Scene)  # NeRF3D trains on nothing else
-        chosen = select(scene.orbit, MAX_FRAMES if self.frames is None else self.frames)
-        return chosen if self.frames is not None else chosen.scaled(min(1.0, MAX_SIDE / scene.orbit.longest))
+        count = MAX_FRAMES if self.frames is None else self.frames
+        chosen = scene.orbit[torch.tensor(subsample(len(scene.orbit), count), dtype=torch.long)]
+        return chosen if self.in_full else chosen.scaled(min(1.0, MAX_SIDE / scene.orbit.longest))
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF3D) -> None:
         if self.frames == 0 or not trainer.is_global_zero:
             return
         full = self.cameras(trainer)
-        count, scale = fit_orbit(len(full), share_of(trainer, pl_module, "orbit"))
-        cameras = select(full, count).scaled(scale).to(pl_module.device)
-        if count < len(full) or scale < 1:
+        scale = 1.0 if self.in_full else math.sqrt(self.share(trainer, pl_module))
+        cameras = full.scaled(scale).to(pl_module.device)
+        if scale < 1:
             print(
-                f"{FILE}: {count} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
-                f" training; callbacks.orbit.frames={len(full)} draws all at full size"
+                f"{FILE}: {len(full)} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
+                f" training; callbacks.orbit.frames={len(full)} draws them at full size"
             )
         with atomic(Path(trainer.default_root_dir) / FILE) as temporary:
             write_animation(temporary, self._draw(trainer, pl_module, cameras), 1 / self.fps)
@@ -82,14 +77,3 @@ class Orbit(Renders):
             plan.note(len(rgb), plan.spent - before)
             self._done = (view + 1) / len(cameras)
             yield panel([image], caption)
-
-
-def select(cameras: Cameras, count: int) -> Cameras:
-    """Evenly spaced views of a path."""
-    return cameras[torch.tensor(subsample(len(cameras), count), dtype=torch.long)]
-
-
-def fit_orbit(frames: int, share: float) -> tuple[int, float]:
-    """How many frames to draw, and the factor on their size, where so large a share of all their pixels may be rendered."""
-    count = min(frames, max(int(frames * share), MIN_FRAMES))
-    return count, min(1.0, max(MIN_SCALE, math.sqrt(frames * share / count)))

@@ -3,56 +3,43 @@
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from typing import TypeVar
 
 MIN_SECONDS = 30.0
 """Rendering may always take this long, however short the training is."""
-PRIORITY = {"final": 30.0, "aligned": 1.0, "test": 1.0, "curve": 1.0, "snapshots": 1.0, "orbit": 1.0}
-"""Weights of the jobs where there is not time for all: pictures and curves become smaller before the final figure does."""
+MIN_SHARE = 0.01
+"""Of its pixels, that each job renders however little time there is."""
 SMOOTHING = 0.7
 """Weight of the last view in the seconds that a pixel takes."""
 PROBE_PIXELS = 1 << 14
 """Pixels whose time tells what others take; fewer count less."""
+Job = TypeVar("Job")
 
 
-@dataclass(frozen=True)
-class Need:
-    """What a job still has to render."""
-
-    pixels: float
-    """At full quality."""
-    least: float = 0.0
-    """Pixels that are rendered however little time there is."""
-    scored: bool = False
-    """Whether SSIM is computed of them."""
-    asked: bool = False
-    """Whether the user asked for it: it is then rendered in any case, in time of its own."""
-
-
-def allot(needs: Mapping[str, float], allowance: float) -> dict[str, float]:
-    """Weighted max-min fair shares: no job gets more than it needs, and what it leaves is divided among the others.
+def allot(costs: Mapping[Job, float], weights: Mapping[Job, float], allowance: float) -> dict[Job, float]:
+    """Weighted max-min fair shares: no job gets more than it costs, and what it leaves is divided among the others.
 
     Args:
-        needs: seconds by job.
-        allowance: seconds for all of them.
+        costs, weights: seconds of each job, and its weight.
+        allowance: seconds for all of them; each gets `MIN_SHARE` of its own in any case.
     """
-    shares: dict[str, float] = {}
-    for job in sorted(needs, key=lambda job: needs[job] / PRIORITY[job]):
-        weight = PRIORITY[job] / sum(PRIORITY[other] for other in needs if other not in shares)
-        shares[job] = min(needs[job], weight * max(0.0, allowance - sum(shares.values())))
-    return shares
+    shares: dict[Job, float] = {}
+    rest = max(0.0, allowance - MIN_SHARE * sum(costs.values()))
+    for job in sorted(costs, key=lambda job: costs[job] / weights[job]):
+        weight = weights[job] / sum(weights[other] for other in costs if other not in shares)
+        shares[job] = min((1 - MIN_SHARE) * costs[job], weight * rest)
+        rest -= shares[job]
+    return {job: shares[job] + MIN_SHARE * costs[job] for job in costs}
 
 
 class RenderPlan:
-    """Divides the time for rendering among a run's jobs by the time that a pixel takes, and says what is being rendered."""
+    """Counts the time of rendering, measures what a pixel takes, and says what is being rendered."""
 
     def __init__(self) -> None:
         self.spent = 0.0
         """Seconds of rendering so far."""
         self.pixel_seconds: float | None = None
         """Of rendering; None before the first view."""
-        self.score_seconds = 0.0
-        """Of SSIM, for each pixel."""
         self.subject = ""
         """What is being rendered."""
         self._listeners: list[Callable[[], None]] = []
@@ -87,24 +74,3 @@ class RenderPlan:
         else:
             weight = SMOOTHING * min(1.0, pixels / PROBE_PIXELS)
             self.pixel_seconds += weight * (seconds / pixels - self.pixel_seconds)
-
-    def cost(self, need: Need) -> float:
-        """Seconds that a job takes at full quality."""
-        return need.pixels * ((self.pixel_seconds or 0.0) + need.scored * self.score_seconds)
-
-    def divide(self, needs: Mapping[str, Need], allowance: float) -> dict[str, float]:
-        """Seconds of each job, of an allowance for all rendering of the run."""
-        whole = {job: self.cost(need) for job, need in needs.items()}
-        bounded = {job: need for job, need in needs.items() if not need.asked}
-        least = {job: whole[job] * min(need.least / max(need.pixels, 1.0), 1.0) for job, need in bounded.items()}
-        more = allot({job: whole[job] - least[job] for job in bounded}, allowance - self.spent - sum(least.values()))
-        return whole | {job: least[job] + more[job] for job in bounded}
-
-    def share(self, job: str, needs: Mapping[str, Need], allowance: float) -> float:
-        """The share of its pixels that a job may render, one of `needs`."""
-        whole = self.cost(needs[job])
-        return min(1.0, self.divide(needs, allowance)[job] / whole) if whole else 1.0
-
-    def seconds_left(self, needs: Mapping[str, Need], allowance: float) -> float | None:
-        """Of all jobs together; None before the first view."""
-        return None if self.pixel_seconds is None else sum(self.divide(needs, allowance).values())

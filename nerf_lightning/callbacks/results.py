@@ -5,7 +5,7 @@ import platform
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
-from statistics import fmean, median
+from statistics import fmean
 from typing import Any
 
 import lightning as L
@@ -14,9 +14,9 @@ import torch
 import nerf_lightning
 from nerf_lightning.callbacks.attached import attached, data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.evaluation import Evaluation, figures_of, peak_memory_bytes, statistic_of
+from nerf_lightning.callbacks.evaluation import Evaluation
 from nerf_lightning.callbacks.guard import Guard
-from nerf_lightning.callbacks.heldout import measured_curve
+from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
 from nerf_lightning.dataset import PictureBatch
 from nerf_lightning.refine import summary
@@ -55,14 +55,12 @@ def summarize_run(
     device, budget = trainer.strategy.root_device, Budget.of(trainer)
     throughput, guard = attached(trainer, Throughput), attached(trainer, Guard)
     evaluation = attached(trainer, Evaluation) or Evaluation()
-    views = evaluation.views
     if error is None:
         status, diagnosis = judge_run(trainer, system, evaluation)
+    elif not isinstance(error, Exception):  # Ctrl-C, SIGTERM
+        status, diagnosis = "interrupted", f"at step {trainer.global_step}; resume= continues"
     else:
-        status, diagnosis = describe_error(trainer, error)
-        if len(views) < data_of(trainer).held_out_views:
-            views = []  # the mean of some views is another figure
-    figures = figures_of(views)
+        status, diagnosis = "failed", " ".join(f"{type(error).__name__}: {error}".split())
     corrections = system.corrections if isinstance(system, NeRF3D) else None
     results = {
         "scene": data_of(trainer).scene.describe(),
@@ -86,16 +84,10 @@ def summarize_run(
         "train_seconds": round(budget.seconds, 3),
         "steps": trainer.global_step,
         "rays_per_second": round(throughput.rays / budget.seconds, 1) if throughput and budget.seconds else None,
-        **figures,
-        "psnr_aligned": round(fmean(evaluation.aligned), 4) if evaluation.aligned else None,
-        "rows_measured": round(evaluation.rows, 4),
-        "test": evaluation.test,
-        "render_seconds_per_view": statistic_of(views, median, "seconds"),
-        "peak_memory_bytes": evaluation.peak_memory or peak_memory_bytes(device),
-        "curve": quality_curve(trainer, figures["psnr"]),
+        **evaluation.figures,
+        "curve": quality_curve(trainer),
         "warnings": list(warnings),
         "plateau": budget.stopped,
-        "misfits": evaluation.misfits,
         "corrections": summary(corrections) if corrections is not None and corrections.finite else None,
         "recoveries": [asdict(one) for one in guard.recoveries] if guard is not None else [],
         "status": status,
@@ -110,10 +102,7 @@ def judge_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> tup
         return "collapsed", f"{name} is no longer finite"
     counted = [view for view in evaluation.views if math.isfinite(view["psnr"])]
     if not counted:
-        return (
-            "collapsed",
-            "held-out views have no figure: what is rendered is not finite, or no pixel of theirs is known",
-        )
+        return "collapsed", "no figure of held-out views: what is rendered is not finite, or no pixel is known"
     quality, plain = (fmean(view[key] for view in counted) for key in ("psnr", "plain_psnr"))
     view, nothing = data_of(trainer).held_out(0).to(system.device), min(plain + NO_BETTER, SEEN_AS_EQUAL)
     if quality < nothing:
@@ -121,7 +110,7 @@ def judge_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> tup
         diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
         return "collapsed", f"{diagnosis}: {cause}" if cause else diagnosis
     status = "stopped_early" if Budget.of(trainer).progress(trainer.global_step) < 1.0 else "finished"
-    trained = [psnr for psnr in evaluation.photos or [] if math.isfinite(psnr)]
+    trained = [psnr for psnr in evaluation.photos if math.isfinite(psnr)]
     if trained and quality < min(fmean(trained) - WIDE_GAP, GOOD):
         return status, (
             f"training photos {fmean(trained):.1f} dB, held-out views {quality:.1f} dB: too few views for this model,"
@@ -137,17 +126,12 @@ def judge_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> tup
     return status, ""
 
 
-def describe_error(trainer: L.Trainer, error: BaseException) -> tuple[str, str]:
-    """Status and diagnosis of a run that ended early."""
-    if not isinstance(error, Exception):  # Ctrl-C, SIGTERM
-        return "interrupted", f"at step {trainer.global_step}; resume= continues"
-    return "failed", " ".join(f"{type(error).__name__}: {error}".split())
-
-
-def quality_curve(trainer: L.Trainer, final: float | None) -> list[list[float]]:
-    """[training seconds, step, PSNR] at each measurement, and at the end, where the PSNR is `final`."""
+def quality_curve(trainer: L.Trainer) -> list[list[float]]:
+    """[training seconds, step, PSNR] at each measurement, and at the end."""
+    held_out, evaluation = attached(trainer, HeldOut), attached(trainer, Evaluation)
+    final = evaluation.figures["psnr"] if evaluation is not None else None
     end = [] if final is None else [[round(Budget.of(trainer).seconds, 3), trainer.global_step, final]]
-    return measured_curve(trainer) + end
+    return [*(held_out.curve if held_out is not None else []), *end]
 
 
 def artifact_bytes(system: System) -> int:

@@ -8,8 +8,7 @@ import lightning as L
 
 from nerf_lightning.callbacks.attached import ChecksData, data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.render_plan import Need
-from nerf_lightning.callbacks.rendering import Renders, share_of
+from nerf_lightning.callbacks.rendering import Renders
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.dataset.subset import thin
 from nerf_lightning.drawing.panels import narrowed, result_panel, to_bytes, write_png
@@ -20,15 +19,14 @@ LOGGED_WIDTH = 640
 """Widest picture for TensorBoard, in pixels: it takes 0.1 s for each megabyte."""
 FOLDER, FINAL, TRUTH = "snapshots", "final.png", "truth.png"
 """Below the run folder: all snapshots, the latest render alone, and what it should look like, which is written once."""
-MIN_PIXELS, MAX_PIXELS = 1 << 13, 800 * 800
+MAX_PIXELS = 800 * 800
 """Of a snapshot of a scene, which is for looking at."""
 
 
 class Snapshots(ChecksData, Renders):
     """Writes truth, render and depth of one held-out view as PNG and to TensorBoard, and once more at the end.
 
-    Of views beyond `MAX_PIXELS`, and where there is not time for all (see `RenderPlan`),
-    every n-th row and column is rendered.
+    Of views beyond `MAX_PIXELS`, and where there is not time for all (see `Renders`), every n-th row and column is rendered.
 
     Args:
         steps: after which steps; None means 10, 20, 50, 100, 200, 500, ...
@@ -55,11 +53,11 @@ class Snapshots(ChecksData, Renders):
         if not 0 <= self.view < views:
             raise InputError("callbacks.snapshots.view", "", str(self.view), f"a held-out view from 0 to {views - 1}")
 
-    def needs(self, trainer: L.Trainer) -> dict[str, Need]:
+    def pixels_left(self, trainer: L.Trainer) -> float:
         step, progress = trainer.global_step, Budget.of(trainer).progress(trainer.global_step)
         last = step / progress if progress else step
         left = {one for one in (*self.steps_until(last), round(last)) if one >= step and one != self._written}
-        return {"snapshots": Need(len(left) * self.max_pixels(trainer), len(left) * MIN_PIXELS)}
+        return len(left) * self.max_pixels(trainer)
 
     def max_pixels(self, trainer: L.Trainer) -> int:
         """Of a snapshot for which there is time."""
@@ -72,8 +70,8 @@ class Snapshots(ChecksData, Renders):
             return
         budget, data, step = Budget.of(trainer), data_of(trainer), trainer.global_step
         folder, logger = Path(trainer.default_root_dir), trainer.logger
-        most = share_of(trainer, pl_module, "snapshots") * self.max_pixels(trainer)
-        subset = thin(data.pixels_held_out(self.view), max(MIN_PIXELS, most))
+        most = self.share(trainer, pl_module) * self.max_pixels(trainer)
+        subset = thin(data.pixels_held_out(self.view), most)
         with budget.rendering(trainer, "snapshot"):
             (result,) = pl_module.evaluate_held_out(data, [self.view], subset)
         budget.plan.note(result.pixels, result.seconds)
