@@ -179,7 +179,9 @@ class Results(Renders):
             if len(self.views) < data_of(trainer).held_out_views:
                 self.views = []  # the mean of some views is another figure
             self.write(trainer, pl_module, "interrupted", f"at step {trainer.global_step}; resume= continues")
-        elif trainer.ckpt_path is None or Budget.of(trainer).began:  # else there was no state to go on from
+        elif (
+            trainer.ckpt_path is None or Budget.of(trainer).state.clock.started
+        ):  # else there was no state to go on from
             with suppress(NoRoom):  # on a full disk what happened first is to be told
                 self.write(trainer, pl_module, "failed", " ".join(f"{type(exception).__name__}: {exception}".split()))
 
@@ -211,7 +213,7 @@ class Results(Renders):
             "threads": torch.get_num_threads(),
             "machine": describe_machine(pl_module.device),
             # Several processes would count each other as other work.
-            "load": budget.load.cores() if trainer.world_size == 1 else None,
+            "load": budget.state.clock.load.cores() if trainer.world_size == 1 else None,
             "versions": {
                 "python": platform.python_version(),
                 "torch": torch.__version__,

@@ -34,7 +34,7 @@ square of how far the content has moved in the photos, above `FAR` pixels. What 
 WORTHWHILE = {"poses": 0.01, "light": 0.05}
 """Share by which most photos' squared error has to fall. Exact poses raise it; gains explain a little of all that is wrong, and
 make the neutral look another than that of the photos."""
-RIPENED = 0.4
+GROWTH_DELAY = 0.4
 """Share of the training that it takes, once poses are corrected, until the field has grown."""
 
 
@@ -181,10 +181,9 @@ class Corrections(torch.nn.Module):
         """Whether all of it are finite numbers: some are not any more where training has broken down."""
         return all(bool(tensor.isfinite().all()) for tensor in self.state_dict().values())
 
-    @property
-    def groups(self) -> list[dict[str, Any]]:
+    def param_groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups: what is or may be corrected, each with its learning rate."""
-        return [{"params": self._of(name), "lr": rate} for name, rate in self.rates.items()]
+        return [{"name": name, "params": self._of(name), "lr": rate} for name, rate in self.rates.items()]
 
     def alike(self, cameras: Cameras, bounds: Bounds) -> "Corrections":
         """With what is corrected here, for photos of the field that was trained with these: by the same lens, and with gains
@@ -194,9 +193,9 @@ class Corrections(torch.nn.Module):
         other.lens = self.lens.of(cameras)
         return other
 
-    def factors(self, progress: float) -> list[float]:
-        """On the rates of `groups`, by progress in training: nothing at first, then from 1 down to `FINAL`."""
-        return [self._factor(name, self.since.get(name), progress) for name in self.rates]
+    def lr_factors(self, progress: float) -> dict[str, float]:
+        """Factors on the rates of these groups, by progress in training: nothing at first, then from 1 down to `FINAL`."""
+        return {name: self._factor(name, self.since.get(name), progress) for name in self.rates}
 
     def _factor(self, name: str, start: float | None, progress: float) -> float:
         if start is None or progress < start:
@@ -211,13 +210,13 @@ class Corrections(torch.nn.Module):
         moved = float(self.motions.detach().square().sum(1).mean().sqrt())  # in pixels, as they are whitened
         return min(FASTER, max(1.0, moved / FAR))
 
-    def ripeness(self, progress: float, grown_after: float) -> float:
+    def delay_growth(self, progress: float, growth_end: float) -> float:
         """The progress by which a field grows: slower while cameras find their places, as detail would hold them where they
         are."""
         start = self.since.get("poses", 1.0)
-        if not start < grown_after or progress < start:
+        if not start < growth_end or progress < start:
             return progress
-        return min(progress, start + (grown_after - start) * (progress - start) / RIPENED)
+        return min(progress, start + (growth_end - start) * (progress - start) / GROWTH_DELAY)
 
     def _own(self, values: Float[Tensor, "V *K"]) -> Float[Tensor, "V *K"]:
         """Without their mean, if that is to be zero."""

@@ -12,7 +12,16 @@ from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import over
 from nerf_lightning.system.metrics import mse_to_psnr
 from nerf_lightning.system.nerf3d import NeRF3D
-from nerf_lightning.system.trial import LIGHT, POSES, derivatives, least_squares, seen_by, some_pixels, squared_errors
+from nerf_lightning.system.trial import (
+    LIGHT,
+    POSES,
+    derivatives,
+    frozen_render,
+    least_squares,
+    seen_by,
+    some_pixels,
+    squared_errors,
+)
 from nerf_lightning.utils.progress import tracked
 from nerf_lightning.utils.seeding import Stream, step_generator
 
@@ -39,7 +48,7 @@ def halves(views: Views, view: int) -> tuple[Int[Tensor, "L"], Int[Tensor, "R"]]
 
 def fitted(system: NeRF3D, views: Views, half: int, corrections: Corrections, count: int) -> None:
     """Finds corrections with which a field, that stays as it is, fits `count` pixels of this half of each photo best."""
-    see, behind = system.as_it_is(), system.renderer.colour
+    see, behind = frozen_render(system), system.renderer.background.color
     generator = step_generator(system.seed, Stream.STUDY, 1, system.device)
     poses, light = ("poses" in corrections.since), ("light" in corrections.since)
     together = TOGETHER if poses else 0
@@ -93,7 +102,7 @@ def aligned_psnr(system: NeRF3D, views: Views, share: float = 1.0) -> list[float
         with torch.no_grad():
             for view, part in enumerate(parts):
                 given, of = rays_through(views, part[1 - side])
-                seen, behind = system.render(corrections.rays(given, of)), system.renderer.backgrounds(len(of))
+                seen, behind = system.render(corrections.rays(given, of)), system.renderer.background.sample(len(of))
                 rgb = corrections.lit(seen.rgb, seen.opacity, behind, given, of).clamp(0, 1)
                 squares[view] += float((rgb - over(views.pixels[part[1 - side]], behind)).square().sum())
                 counts[view] += rgb.numel()

@@ -2,8 +2,11 @@
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from functools import partial
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import lightning as L
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
@@ -13,9 +16,15 @@ from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.rays import rays_through
 from nerf_lightning.refine import Corrections
 from nerf_lightning.refine.poses import spanned, without
-from nerf_lightning.renderer import Rendered, over
+from nerf_lightning.renderer import RenderOutput, over
+from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.utils.text import subsample
 
+if TYPE_CHECKING:
+    from nerf_lightning.system.nerf3d import NeRF3D
+
+UNSURE_SHARE, DRAWS = 0.5, 4
+"""Share of what corrections have to explain from which on this many draws of pixels decide, by their mean."""
 PHOTOS, PIXELS = 64, 128
 """How many photos are looked at, and pixels of each that decide; as many others judge."""
 DAMPING = 0.3
@@ -24,7 +33,7 @@ TINY = 1e-6
 """Likewise, of the mean over a photo's unknowns: some have no effect at all."""
 POSES, LIGHT = slice(0, 6), slice(6, 9)
 """Columns of the unknowns: a camera's `motions`, then its `log_gains`."""
-See = Callable[[Rays, Float[Tensor, "R 3"]], Rendered]
+See = Callable[[Rays, Float[Tensor, "R 3"]], RenderOutput]
 """Renders rays onto backgrounds, with gradient in the rays."""
 
 
@@ -61,14 +70,16 @@ def some_pixels(
     return Pixels(rays, view, over(views.pixels[places], backgrounds), backgrounds, views.mask[places])
 
 
-def seen_by(see: See, corrections: Corrections | None, pixels: Pixels) -> Rendered:
+def seen_by(see: See, corrections: Corrections | None, pixels: Pixels) -> RenderOutput:
     """What cameras see through these pixels, as corrected if they are."""
     with torch.no_grad():
         rays = pixels.rays if corrections is None else corrections.rays(pixels.rays, pixels.views)
         return see(rays, pixels.behind)
 
 
-def squared_errors(seen: Rendered, corrections: Corrections | None, pixels: Pixels, photos: int) -> Float[Tensor, "V"]:
+def squared_errors(
+    seen: RenderOutput, corrections: Corrections | None, pixels: Pixels, photos: int
+) -> Float[Tensor, "V"]:
     """Of each photo: the sum over its known pixels and their channels, in corrected light if it is."""
     with torch.no_grad():
         rgb = seen.rgb
@@ -151,7 +162,9 @@ def worth(
     deciding, judging = (some_pixels(views, chosen, PIXELS, behind, generator) for _ in range(2))
     left, jacobian = derivatives(see, corrections, deciding, len(chosen))
 
-    def errors(motions: Tensor | None, log_gains: Tensor | None, seen: Rendered | None = None) -> Float[Tensor, "V"]:
+    def errors(
+        motions: Tensor | None, log_gains: Tensor | None, seen: RenderOutput | None = None
+    ) -> Float[Tensor, "V"]:
         trial = changed(corrections, chosen, motions, log_gains)
         return squared_errors(seen or seen_by(see, trial, judging), trial, judging, len(chosen))
 
@@ -170,3 +183,33 @@ def worth(
         }
     shares = {name: by / as_it_is for name, by in fallen.items()}  # nan where all is masked
     return {name: float(share.nanmedian().nan_to_num()) for name, share in shares.items()}
+
+
+def frozen_render(system: "NeRF3D") -> See:
+    """Renders without randomness and with gradient in the rays alone: the field does not learn from it."""
+    field, renderer = copy.deepcopy(system.field).requires_grad_(False), copy.deepcopy(system.renderer).eval()
+
+    def see(rays: Rays, behind: Tensor) -> RenderOutput:
+        with torch.no_grad():
+            samples = system.sampler(rays.detach(), field.density)
+        return renderer(rays, samples, field, behind)
+
+    return see
+
+
+class TryCorrections(L.Callback):
+    """Corrects cameras and light from the first trial on that shows that it helps; where it might, more pixels are asked."""
+
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: "NeRF3D", batch: Any, batch_idx: int) -> None:
+        corrections, step, progress = pl_module.corrections, trainer.global_step, pl_module.state.progress
+        if corrections is None or not corrections.due(step, progress):
+            return
+        views = pl_module.data.scene.train.to(pl_module.device)
+        generator = step_generator(pl_module.seed, Stream.TRIAL, step, pl_module.device)
+        color, light = pl_module.renderer.background.color, "light" in corrections.open_at(step)
+        ask = partial(worth, frozen_render(pl_module), views, color, corrections, generator, light)
+        found = ask()
+        if corrections.helps(step, found, UNSURE_SHARE):
+            several = [found, *(ask() for _ in range(DRAWS - 1))]
+            found = {name: fmean(one[name] for one in several) for name in found}
+        corrections.note(step, progress, found)
