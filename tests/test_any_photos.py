@@ -18,7 +18,7 @@ from nerf_lightning.cli.export import export_compact
 from nerf_lightning.cli.render import render
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
-from nerf_lightning.renderer import Rendered
+from nerf_lightning.renderer import RenderOutput
 from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.view.drawing import frusta
@@ -101,7 +101,7 @@ def test_run_nan_pictures_is_collapsed(
     """As where weights are finite and what they add up to is not; or where corrections of cameras are not either."""
     render_well = NeRF3D.render
 
-    def render_badly(self: NeRF3D, *given: Any) -> Rendered:
+    def render_badly(self: NeRF3D, *given: Any) -> RenderOutput:
         rendered = render_well(self, *given)
         if cameras_too and self.corrections is not None:
             self.corrections.motions.data.fill_(torch.nan)

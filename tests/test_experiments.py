@@ -12,6 +12,7 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.system import NeRF2D, NeRF3D, System
+from nerf_lightning.system.system import total_loss
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.seeding import Stream, step_generator
 from tests.helpers.command_line import BARE
@@ -47,7 +48,7 @@ def take_a_step(cfg: DictConfig) -> System:
     system = build_system(cfg, frame_of(data))
     batch, optimizer = data.draw(0), system.configure_optimizers()
     if isinstance(system, NeRF3D):
-        loss, _ = system.loss(batch, step_generator(0, Stream.STEP, 0), 1)
+        loss = total_loss(system.compute_losses(batch, step_generator(0, Stream.STEP, 0))[0])
     else:
         assert isinstance(system, NeRF2D)
         loss = system.loss(batch)

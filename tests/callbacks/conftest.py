@@ -51,12 +51,7 @@ class Scripted(NeRF2D):
         self.psnrs = iter(range(10, 1000))
         self.asked: list[Any] = []
         mse = torch.tensor(0.01, dtype=torch.float64)
-        self.stats = StepStats(mse, 30, 90, terms={"rgb": mse})
-        self.groups = [{"lr": 0.1}]
-
-    @property
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        return self.groups
+        self.stats = StepStats(mse, 30, 90, losses={"photometric": mse})
 
     def evaluate(self, view: Any) -> ViewResult:
         self.asked.append(view)

@@ -93,7 +93,7 @@ def learned(corrections: Corrections, truth: Corrections, cameras: Cameras) -> N
         found = renderer(rays, sampler(rays.detach(), lambda x: x[:, 0]), soft_ball)
         return by.lit(found.rgb, found.opacity, behind, given, pixels[0])
 
-    optimizer = torch.optim.Adam(corrections.groups)
+    optimizer = torch.optim.Adam(corrections.param_groups())
     for step in range(STEPS):
         for group, rate in zip(optimizer.param_groups, (0.1, 0.02), strict=True):
             group["lr"] = rate * 0.02 ** (step / STEPS)

@@ -21,7 +21,7 @@ from nerf_lightning.refine.corrections import (
     TWICE,
     WORTHWHILE,
 )
-from nerf_lightning.renderer import Rendered, VolumeRenderer
+from nerf_lightning.renderer import RenderOutput, VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system.fits import misfits
 from nerf_lightning.system.trial import least_squares, worth
@@ -31,7 +31,7 @@ VIEWS, SIZE = 6, 24
 BLACK = torch.zeros(3)
 
 
-def see(rays: Rays, behind: Tensor) -> Rendered:
+def see(rays: Rays, behind: Tensor) -> RenderOutput:
     samples = UniformSampler(BOX, 48)(rays.detach(), lambda x: x[:, 0])
     return VolumeRenderer("black")(rays, samples, soft_ball, behind)
 
@@ -105,7 +105,7 @@ def test_least_squares_is_damped():
 
 def test_trial_schedule_corrects_what_helps_and_retries_rest(views: Views):
     corrections = Corrections(views.cameras, BOX, auto=True)
-    assert corrections.factors(1.0) == [0.0, 0.0] and not corrections.since
+    assert set(corrections.lr_factors(1.0).values()) == {0.0} and not corrections.since
     assert not corrections.due(FIRST - 1, START) and corrections.due(FIRST, START)
     assert not corrections.due(FIRST, LAST + 0.01), "too late"
     assert not Corrections(views.cameras, BOX, poses=False, auto=True).due(FIRST, START), "too early for gains"
@@ -116,8 +116,9 @@ def test_trial_schedule_corrects_what_helps_and_retries_rest(views: Views):
     corrections.note(FIRST, START, {"poses": 0.3})
     assert corrections.motions.requires_grad and not corrections.log_gains.requires_grad
     assert not corrections.due(EARLY - 1, START) and corrections.due(EARLY, START)
-    assert corrections.factors(START - 0.001) == [0.0, 0.0] and corrections.factors(START) == [FASTER, 0.0]
-    assert corrections.factors(1.0) == [Corrections.FINAL, 0.0]
+    assert not any(corrections.lr_factors(START - 0.001).values())
+    assert corrections.lr_factors(START) == {"poses": FASTER, "light": 0.0}
+    assert corrections.lr_factors(1.0) == {"poses": Corrections.FINAL, "light": 0.0}
     again = Corrections(views.cameras, BOX, auto=True)
     again.decide(corrections.decided())
     assert again.motions.requires_grad and again.decided() == corrections.decided()
@@ -132,7 +133,7 @@ def test_gains_start_from_exposures_that_explain_photos(views: Views):
     lit = Views.of((views.images * gains.exp()[:, :1, None, None] / 4).clamp(0, 255).to(torch.uint8), views.cameras)
     for photos, brightness, fits in ((lit, 0.25, True), (views, 1.0, False)):
 
-        def darker(rays: Rays, behind: Tensor, brightness: float = brightness) -> Rendered:
+        def darker(rays: Rays, behind: Tensor, brightness: float = brightness) -> RenderOutput:
             return replace(seen := see(rays, behind), rgb=seen.rgb * brightness)
 
         corrections = Corrections(views.cameras, BOX, exposures=exposures, auto=True)
