@@ -92,6 +92,7 @@ def trainer_with(tmp_path: Path) -> Callable[..., L.Trainer]:
         trainer.global_step, trainer.should_stop = 0, False
         trainer.default_root_dir = str(tmp_path)
         trainer.logger = Mock()
+        trainer.optimizers = [Mock(param_groups=[{"name": "field", "lr": 0.1}])]
         trainer.world_size, trainer.is_global_zero = 1, True
         return trainer
 

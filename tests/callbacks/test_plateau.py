@@ -39,11 +39,6 @@ def test_plateau_is_reported_where_more_time_is_not_worth_it():
     assert measured(Plateau(0.2), lambda spent: 20 - 1 / spent) is None
 
 
-def test_budget_patience_zero_is_refused():
-    with pytest.raises(InputError, match=r"budget\.patience: .*found 0"):
-        Budget(steps=10, patience=0)
-
-
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
     save_npz(make_scene(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")

@@ -84,7 +84,7 @@ def simulated(clock: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Ca
 
         def render(self: NeRF3D, rays: Rays, **given: Any) -> RenderOutput:
             nonlocal rendering
-            seconds = len(rays) * pixel_seconds * (fog if self.progress < 0.03 else 1.0)
+            seconds = len(rays) * pixel_seconds * (fog if self.state.progress < 0.03 else 1.0)
             clock.wait(seconds)
             rendering += seconds
             return RenderOutput(torch.rand(len(rays), 3), torch.ones(len(rays)), torch.ones(len(rays)))
