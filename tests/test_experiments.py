@@ -124,7 +124,14 @@ def test_run_leaves_results_pictures_checkpoints_and_curves(tmp_path: Path):
     (file,) = tmp_path.glob("events.out.tfevents.*")
     events = EventAccumulator(str(file)).Reload()
     scalars = set(events.Tags()["scalars"])
-    assert {"val/psnr", "val/ssim", "loss/photometric", "train/psnr", "speed/rays_per_second", "speed/train_seconds"} < scalars
+    assert {
+        "val/psnr",
+        "val/ssim",
+        "loss/photometric",
+        "train/psnr",
+        "speed/rays_per_second",
+        "speed/train_seconds",
+    } < scalars
     assert {name.partition("/")[0] for name in scalars} == {"loss", "lr", "speed", "train", "val"}
     assert events.Scalars("val/psnr")[-1].step == 60 and events.Tags()["images"] == ["images/view"]
     assert not list(tmp_path.glob("**/.*")), "no temporary file stays behind"

@@ -128,7 +128,7 @@ def voxels_like(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[Vo
         colours.new_zeros(1, 3),
         views.new_zeros(1, views.shape[1]),
     )
-    voxels.hold(keep.flatten(), [torch.cat(pair) for pair in zip(nothing, (raw, colours, views), strict=True)])
+    voxels.set_vertices(keep.flatten(), [torch.cat(pair) for pair in zip(nothing, (raw, colours, views), strict=True)])
     return voxels, options
 
 
@@ -167,7 +167,7 @@ def cell_sizes(bounds: Bounds, places: Float[Tensor, "N 3"], across: int) -> Flo
 
 def cells_around(voxels: VoxelField, grid: int) -> Cells:
     """The cells of another grid in which voxels hold something, and their neighbours."""
-    kept = (voxels.index > 0).view(*[voxels.side] * 3).nonzero()
+    kept = voxels.kept.view(*[voxels.side] * 3).nonzero()
     x, y, z = (kept * grid // (voxels.side - 1)).clamp(0, grid - 1).unbind(1)
     found = torch.zeros(grid, grid, grid, dtype=torch.bool, device=kept.device)
     found[x, y, z] = True

@@ -32,13 +32,11 @@ RECENT = 0.5
 PIECES = 4
 """Each step measures the roughness of one of this many pieces of the table."""
 TABLES = ("log_density", "colours", "views")
-COUNTS = {"stage": torch.int64, "steps": torch.int32, "started": torch.int32}
-"""Whole numbers in checkpoints."""
 CHUNK = 1 << 16
 """Vertices interpolated at a time when growing, to bound the memory."""
 
-VERTEX = 13
-"""Bytes of each vertex of a grid, kept or not, while it grows: whether it is kept, how many are before it, and its row."""
+BYTES_PER_VERTEX = 14
+"""Of a grid while it grows, kept or not: whether it is kept, twice, how many are before it, and its row."""
 
 
 class VoxelField(Field):
@@ -63,9 +61,14 @@ class VoxelField(Field):
         InputError: where coarsest > finest.
     """
 
+    kept: Tensor
+    """Which vertices of the grid hold values."""
     index: Tensor
+    """Row of every vertex; 0 for those that are not kept."""
     vertex: Tensor
+    """Vertex of every row, its inverse."""
     seen: Tensor
+    """Step of the last reading of every row."""
 
     def __init__(
         self,
@@ -90,12 +93,12 @@ class VoxelField(Field):
         self.max_lr = 1 / density_rate
         self.smoothness = smoothness
         rows = (self.growth.resolutions[0] + 1) ** 3 + 1
-        self.register_buffer("index", torch.arange(1, rows, dtype=torch.int32))
+        self.register_buffer("kept", torch.ones(rows - 1, dtype=torch.bool))
+        self.register_buffer("index", torch.arange(1, rows, dtype=torch.int32), persistent=False)
         self.register_buffer("vertex", torch.arange(-1, rows - 1, dtype=torch.int32), persistent=False)
-        self.register_buffer("seen", torch.zeros(rows, dtype=torch.int32))  # step of the last reading
+        self.register_buffer("seen", torch.zeros(rows, dtype=torch.int32))
         self.stage, self.steps, self.started = 0, 1, 1
-        """Of `growth`, steps so far, and the first one of the stage. Checkpoints hold them too (`COUNTS`), but a step must not
-        ask a device for them."""
+        """Of `growth`, steps so far, and the first one of the stage; on the host, as a step must not ask a device for them."""
         self.log_density = torch.nn.Parameter(torch.zeros(rows))  # divided by density_rate
         self.log_density.data[0] = EMPTY / density_rate
         self.colours = torch.nn.Parameter(torch.zeros(rows, 3))
@@ -108,7 +111,7 @@ class VoxelField(Field):
 
     @property
     def training_bytes(self) -> int:
-        return max(super().training_bytes, VERTEX * (self.growth.resolutions[-1] + 1) ** 3)
+        return max(super().training_bytes, BYTES_PER_VERTEX * (self.growth.resolutions[-1] + 1) ** 3)
 
     @property
     def side(self) -> int:
@@ -151,16 +154,17 @@ class VoxelField(Field):
         values = torch.cat([table.view(len(table), -1) for table in self.tables], dim=1)
         parts = (keep.nonzero() / (keep.shape[0] - 1)).split(CHUNK)
         new = torch.cat([values[:1], *(interpolate_rows(values, *locate(self.index, part)) for part in parts)])
-        self.hold(keep.flatten(), new.split([1, 3, 3 * self.terms], dim=1))
+        self.set_vertices(keep.flatten(), new.split([1, 3, 3 * self.terms], dim=1))
         self.stage, self.started = stage, self.steps + 1
         return list(self.tables)
 
-    def hold(self, keep: Bool[Tensor, "V"], tables: Sequence[Tensor]) -> None:
+    def set_vertices(self, keep: Bool[Tensor, "V"], tables: Sequence[Tensor]) -> None:
         """Replaces the tables: row 0 for all other vertices, then those of the kept vertices in order."""
         for table, columns in zip(self.tables, tables, strict=True):
             replace_data(table, columns.reshape(len(columns), *table.shape[1:]).contiguous())
-        self.index = torch.where(keep, keep.cumsum(0), 0).int()
-        self.find_vertices()
+        self.kept, self.index = keep, torch.where(keep, keep.cumsum(0), 0).int()
+        rows = self.index.nonzero()[:, 0]  # in the order of their vertices
+        self.vertex = torch.cat([rows.new_tensor([-1]), rows]).int()
         self.seen = torch.zeros(len(self.vertex), dtype=torch.int32, device=keep.device)
 
     @torch.no_grad()
@@ -176,31 +180,20 @@ class VoxelField(Field):
         wider = views.new_zeros(len(views), 3, self.terms)
         wider[..., : views.shape[2]] = views
         density = smaller.log_density * (smaller.density_rate / self.density_rate)
-        self.hold(smaller.index > 0, [density, smaller.colours.detach(), wider.flatten(1)])
+        self.set_vertices(smaller.kept, [density, smaller.colours.detach(), wider.flatten(1)])
 
     @torch.no_grad()
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
-        keep = vertices_in(reached, self.side - 1).flatten() & (self.index > 0)
+        keep = vertices_in(reached, self.side - 1).flatten() & self.kept
         rows = torch.cat([self.index.new_zeros(1), self.index[keep]]).long()
-        self.hold(keep, [table.detach()[rows] for table in self.tables])
+        self.set_vertices(keep, [table.detach()[rows] for table in self.tables])
 
     def export_state(self) -> dict[str, Tensor]:
         tables = zip(TABLES, self.tables, strict=True)
-        return {"kept": self.index > 0, **{name: table.detach() for name, table in tables}}
+        return {"kept": self.kept, **{name: table.detach() for name, table in tables}}
 
-    @torch.no_grad()
     def import_state(self, state: dict[str, Tensor]) -> None:
-        keep, tables = state["kept"], [state[name] for name in TABLES]
-        if keep.dtype != torch.bool or not of_grid(keep):
-            raise RuntimeError("vertices that are none of a cubic grid")
-        if any(len(table) != int(keep.sum()) + 1 for table in tables):
-            raise RuntimeError("tables of another length than there are vertices")
-        self.hold(keep, tables)
-
-    def find_vertices(self) -> None:
-        """Makes `vertex`, the inverse of `index`: rows stand in the order of their vertices."""
-        kept = self.index.nonzero()[:, 0]
-        self.vertex = torch.cat([kept.new_tensor([-1]), kept]).int()
+        self.load_state_dict({name: state[name] for name in ("kept", *TABLES)}, strict=False)
 
     def surroundings(self, side: int) -> Bool[Tensor, "S S S"]:
         """Which vertices of a grid of side^3 lie among current vertices that were read lately, or next to those."""
@@ -214,51 +207,28 @@ class VoxelField(Field):
         # Before anything was rendered, everything stays.
         return widened(keep) if keep.any() else torch.ones_like(keep)
 
-    def _save_to_state_dict(self, destination: dict[str, Tensor], prefix: str, keep_vars: bool) -> None:
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-        for name, dtype in COUNTS.items():
-            destination[prefix + name] = torch.tensor(getattr(self, name), dtype=dtype)
+    def get_extra_state(self) -> Tensor:
+        return torch.tensor([self.stage, self.steps, self.started])
 
-    def _check(self, prefix: str, state: dict[str, Tensor]) -> None:
-        """Refuses a state whose index, tables and counts do not belong together: what it has, as a part may be missing."""
-        found = {name: state[prefix + name] for name in ("index", "seen", *TABLES, *COUNTS) if prefix + name in state}
-        if any(name in found and found[name].numel() != 1 for name in COUNTS):
-            raise RuntimeError("counts of another shape than one number has")
-        if "stage" in found and not 0 <= int(found["stage"]) < len(self.growth.resolutions):
-            raise RuntimeError(f"stage {int(found['stage'])} of {len(self.growth.resolutions)}")
-        if "index" not in found:
-            return
-        index = found["index"]
-        kept = index[index > 0]
-        rising = torch.equal(kept, torch.arange(1, len(kept) + 1).to(kept))
-        if index.dtype != torch.int32 or not of_grid(index) or int(index.min()) < 0 or not rising:
-            raise RuntimeError("an index that is none of a cubic grid")
-        rows = len(kept) + 1
-        shapes = {"seen": (rows,), "log_density": (rows,), "colours": (rows, 3), "views": (rows, 3 * self.terms)}
-        for name, shape in shapes.items():
-            if name in found and found[name].shape != shape:
-                raise RuntimeError(f"{name} of shape {tuple(found[name].shape)}, where the index asks for {shape}")
+    def set_extra_state(self, state: Tensor) -> None:
+        self.stage, self.steps, self.started = state.tolist()
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        """Takes the sizes of the loaded state: a grid of another stage has other shapes.
+        """Takes the size of the loaded state: a grid of another stage has other shapes.
 
         Raises:
-            RuntimeError: where they are none of such a grid.
+            RuntimeError: where vertices are none of a cubic grid.
         """
-        self._check(prefix, state_dict)
-        for name in COUNTS:
-            if prefix + name in state_dict:
-                setattr(self, name, int(state_dict.pop(prefix + name)))
-        for name in ("index", "seen"):
-            if prefix + name in state_dict:
-                setattr(self, name, torch.empty_like(state_dict[prefix + name], device=self.aabb.device))
-        for name in TABLES:
-            if prefix + name in state_dict:
-                replace_data(getattr(self, name), torch.empty_like(state_dict[prefix + name], device=self.aabb.device))
+        if (kept := state_dict.get(f"{prefix}kept")) is not None:
+            if (
+                kept.dtype != torch.bool
+                or kept.ndim != 1
+                or round(len(kept) ** (1 / 3)) ** 3 != len(kept)
+                or not len(kept)
+            ):
+                raise RuntimeError("vertices that are none of a cubic grid")
+            rows = int(kept.sum()) + 1
+            self.set_vertices(
+                kept.to(self.aabb.device), [table.new_empty(rows, table[0].numel()) for table in self.tables]
+            )
         super()._load_from_state_dict(state_dict, prefix, *rest)
-        self.find_vertices()
-
-
-def of_grid(vertices: Tensor) -> bool:
-    """Whether there is one for each vertex of a cubic grid, in a row."""
-    return vertices.ndim == 1 and len(vertices) > 0 and round(len(vertices) ** (1 / 3)) ** 3 == len(vertices)

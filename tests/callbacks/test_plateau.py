@@ -6,11 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from nerf_lightning.callbacks import Budget
 from nerf_lightning.callbacks.plateau import FIRST, Plateau
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.objects import PILE, make_scene
 from nerf_lightning.training.train import train
 

@@ -104,9 +104,9 @@ def test_voxels_state_in_fresh_field_continues_alike(grown: bool):
 @pytest.mark.parametrize(
     "name, change",
     [
-        ("index", lambda index: index[:-1]),
+        ("kept", lambda kept: kept[:-1]),
         ("seen", lambda seen: seen[:9]),
-        ("stage", lambda stage: stage + 2),
+        ("log_density", lambda values: values[1:]),
     ],
 )
 def test_voxels_state_with_mismatched_parts_is_refused(name: str, change: Callable[[torch.Tensor], torch.Tensor]):
