@@ -104,7 +104,7 @@ def test_run_nan_pictures_is_collapsed(
     def render_badly(self: NeRF3D, *given: Any) -> RenderOutput:
         rendered = render_well(self, *given)
         if cameras_too and self.corrections is not None:
-            self.corrections.motions.data.fill_(torch.nan)
+            self.corrections.poses.motions.data.fill_(torch.nan)
         return replace(rendered, rgb=rendered.rgb * torch.nan)
 
     monkeypatch.setattr(NeRF3D, "render", render_badly)
@@ -112,7 +112,7 @@ def test_run_nan_pictures_is_collapsed(
     options = [*QUICK, "refine=both"] if cameras_too else QUICK
     run = nl.train(nl.load_scene(folder), steps=4, seed=1, device="cpu", folder=tmp_path / "run", options=options)
     found = run.results
-    told = "corrections.motions is no longer finite" if cameras_too else "what is rendered is not finite"
+    told = "corrections.poses.motions is no longer finite" if cameras_too else "what is rendered is not finite"
     assert found["status"] == "collapsed" and told in found["diagnosis"]
     assert found["psnr"] is None and found["psnr_aligned"] is None and found["curve"] == []
     assert found["corrections"] is None

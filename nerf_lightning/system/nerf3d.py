@@ -91,11 +91,11 @@ class NeRF3D(System):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if self.corrections is not None:
-            checkpoint["corrections"] = self.corrections.decided()
+            checkpoint["corrections"] = self.corrections.trial_state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if self.corrections is not None:
-            self.corrections.decide(checkpoint["corrections"])
+            self.corrections.load_trial_state(checkpoint["corrections"])
 
     def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
         step = self.global_step
@@ -111,7 +111,7 @@ class NeRF3D(System):
         rays = batch.rays
         if self.corrections is not None:
             assert batch.views is not None  # training rays are of photos
-            rays = self.corrections.rays(rays, batch.views)
+            rays = self.corrections.poses(rays, batch.views)
         with torch.no_grad():
             samples = self.sampler(rays.detach(), part(self.field.density, self.backend), generator)
         backgrounds = self.renderer.background.sample(len(rays), generator)
@@ -119,7 +119,7 @@ class NeRF3D(System):
         truth, rgb = over(batch.pixels, backgrounds), output.rgb
         if self.corrections is not None:
             assert batch.views is not None
-            rgb = self.corrections.lit(rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
+            rgb = self.corrections.color(rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
         if samples.whole is not None:  # a ray without all of its samples must not be learned from
             rgb = torch.where(samples.whole[:, None], rgb, truth)
         squares = (rgb - truth).square().mean(1)

@@ -35,7 +35,7 @@ from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, S
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
-from nerf_lightning.refine import summary, told
+from nerf_lightning.refine import format_report, summarize_corrections
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.find import link_latest
@@ -153,7 +153,7 @@ def prepare_system(
     what = "numbers, with their gradients and moments,"
     check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
     if isinstance(system, NeRF3D) and system.corrections is not None and poses_are_off:
-        system.corrections.begin_poses()
+        system.corrections.enable_poses_at_once()
     if system.field.sizing:
         log.info("model: %s", system.field.sizing)
     check_background(cfg, data, system)
@@ -185,14 +185,14 @@ def fit(
 
 def report_photos(system: System, data: RayDataModule | PixelDataModule, results: Results, folder: Path) -> None:
     """Saves corrected cameras, and prints what training has found out about the photos."""
-    if isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.finite:
+    if isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.is_finite:
         assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
-        if "poses" in system.corrections.since:
-            cameras = system.corrections.cameras(data.scene.train.cameras)
-            save_scene(data, folder, cameras, summary(system.corrections)["focal_factor"])
+        if "poses" in system.corrections.enabled_at:
+            cameras = system.corrections.poses.refine_cameras(data.scene.train.cameras)
+            save_scene(data, folder, cameras, summarize_corrections(system.corrections)["focal_factor"])
         found = results.summary["psnr_aligned"]
         aligned = "" if found is None else f"; {found:.2f} dB held out with held-out photos corrected too"
-        print(told(system.corrections, data.scene.train.name) + aligned)
+        print(format_report(system.corrections, data.scene.train.name) + aligned)
     if results.misfits:
         named = join_truncated([f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results.misfits], MAX_NAMED)
         print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}")

@@ -72,6 +72,6 @@ def test_proposals_and_corrections_have_own_learning_rates(tmp_path: Path):
     assert rates.keys() == set(system.parameters())
     assert {rates[parameter] for parameter in system.field.parameters()} == {0.02}
     assert rates[system.sampler.grid.tables] == 0.02 * 0.01**0.5  # in the second of two steps
-    assert rates[system.corrections.motions] == (
+    assert rates[system.corrections.poses.motions] == (
         system.corrections.rates["poses"] * system.corrections.lr_factors(0.5)["poses"]
     )
