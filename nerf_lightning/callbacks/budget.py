@@ -147,7 +147,7 @@ class Budget(L.Callback):
         flat = plateau.note(spent, quality)
         if not agreed(trainer, flat):
             return
-        growth = getattr(system.field, "growth", None)  # a picture's has none
+        growth = system.field.growth
         if growth is not None and self.state.progress < growth.end:
             reached = growth.end
             self._line = (spent, reached, (1 - reached) / (1 - spent))

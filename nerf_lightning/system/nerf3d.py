@@ -89,6 +89,15 @@ class NeRF3D(System):
         self.data.plain = self.renderer.uses_texture
         follow_resolution(self, self.data)
 
+    def set_first_step(self, step: int) -> None:
+        self.sampler.restart(step)
+
+    def restart(self, step: int) -> None:
+        self.set_first_step(step)
+        self.sampler.mark_invisible_cells(self.data.scene.train.cameras)
+        follow_resolution(self, self.data)
+        self.data.start_again()  # the errors were those of the failed attempt
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if self.corrections is not None:
             checkpoint["corrections"] = self.corrections.trial_state()
