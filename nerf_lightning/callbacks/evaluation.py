@@ -109,7 +109,7 @@ class Evaluation(Renders):
 
 def is_corrected(system: L.LightningModule) -> bool:
     """Whether cameras or light of the training photos were corrected."""
-    return isinstance(system, NeRF3D) and system.corrections is not None and bool(system.corrections.since)
+    return isinstance(system, NeRF3D) and system.corrections is not None and bool(system.corrections.enabled_at)
 
 
 def figures_of(views: Sequence[dict[str, float]]) -> dict[str, Any]:

@@ -57,8 +57,8 @@ class HeldOut(Renders):
         return points * sum(map(data.pixels_held_out, subsample(data.held_out_views, self.views)))
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        passed = sum(pl_module.progress >= fraction for fraction in self.at)
-        if passed == self.next_mark or pl_module.progress >= 1.0:
+        passed = sum(pl_module.state.progress >= fraction for fraction in self.at)
+        if passed <= self.next_mark or pl_module.state.progress >= 1.0:
             return
         figures = self.measure(trainer, pl_module)
         self.next_mark, seconds = passed, Budget.of(trainer).seconds

@@ -70,7 +70,7 @@ class Live(ChecksData):
         if self.page is None or not self.page.visitors or start < self._next:
             return
         with Budget.of(trainer).paused():
-            self.page.show_progress(pl_module.progress, ", ".join(describe_progress(trainer)))
+            self.page.show_progress(pl_module.state.progress, ", ".join(describe_progress(trainer)))
             self.page.again()
             self.page.paint(IMAGE_SECONDS)
         end = time.perf_counter()

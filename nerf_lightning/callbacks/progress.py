@@ -78,7 +78,7 @@ class Progress(L.Callback):
             parts.insert(1, f"{self._rays / max(budget.seconds - self._mark, 1e-9):,.0f} rays/s")
             self._mark, self._rays = budget.seconds, 0
         done = budget.seconds + budget.plan.spent
-        fraction = system.progress if seconds is None else done / max(done + seconds, 1e-9)
+        fraction = system.state.progress if seconds is None else done / max(done + seconds, 1e-9)
         if self.bar is not None:
             self.bar.update(TaskID(0), completed=fraction, status="  ".join(parts))
         else:

@@ -19,7 +19,7 @@ from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
 from nerf_lightning.dataset import PictureBatch
-from nerf_lightning.refine import summary
+from nerf_lightning.refine import summarize_corrections
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.utils.files import known
 from nerf_lightning.utils.machine import describe_machine
@@ -71,7 +71,7 @@ def summarize_run(
         "threads": torch.get_num_threads(),
         "machine": describe_machine(device),
         # Several processes would count each other as other work.
-        "load": budget.load.cores() if trainer.world_size == 1 else None,
+        "load": budget.state.clock.load.cores() if trainer.world_size == 1 else None,
         "versions": {
             "python": platform.python_version(),
             "torch": torch.__version__,
@@ -88,7 +88,9 @@ def summarize_run(
         "curve": quality_curve(trainer),
         "warnings": list(warnings),
         "plateau": budget.stopped,
-        "corrections": summary(corrections) if corrections is not None and corrections.finite else None,
+        "corrections": summarize_corrections(corrections)
+        if corrections is not None and corrections.is_finite
+        else None,
         "recoveries": [asdict(one) for one in guard.recoveries] if guard is not None else [],
         "status": status,
         "diagnosis": diagnosis,
