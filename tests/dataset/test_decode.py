@@ -87,11 +87,9 @@ def test_read_pixels_truncated_jpeg_raises(size: tuple[int, int] | None, tmp_pat
 
 @pytest.mark.parametrize("mode", ["L", "CMYK"])
 def test_read_pixels_grey_and_cmyk_become_rgb(mode: str, tmp_path: Path):
-    Image.fromarray(photo(32, 16)).convert(mode).save(tmp_path / "a.jpg", quality=95)
-    whole, reduced = read_pixels(tmp_path / "a.jpg"), read_pixels(tmp_path / "a.jpg", size=(16, 8))
-    expected = Image.fromarray(photo(32, 16)).convert(mode).convert("RGB")
-    assert np.abs(whole.astype(int) - np.asarray(expected)).mean() < 4
-    assert np.abs(reduced.astype(int) - area_resize(whole, 16, 8)).mean() < 4
+    picture = Image.fromarray(photo(32, 16)).convert(mode)
+    picture.save(tmp_path / "a.jpg", quality=95)
+    assert np.abs(read_pixels(tmp_path / "a.jpg").astype(int) - np.asarray(picture.convert("RGB"))).mean() < 4
 
 
 @pytest.mark.parametrize("data", [b"GIF89a" + bytes(100), PNG_WITHOUT_ROWS], ids=["gif", "png"])

@@ -38,6 +38,8 @@ DRAFT_SCALES = (8, 4, 2)
 OVERSAMPLING = 2
 """Least ratio of a reduced JPEG's sides to those it is averaged to, where they differ: its low-pass filter is sharper than
 an average, and shows only where little is averaged afterwards (43 dB against the average of the whole photo, else above 50)."""
+CONVERSIONS = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
+"""From OpenCV's channels, by their count."""
 PNG = b"\x89PNG"
 HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 """Brands after `ftyp` in photos of phones (ISO 23008-12); the last two stand for any codec."""
@@ -130,17 +132,9 @@ def _rgb8(path: Path, raw: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "H W 
     if raw.dtype != np.uint8:
         raise InputError(path, "", f"{raw.dtype} pixels", "8 or 16 bits a channel")
     raw = raw.reshape(*raw.shape[:2], -1)
-    match raw.shape[2]:
-        case 1:
-            return cv2.cvtColor(raw, cv2.COLOR_GRAY2RGB)
-        case 2:
-            return raw[..., [0, 0, 0, 1]]
-        case 3:
-            return cv2.cvtColor(raw, cv2.COLOR_BGR2RGB)
-        case 4:
-            return cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA)
-        case channels:
-            raise InputError(path, "", f"{channels} channels", "1 to 4")
+    if (channels := raw.shape[2]) not in CONVERSIONS:
+        raise InputError(path, "", f"{channels} channels", "1, 3 or 4")
+    return cv2.cvtColor(raw, CONVERSIONS[channels])
 
 
 def _heic(path: Path, data: bytes) -> UInt8[np.ndarray, "H W C"]:
@@ -157,15 +151,11 @@ def _heic(path: Path, data: bytes) -> UInt8[np.ndarray, "H W C"]:
 def _check_png(path: Path, data: bytes) -> None:
     """Compares the checksums of all chunks, up to the last: some OpenCV versions fill the rest with grey and only warn."""
     at, name = 8, b""
-    while at + 12 <= len(data) and name != b"IEND":
+    while name != b"IEND":
         end = at + 8 + int.from_bytes(data[at : at + 4], "big")
         name = data[at + 4 : at + 8]
-        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            break
+        if len(name) < 4 or zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise InputError(path, "", "an image that was cut short or changed", "a whole PNG", "copy it again")
         at = end + 4
-    else:
-        if name == b"IEND":
-            width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
-            check_memory(path, "", f"{width}x{height} pixels", 3 * width * height)
-            return
-    raise InputError(path, "", "an image that was cut short or changed", "a whole PNG", "copy it again")
+    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+    check_memory(path, "", f"{width}x{height} pixels", 3 * width * height)
