@@ -13,7 +13,7 @@ from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.loss_monitor import LossHistory, LossMonitor, TrainingFailure
 from nerf_lightning.model import SoftenableReLU
-from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.system import System
 from nerf_lightning.utils.options import AtLeast, Count
 from nerf_lightning.utils.seeding import Stream, step_generator
 
@@ -87,19 +87,19 @@ class Guard(L.Callback):
             self.monitor.plain_loss = float((truth - truth.mean(0)).square().mean())
         if self.attempts and self.monitor.is_healthy and all_finite(pl_module):
             self._good = copy_state(pl_module)  # of a resumed run
-        if isinstance(pl_module, NeRF3D):
-            if self.monitor.history.start_step:
-                pl_module.sampler.restart(self.monitor.history.start_step)
-            if self.attempts and trainer.global_step == 0 and trainer.world_size == 1:
-                self._cap_learning_rate(trainer, pl_module)
+        if self.monitor.history.start_step:
+            pl_module.set_first_step(self.monitor.history.start_step)
+        if self.attempts and trainer.global_step == 0 and trainer.world_size == 1:
+            self._cap_learning_rate(trainer, pl_module)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        pl_module.rate = self.rate
+        scale = self.rate
         start_step = self.monitor.history.start_step
         if start_step and self.rate < 1:
             warmup = min(1.0, (trainer.global_step - start_step + 1) / RESTART_WARMUP_STEPS)
-            done = (pl_module.progress - self.restart_progress) / max(1 - self.restart_progress, 1e-6)
-            pl_module.rate *= warmup * RESTART_LR_DECAY**done
+            done = (pl_module.state.progress - self.restart_progress) / max(1 - self.restart_progress, 1e-6)
+            scale *= warmup * RESTART_LR_DECAY**done
+        pl_module.state.scale_lr(scale)
 
     def on_after_backward(self, trainer: L.Trainer, pl_module: System) -> None:
         if self.monitor.is_due(trainer.global_step + 1) and not self.monitor.has_learned:
@@ -172,7 +172,7 @@ class Guard(L.Callback):
         else:
             action = self._restart(system, step, failure.diverged)
             self.monitor.reset(step)
-            self.restart_progress = system.progress
+            self.restart_progress = system.state.progress
         for optimizer in trainer.optimizers:
             optimizer.state.clear()
             optimizer.zero_grad()
@@ -183,13 +183,13 @@ class Guard(L.Callback):
         self.recoveries.append(Recovery(step, seconds, cause, action))
         print(f"guard: step {step}: {cause}; {action}", flush=True)
 
-    def _cap_learning_rate(self, trainer: L.Trainer, system: NeRF3D) -> None:
+    def _cap_learning_rate(self, trainer: L.Trainer, system: System) -> None:
         """Before the first step: lowers a rate that is known to be too high for the field."""
         optimizer = trainer.optimizers[0]
-        asked, fastest = optimizer.param_groups[0]["initial_lr"], system.field.fastest
-        if isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW) and asked > fastest:
-            self.rate = fastest / asked
-            cause = f"a learning rate of {asked:.3g} is too high for this field, which trains at up to {fastest:.3g}"
+        asked, max_lr = optimizer.param_groups[0]["initial_lr"], system.field.max_lr
+        if isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW) and asked > max_lr:
+            self.rate = max_lr / asked
+            cause = f"a learning rate of {asked:.3g} is too high for this field, which trains at up to {max_lr:.3g}"
             self._record(trainer, cause, f"{self.rate:.2g} times the learning rate")
 
     def _restart(self, system: System, step: int, diverged: bool) -> str:
@@ -203,9 +203,7 @@ class Guard(L.Callback):
                 if reset := getattr(module, "reset_parameters", None):
                     reset()
         system.field.load_state_dict(fresh.state_dict())
-        system.on_fit_start()  # the sampler learns about the scene at the start
-        if isinstance(system, NeRF3D):
-            system.sampler.restart(step)
+        system.restart(step)
         relus = [module for module in system.modules() if isinstance(module, SoftenableReLU)]
         if relus and not self.softened and not diverged:
             self.softened = True
