@@ -1,5 +1,7 @@
 """Decoding: JPEG at reduced scale, legal oddities, files cut short, headers."""
 
+import importlib.util
+import sys
 import zlib
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import pytest
 from PIL import Image
 
 from nerf_lightning.dataset.formats.decode import draft_scale, image_header, read_pixels
+from nerf_lightning.dataset.placing.lenses import Shot, shot
 from nerf_lightning.dataset.resize import area_resize
 from nerf_lightning.errors import InputError
 from tests.helpers.exif_tags import tags
@@ -74,14 +77,13 @@ def test_read_pixels_fill_bytes_are_skipped(tmp_path: Path):
     assert np.array_equal(read_pixels(path), before)
 
 
-@pytest.mark.parametrize("size", [None, (32, 16)])
-def test_read_pixels_truncated_jpeg_raises(size: tuple[int, int] | None, tmp_path: Path):
+def test_read_pixels_truncated_jpeg_raises(tmp_path: Path):
     path = save(tmp_path / "a.jpg", photo(64, 32))
     data = path.read_bytes()
-    for kept in np.linspace(3, len(data) - 3, 40).astype(int):
+    for kept in np.linspace(3, len(data) - 3, 10).astype(int):
         path.write_bytes(data[:kept])
         with pytest.raises(InputError, match="cut short or changed") as caught:
-            read_pixels(path, size=size)
+            read_pixels(path, size=(32, 16))
         assert "\n" not in str(caught.value)
 
 
@@ -100,3 +102,40 @@ def test_read_pixels_of_no_image_prints_nothing_of_opencv(
     with pytest.raises(InputError, match="no image"):
         read_pixels(tmp_path / "a.jpg")
     assert capfd.readouterr() == ("", "")
+
+
+installed = pytest.mark.skipif(importlib.util.find_spec("pillow_heif") is None, reason="pillow-heif is not installed")
+
+
+def write_heic(file: Path) -> np.ndarray:
+    """A smooth picture with a tag that would turn it, of which a HEIC reader has no need."""
+    import pillow_heif
+
+    picture = np.linspace(0, 255, 48 * 64 * 3).reshape(48, 64, 3).astype(np.uint8)
+    exif = tags(6, "Apple", focal_35mm=26)
+    pillow_heif.from_pillow(Image.fromarray(picture)).save(file, exif=exif, quality=90)
+    return picture
+
+
+@installed
+def test_read_pixels_heic_is_upright(tmp_path: Path):
+    picture = write_heic(tmp_path / "a.HEIC")
+    for upright in (True, False):
+        found = read_pixels(tmp_path / "a.HEIC", upright)
+        np.testing.assert_allclose(found.astype(int), np.rot90(picture, -1), atol=12)
+    assert shot(tmp_path / "a.HEIC", 48, 64) == Shot(48, 64, "Apple", focal_35mm=26.0)
+
+
+@installed
+def test_read_pixels_truncated_heic_raises(tmp_path: Path):
+    write_heic(tmp_path / "a.heic")
+    (tmp_path / "a.heic").write_bytes((tmp_path / "a.heic").read_bytes()[:-20])
+    with pytest.raises(InputError, match="found an unreadable image .*, expected a whole HEIC photo; copy it again"):
+        read_pixels(tmp_path / "a.heic")
+
+
+def test_read_pixels_heic_without_package_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x1cftypheic" + bytes(100))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(InputError, match=r"no such package, .* HEIC photos; pip install 'nerf_lightning\[heic\]'"):
+        read_pixels(tmp_path / "a.heic")

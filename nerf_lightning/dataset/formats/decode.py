@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt8
-from PIL.Image import Transpose
 from PIL.JpegImagePlugin import JpegImageFile
 
 from nerf_lightning.dataset.formats.header import DAMAGED, JPEG, QUARTER_TURNS, read_header
@@ -23,16 +22,6 @@ from nerf_lightning.utils.parsing import existing_file
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # `read_pixels` says what is wrong with a file
 
 THREADS = 4
-TURNS = {
-    2: Transpose.FLIP_LEFT_RIGHT,
-    3: Transpose.ROTATE_180,
-    4: Transpose.FLIP_TOP_BOTTOM,
-    5: Transpose.TRANSPOSE,
-    6: Transpose.ROTATE_270,
-    7: Transpose.TRANSVERSE,
-    8: Transpose.ROTATE_90,
-}
-"""What makes a photo upright, by its EXIF orientation."""
 DRAFT_SCALES = (8, 4, 2)
 """Factors by which libjpeg reduces while it decodes."""
 OVERSAMPLING = 2
@@ -59,23 +48,32 @@ def read_pixels(path: Path, upright: bool = False, size: tuple[int, int] | None 
         InputError: missing, truncated, not an image, or of floating-point pixels; HEIC without the package that reads it.
     """
     existing_file(path)
+    header = read_header(path)
+    orientation = header.orientation if upright and header is not None and not header.alpha else 1
     try:
         data = path.read_bytes()
         if data.startswith(JPEG):
-            return _decode_jpeg(path, data, upright, size)
+            wanted = size[::-1] if size is not None and orientation in QUARTER_TURNS else size
+            return turn_upright(_decode_jpeg(path, data, wanted), orientation)
         if data.startswith(PNG):
             _check_png(path, data)
         # UNCHANGED keeps alpha and 16 bits, and leaves the EXIF rotation alone.
         raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-        if raw is not None and upright and (raw.ndim == 2 or raw.shape[2] < 4):
-            raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     except (cv2.error, OSError) as error:
         raise InputError(path, "", f"an unreadable image ({error})", "a PNG, JPEG or TIFF") from error
     if raw is None and data[8:12] in HEIC:
         return _heic(path, data)
     if raw is None:
         raise InputError(path, "", f"{len(data)} bytes that are no image", "a PNG, JPEG or TIFF", "copy it again")
-    return _rgb8(path, raw)
+    return turn_upright(_rgb8(path, raw), orientation)
+
+
+def turn_upright(image: UInt8[np.ndarray, "H W C"], orientation: int) -> UInt8[np.ndarray, "h w C"]:
+    """A photo as its EXIF orientation says."""
+    image = image.transpose(1, 0, 2) if orientation in QUARTER_TURNS else image
+    image = image[:, ::-1] if orientation in (2, 3, 6, 7) else image
+    image = image[::-1] if orientation in (3, 4, 7, 8) else image
+    return np.ascontiguousarray(image)
 
 
 def image_header(path: Path, upright: bool = False) -> tuple[int, int, bool]:
@@ -97,10 +95,7 @@ def image_header(path: Path, upright: bool = False) -> tuple[int, int, bool]:
     return header.width, header.height, header.alpha
 
 
-def _decode_jpeg(path: Path, data: bytes, upright: bool, size: tuple[int, int] | None) -> UInt8[np.ndarray, "H W 3"]:
-    header = read_header(path)
-    orientation = header.orientation if upright and header is not None else 1
-    wanted = size[::-1] if size is not None and orientation in QUARTER_TURNS else size
+def _decode_jpeg(path: Path, data: bytes, wanted: tuple[int, int] | None) -> UInt8[np.ndarray, "H W 3"]:
     try:
         with JpegImageFile(BytesIO(data)) as image:
             width, height = image.size
@@ -108,9 +103,7 @@ def _decode_jpeg(path: Path, data: bytes, upright: bool, size: tuple[int, int] |
             check_memory(path, "", f"{width}x{height} pixels", 3 * width * height // factor**2)
             image.draft(image.mode, (width // factor, height // factor))
             image.load()
-            straight = image if image.mode == "RGB" else image.convert("RGB")
-            turn = TURNS.get(orientation)
-            return np.array(straight if turn is None else straight.transpose(turn))
+            return np.array(image if image.mode == "RGB" else image.convert("RGB"))
     except DAMAGED as error:
         found = f"an image that was cut short or changed ({error})"
         raise InputError(path, "", found, "a whole JPEG", "copy it again") from error
