@@ -17,7 +17,7 @@ from benchmarks.tables import Rows, medians
 from nerf_lightning.cameras import Cameras, in_other_frame
 from nerf_lightning.capture.poses.geometry import angle_between
 from nerf_lightning.dataset import Scene
-from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.runs.data import seen_by_corrected
 from nerf_lightning.runs.scene_file import load_scene as content_of
 from nerf_lightning.synthetic import corruptions

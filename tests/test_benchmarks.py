@@ -16,7 +16,7 @@ from benchmarks.tables import differences
 from nerf_lightning import kernels
 from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.device import CPU
 from tests.helpers.soft_ball import cameras_around_ball
 

@@ -10,7 +10,7 @@ import torch
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset import Scene, Views, load_npz, plausible, save_npz
-from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.dataset.extent import border_colour
 from nerf_lightning.dataset.plausible import check_scene, off_centre
 from nerf_lightning.dataset.views import Runs

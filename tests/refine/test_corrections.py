@@ -12,7 +12,7 @@ import nerf_lightning as nl
 from nerf_lightning.cameras import Cameras, Rays, in_other_frame
 from nerf_lightning.cli.export import export_transforms
 from nerf_lightning.config.compose import composed
-from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
