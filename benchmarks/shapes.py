@@ -18,10 +18,10 @@ from benchmarks.tables import Rows, named
 from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.run import capture_scene
 from nerf_lightning.capture.tags.layout import TagLayout
-from nerf_lightning.synthetic.solids import bulldozer
 from nerf_lightning.export.mesh import mesh_file, training_views
 from nerf_lightning.export.volume import volume_of
 from nerf_lightning.runs.open import SceneRun, open_scene_run
+from nerf_lightning.synthetic.solids import bulldozer
 from nerf_lightning.utils.device import the_device
 
 PHOTOS, VIEWS = 20, 40

@@ -20,11 +20,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nerf_lightning.dataset import Views, open_scene
-from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
 from nerf_lightning.runs.compact import encode, load_compact
 from nerf_lightning.runs.folder import load_config, load_run, plain_config
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.parsing import read_json, read_npy, read_yaml
 from tests.helpers.colmap_files import write_scene
 

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, look_at, orbit_around
+from nerf_lightning.cameras import Bounds, look_at, orbit_around
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.errors import InputError
+from nerf_lightning.synthetic.objects import make_cameras
 from nerf_lightning.synthetic.solids import bulldozer
 from nerf_lightning.synthetic.tracer import render_view
 from nerf_lightning.utils.memory import check_memory
@@ -19,7 +19,6 @@ RADIUS = 4.0311
 """Distance of every camera from the origin, as in the NeRF paper's Lego scene."""
 FIELD_OF_VIEW_RAD = 0.6911112
 """Horizontal; from the same scene."""
-ORBIT_ELEVATION_RAD = math.radians(30)
 BYTES_PER_POSE = 116
 """With its intrinsics and size."""
 UP = (0.0, 0.0, 1.0)
@@ -34,38 +33,27 @@ def bricks(size: int = 200, train_views: int = 100, val_views: int = 10, orbit_v
         val_views: how many views to hold out, spread likewise, at other directions.
         orbit_views: how many frames the circle around it has.
     """
-    counts = {"size": size, "train_views": train_views, "val_views": val_views, "orbit_views": orbit_views}
-    for key, value in counts.items():
-        if value < 1:
-            raise InputError("bricks", key, str(value), "a whole number of at least 1")
     views = train_views + val_views
     what = f"{views:,} pictures of {size:,}x{size:,} pixels, with a pose each,"
     needed = views * (4 * size**2 + BYTES_PER_POSE) + BYTES_PER_POSE * orbit_views
     check_memory("bricks", "size, train_views, val_views", what, needed)
     aabb = torch.from_numpy(bulldozer().aabb).float()
     centre = aabb.mean(0)
+    orbit = orbit_around(torch.zeros(3), torch.tensor(UP), RADIUS, math.radians(30), orbit_views)
     return Scene(
         name="bricks",
         source=BUILT_IN,
         train=_render_views(_place_cameras(torch.arange(1, train_views + 1)), size),
         val=_render_views(_place_cameras(-torch.arange(1, val_views + 1)), size),
-        orbit=_make_cameras(
-            orbit_around(torch.zeros(3), torch.tensor(UP), RADIUS, ORBIT_ELEVATION_RAD, orbit_views), size
-        ),
+        orbit=make_cameras(orbit, size, size, FIELD_OF_VIEW_RAD),
         bounds=Bounds(centre + 1.02 * (aabb - centre)),
         background=(0.0, 0.0, 0.0),
     )
 
 
 def _render_views(c2w: Float[Tensor, "V 4 4"], size: int) -> Views:
-    cameras = _make_cameras(c2w, size)
+    cameras = make_cameras(c2w, size, size, FIELD_OF_VIEW_RAD)
     return Views.of(torch.from_numpy(np.stack([render_view(cameras, view) for view in range(len(cameras))])), cameras)
-
-
-def _make_cameras(c2w: Float[Tensor, "V 4 4"], size: int) -> Cameras:
-    focal = 0.5 * size / math.tan(0.5 * FIELD_OF_VIEW_RAD)
-    K = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-    return Cameras.of_size(K.repeat(len(c2w), 1, 1), c2w, size, size)
 
 
 def _place_cameras(index: Tensor) -> Float[Tensor, "V 4 4"]:

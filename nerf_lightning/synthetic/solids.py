@@ -59,6 +59,10 @@ def bulldozer() -> Solids:
     model = json.loads(Path(__file__).with_name("bulldozer.json").read_text(encoding="utf-8"))
     kinds, names, *geometry = zip(*((*row, UNTURNED)[:5] for row in model["solids"]), strict=True)
     materials = [model["materials"][name] for name in names]
-    looks = {key: np.array([one[key] for one in materials], np.float32) for key in ("colour", "accent", "period", "gloss")}
+    looks = {
+        key: np.array([one[key] for one in materials], np.float32) for key in ("colour", "accent", "period", "gloss")
+    }
     pattern = np.array([PATTERNS.index(one["pattern"]) for one in materials])
-    return Solids(np.array(kinds) == "cylinder", *(np.array(part, float) for part in geometry), pattern=pattern, **looks)
+    return Solids(
+        np.array(kinds) == "cylinder", *(np.array(part, float) for part in geometry), pattern=pattern, **looks
+    )

@@ -17,9 +17,7 @@ SUPERSAMPLING = 3
 SHADOW_SIZE = 1536
 
 
-def rasterize(
-    solids: Solids, cameras: Cameras, view: int
-) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+def rasterize(solids: Solids, cameras: Cameras, view: int) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
     """The solid seen at each pixel centre of a view (-1 for none) and its depth along the camera's z axis (inf for none).
 
     Each solid is intersected only where its bounding box projects to; all of it must lie before the camera.

@@ -17,8 +17,8 @@ from nerf_lightning.callbacks.render_plan import RenderPlan, allot
 from nerf_lightning.cameras import Rays
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Views
-from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.renderer import Rendered
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.system import NeRF3D, StepStats
 from nerf_lightning.training.train import train
 

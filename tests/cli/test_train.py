@@ -15,10 +15,10 @@ import yaml
 from nerf_lightning.config import conf_dir
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Scene, save_npz
-from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.dataset.scene import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.owner import owned
+from nerf_lightning.synthetic.bricks import bricks
 from tests.helpers.command_line import BARE, popen
 
 ROOT = Path(__file__).resolve().parents[2]

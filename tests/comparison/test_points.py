@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nerf_lightning.comparison.points import compute_points, conditions_of, find_frontier, format_bytes, typical_run
+from nerf_lightning.comparison.points import compute_points, conditions_of, find_frontier, typical_run
 from tests.helpers.run_results import MakeRun
 
 
@@ -74,11 +74,6 @@ def test_compute_points_a_collapsed_seed_counts_as_the_worst(make_run: MakeRun):
     assert compute_points([good[0], collapsed]) == [], "of two runs one is left"
 
 
-@pytest.mark.parametrize("changes", [{"psnr": None}, {"psnr": "high"}, {"train_seconds": 0}, {"train_seconds": [1]}])
-def test_compute_points_a_run_without_figures_makes_none(changes: dict, make_run: MakeRun):
-    assert compute_points([make_run("a", **changes)]) == []
-
-
 def dominated(i: int, costs: list[float], gains: list[float]) -> bool:
     others = zip(costs, gains, strict=True)
     return any(c <= costs[i] and g >= gains[i] and (c < costs[i] or g > gains[i]) for c, g in others)
@@ -101,8 +96,3 @@ def test_compute_points_frontiers_take_seconds_that_differ_by_noise_as_equal(mak
     ((_, points),) = compute_points(runs)
     fronts = dict(zip(points["label"], points["frontier"], strict=True))
     assert fronts == {"b": "train_seconds render_seconds bytes", "c": "", "a": ""}
-
-
-@pytest.mark.parametrize(("size", "words"), [(1.25e6, "1.25 MB"), (1e8, "100 MB"), (340_400, "340 kB"), (20, "0 kB")])
-def test_format_bytes(size: float, words: str):
-    assert format_bytes(size) == words

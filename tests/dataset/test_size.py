@@ -14,13 +14,13 @@ from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, Views, open_scene, save_npz
 from nerf_lightning.dataset import size as size_module
-from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.dataset.shots import Reading, Shot, read_shots
 from nerf_lightning.dataset.size import AutoResize, auto_resize, choose_resize, find_reduced
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.scene_file import load_scene, save_scene
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.device import CPU
 from tests.helpers.colmap_files import write_scene
 

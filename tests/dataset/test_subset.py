@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from nerf_lightning.dataset import Picture, PixelDataModule, RayDataModule
-from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset, thin
+from nerf_lightning.synthetic.bricks import bricks
 
 
 def test_pixel_subset_strips_are_spread():

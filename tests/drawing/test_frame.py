@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.drawing.depth import colorize_depth, depth_limits
 from nerf_lightning.drawing.frame import Style, colours, error_picture
+from nerf_lightning.drawing.panels import colorize_depth, depth_limits
 from nerf_lightning.renderer import Rendered
 
 RED = torch.tensor([1.0, 0.0, 0.0])

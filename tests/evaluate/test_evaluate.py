@@ -14,10 +14,10 @@ import torch
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.evaluate import perceptual
 from nerf_lightning.evaluate.metrics import ViewMetrics, average, format_table
 from nerf_lightning.evaluate.perceptual import perceptual_distance
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.training.train import train
 
 

@@ -10,8 +10,8 @@ from nerf_lightning.callbacks.render_plan import RenderPlan
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, Scene
-from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.errors import InputError
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.training.train import train
 
 OPTIONS = ["+experiment=smoke_3d", "budget.steps=3", "callbacks.orbit=null", "callbacks.snapshots=null", "~logger"]

@@ -9,10 +9,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerf_lightning.cameras import Cameras, orbit_around, resample_path, spiral_like
-from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.camera_path import build_path
 from nerf_lightning.render.path_file import read_path
+from nerf_lightning.synthetic.bricks import bricks
 
 UP = torch.tensor([0.0, 0.6, 0.8])
 CENTRE = torch.tensor([1.0, -2.0, 0.5])

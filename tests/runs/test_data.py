@@ -12,11 +12,11 @@ import yaml
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Views, save_npz
-from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.scene_file import load_scene, save_scene
+from nerf_lightning.synthetic.bricks import bricks
 from tests.helpers.colmap_files import cameras_of, photos, write_colmap
 
 URL = "http://stranger.example/published.npz"

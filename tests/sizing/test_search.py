@@ -1,6 +1,5 @@
 """The command on small scenes, and the ladders."""
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +11,14 @@ import yaml
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.cli.rightsize import describe_scene, rightsize
 from nerf_lightning.config import conf_dir
-from nerf_lightning.config.build import PictureFrame, SceneFrame, build_data, build_system, frame_of
+from nerf_lightning.config.build import PictureFrame, SceneFrame, build_data, build_system
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import VoxelField
 from nerf_lightning.runs.compact import load_compact
 from nerf_lightning.sizing import search
-from nerf_lightning.sizing.ladder import read_ladder
+from nerf_lightning.sizing.choose import read_ladder
 from nerf_lightning.synthetic.objects import PILE, make_scene
 
 RUNGS = [
@@ -89,12 +88,9 @@ def test_rightsize_takes_images_and_any_distance(tmp_path: Path):
     ("overrides", "options", "message"),
     [
         ([], {"psnr": 3.0, "within_db": 1.0}, "one of the two"),
-        ([], {"within_db": -1.0}, "within_db"),
         ([], {"ladder": "none_such"}, "none_such"),
         ([], {"output": Path()}, "in it"),
-        (["threads=0"], {}, "threads"),
         (["budget.second=60"], {}, "budget.seconds"),
-        (["budget.seconds=["], {}, "command line"),
         (["sampler.samples=-1"], {}, "sampler.samples"),
     ],
 )
@@ -144,17 +140,6 @@ def test_configure_rung_counts_steps_whatever_the_budget(given: list[str], steps
     part = search.configure_rung(composed([*given, "budget.patience=1"], tmp_path), [{"width": 8}] * 10, 0)
     assert (part.budget.steps, part.budget.seconds, part.budget.patience) == (steps, None, None)
     assert set(part.callbacks) == {"guard"} and part.logger is None and part.model.width == 8
-
-
-def test_measure_psnr_refuses_field_that_is_not_finite(scene: str, tmp_path: Path):
-    cfg = composed(["dataset=photos", f"dataset.path={scene}", *FAST], tmp_path)
-    data = build_data(cfg)
-    system = build_system(cfg, frame_of(data))
-    assert search.measure_psnr(system, data) > 3
-    for parameter in system.parameters():
-        parameter.data.fill_(math.nan)
-    with pytest.raises(InputError, match="not finite"):
-        search.measure_psnr(system, data)
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (conf_dir() / "ladders").glob("*.yaml")))

@@ -1,7 +1,7 @@
 """Boxes and cylinders, rasterised and shaded; `nerf_lightning.synthetic.tracer` says what they are called with.
 
-Only + - * / and sqrt are used, which IEEE 754 fixes to the last bit, so that images are the same on every machine. Constants are
-single: a double among them would make doubles of all.
+Only + - * / and sqrt are used, which IEEE 754 fixes to the last bit, so that images are the same on every machine. Constants
+are single: a double among them would make doubles of all.
 """
 
 import numpy as np
@@ -157,9 +157,7 @@ def add_colour(solids, shadow, k, point, direction, out):
     for channel in range(3):
         ambient = FLOOR[channel] + (SKY[channel] - FLOOR[channel]) * up
         # A square root stands for the sRGB curve.
-        out[channel] += np.sqrt(
-            min(albedo[channel] * (ambient + KEY_SHARE * key + FILL_SHARE * fill) + highlight, ONE)
-        )
+        out[channel] += np.sqrt(min(albedo[channel] * (ambient + KEY_SHARE * key + FILL_SHARE * fill) + highlight, ONE))
 
 
 @kernel
