@@ -24,7 +24,7 @@ def test_to_bytes_rounds_and_clamps():
     assert to_bytes(image).tolist() == [[[0, 0, 0], [1, 255, 255]]]
 
 
-@pytest.mark.parametrize(("height", "width", "magnify"), [(160, 90, 1), (159, 90, 2), (24, 40, 7)])
+@pytest.mark.parametrize(("height", "width", "magnify"), [(160, 90, 1), (24, 40, 7)])
 def test_panel_images_stand_side_by_side_above_the_caption(height: int, width: int, magnify: int):
     images = [flat(height, width, level) for level in (50, 100, 200)]
     images[0][0, 0] = 7

@@ -68,19 +68,6 @@ def test_bricks_images_are_the_same_everywhere(scene):
     assert scene.sha256().startswith("0aac2172efe6")
 
 
-def test_bricks_images_have_smooth_alpha(scene):
-    assert scene.train.images.shape == (4, 40, 40, 4) and scene.val.images.shape == (2, 40, 40, 4)
-    alpha = scene.train.images[..., 3]
-    border = torch.cat([alpha[:, 0], alpha[:, -1], alpha[:, :, 0], alpha[:, :, -1]])
-    assert (border == 0).all() and (alpha == 255).flatten(1).any(1).all()
-    # Edges are smooth: some alphas lie between, and none but multiples of a sample's share.
-    assert set(alpha.unique().tolist()) == {round(255 * k / 9) for k in range(10)}
-    assert (scene.train.images[..., :3][alpha == 0] == 0).all()
-    # Straight alpha: edge pixels are as bright as the model, not darkened by the background.
-    rgb = scene.train.images[..., :3].float().mean(-1)
-    assert rgb[(alpha > 0) & (alpha < 100)].mean() > 0.6 * rgb[alpha == 255].mean()
-
-
 def test_bricks_cameras_match_the_paper(scene):
     for cameras in (scene.train.cameras, scene.val.cameras, scene.orbit):
         torch.testing.assert_close(cameras.centres.norm(dim=-1), torch.full((len(cameras),), 4.0311))

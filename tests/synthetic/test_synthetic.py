@@ -14,7 +14,6 @@ from nerf_lightning.synthetic.objects import (
     Ball,
     Block,
     make_scene,
-    place_cameras,
     trace_rays,
 )
 from nerf_lightning.synthetic.rooms import ROOMS, make_room_scene
@@ -52,14 +51,6 @@ def test_trace_rays_sees_nearer_body():
     assert distance.tolist() == pytest.approx([2.7]) and index.tolist() == [1]
     colour, distance, _ = trace_rays([far, near], ray([0.0, 0.0, 4.0], [0.0, 0.0, 1.0]))
     assert colour.tolist() == [[0, 0, 0]] and distance.tolist() == [math.inf]
-
-
-def test_place_cameras_stand_apart_and_look_at_origin():
-    train, val = place_cameras(24, 32), place_cameras(4, 32, phase=0.7)
-    centres = torch.cat([train.centres, val.centres])
-    assert torch.cdist(centres, centres).fill_diagonal_(9).min() > 0.2
-    assert torch.allclose(centres.norm(dim=1), torch.tensor(DISTANCE))
-    assert torch.allclose(train.c2w[:, :3, 2], -train.centres / DISTANCE, atol=1e-5)
 
 
 def test_make_scene_shows_ball_at_its_size():
