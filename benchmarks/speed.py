@@ -21,6 +21,8 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.system.growth import follow_resolution, grow_field, next_stage
+from nerf_lightning.system.system import total_loss
 from nerf_lightning.training.train import prepare
 from nerf_lightning.utils.device import CPU, synchronize
 from nerf_lightning.utils.libraries import silence_lightning
@@ -47,6 +49,7 @@ def build(overrides: list[str], device: torch.device = CPU) -> tuple[DictConfig,
         system = build_system(cfg, frame_of(data), device).to(device)
     if not isinstance(system, NeRF3D) or not isinstance(data, RayDataModule):
         raise TypeError("only 3D runs are measured here")
+    follow_resolution(system, data)
     return cfg, data, system
 
 
@@ -56,16 +59,15 @@ def take_step(
     """One step as NeRF3D does it under a Trainer, without Lightning, on the system's device. Returns its seconds."""
     synchronize(system.device)
     start = time.perf_counter()
-    system.progress = progress
-    for group in optimizer.param_groups:
-        group["lr"] = group["initial_lr"] * system.schedule(progress, step)
-    for parameter in system.field.grow(system.ripeness(step)):
-        optimizer.state.pop(parameter, None)
-    system.follow_field(data)
-    batch = data.draw(step).to(system.device)
+    system.state.advance(progress)
+    system.set_learning_rates(optimizer, step)
+    if (stage := next_stage(system, step)) is not None:
+        grow_field(system, data, stage, optimizer)
+    batch, generator = data.draw(step).to(system.device), step_generator(system.seed, Stream.STEP, step, system.device)
     optimizer.zero_grad()
-    loss, system.stats = system.loss(batch, step_generator(system.seed, Stream.STEP, step, system.device), step)
-    loss.backward()
+    system.sampler.update(step, system.field.density, generator)
+    losses, system.stats = system.compute_losses(batch, generator)
+    total_loss(losses).backward()
     optimizer.step()
     assert system.stats.squares is not None  # a NeRF3D's
     data.note_errors(system.stats.squares, system.stats.whole)
@@ -87,7 +89,7 @@ def measure_method(overrides: list[str], device: torch.device) -> Row:
     """One line. Operations and waits are counted step by step over a whole period of the sampler's updates."""
     forget_peak(device)
     cfg, data, system = build(overrides, device)
-    system.sampler.look_through(data.scene.train.cameras)
+    system.sampler.mark_invisible_cells(data.scene.train.cameras)
     optimizer = system.configure_optimizers()
     period = int(cfg.sampler.update_every)
     first = -(-WARMUP // period) * period
@@ -155,7 +157,7 @@ class Alternation(L.Callback):
             optimizer = pl_module.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Optimizer)
             steps = range(step - BLOCK, step)
-            times = [take_step(pl_module, self.data, optimizer, past, pl_module.progress) for past in steps]
+            times = [take_step(pl_module, self.data, optimizer, past, pl_module.state.progress) for past in steps]
             self.bare_blocks.append(fmean(times[:-1]))
             self._starts = []
         self._starts.append(time.perf_counter())
@@ -171,6 +173,7 @@ def measure_overhead(overrides: list[str]) -> dict[str, float]:
     settings = [*overrides, f"budget.steps={steps}", "callbacks.heldout.at=[]", "callbacks.snapshots.steps=[]"]
     cfg, data, system = build(settings)
     own = RayDataModule(data.scene, data.rays, data.samples, cfg.seed)  # the Trainer has drawn its batch
+    follow_resolution(system, own)
     with tempfile.TemporaryDirectory() as folder:
         trainer, alternation = build_trainer(cfg, Path(folder), device_of(cfg)), Alternation(own)
         trainer.callbacks.insert(0, alternation)  # type: ignore[attr-defined]

@@ -13,7 +13,7 @@ from numpy import ndarray
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.drawing.frame import Style, colours, depth_range
 from nerf_lightning.drawing.panels import to_bytes
-from nerf_lightning.renderer import Rendered
+from nerf_lightning.renderer import RenderOutput
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.device import synchronize
 from nerf_lightning.utils.text import subsample
@@ -94,7 +94,7 @@ class Painter:
             if not wanted():
                 return None
             parts.append(self.system.render(rays[start : start + together], wish.near, wish.far, wish.background))
-        rendered = Rendered(
+        rendered = RenderOutput(
             *(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "distance"))
         )
         depths = self.depths() if wish.channel == "depth" else (0.0, 1.0)

@@ -70,7 +70,7 @@ def test_painter_near_and_far_cut_away(painter: Painter):
 def test_painter_stops_when_no_longer_wanted(painter: Painter):
     asked = iter([True, False])
     assert painter.paint(wish(aspect=1.0), 200, lambda: next(asked)) is None
-    assert torch.equal(painter.system.renderer.colour, torch.zeros(3)), "the run's own background is back"
+    assert torch.equal(painter.system.renderer.background.color, torch.zeros(3)), "the run's own background is back"
 
 
 class Browser(viser.ClientHandle):
