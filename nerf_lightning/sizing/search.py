@@ -244,10 +244,9 @@ def find_sampler(cfg: DictConfig, data: Data, system: System, samplers: Sequence
 
 
 def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Data, folder: Path) -> Measured:
-    """Trains a run of its own, with the whole budget, as if nothing else ran beside it. One that is finished is kept, one that
+    """Trains a run of its own, with the whole budget. One that is finished is kept, one that
     was interrupted continues."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
-    whole = set_options(whole, "budget", {"alone": True})
     print(f"{folder}: {', '.join(f'{key}={value}' for key, value in model.items())}, in full", flush=True)
     done, checkpoint = left_of(read_run(folder), whole)
     if done is None:
