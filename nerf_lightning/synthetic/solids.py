@@ -63,6 +63,5 @@ def bulldozer() -> Solids:
         key: np.array([one[key] for one in materials], np.float32) for key in ("colour", "accent", "period", "gloss")
     }
     pattern = np.array([PATTERNS.index(one["pattern"]) for one in materials])
-    return Solids(
-        np.array(kinds) == "cylinder", *(np.array(part, float) for part in geometry), pattern=pattern, **looks
-    )
+    centre, half, axes = (np.array(part, float) for part in geometry)
+    return Solids(np.array(kinds) == "cylinder", centre, half, axes, pattern=pattern, **looks)
