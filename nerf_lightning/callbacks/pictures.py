@@ -112,11 +112,6 @@ def words(psnr_db: float) -> str:
     return "without loss" if psnr_db == math.inf else f"{psnr_db:.2f} dB"
 
 
-def size_of(count: int) -> str:
-    """Bytes in words."""
-    return f"{count / 1e6:.2f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
-
-
 def jpegs(image: Image) -> list[dict[str, Any]]:
     """Quality, size in bytes and PSNR of JPEGs of a picture."""
     found, bgr = [], np.ascontiguousarray(image[..., ::-1])
@@ -159,11 +154,11 @@ class Baselines(L.Callback):
             "jpeg_as_good": min(good, key=lambda one: one["bytes"], default=None),
         }
         write_json(Path(trainer.default_root_dir) / "baselines.json", known(found))
-        text = f"in {size_of(size)} (the picture's pixels have {size_of(image.nbytes)}): JPEG "
+        text = f"in {size / 1e3:,.1f} kB (the picture's pixels have {image.nbytes / 1e3:,.1f} kB): JPEG "
         text += "none that small" if same is None else words(same["psnr"])
         text += f"; shrunk and enlarged by bicubic interpolation {words(small['psnr'])}"
         if good:
-            text += f"; a JPEG as good as the field has {size_of(min(one['bytes'] for one in good))}"
+            text += f"; a JPEG as good as the field has {min(one['bytes'] for one in good) / 1e3:,.1f} kB"
         print(text)
 
 

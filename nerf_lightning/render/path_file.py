@@ -70,12 +70,12 @@ def _check(file: Path, cameras: Cameras) -> None:
     if not len(cameras) or min(cameras.width, cameras.height) < 1:
         found = f"{len(cameras)} views of {cameras.width} x {cameras.height}"
         raise InputError(file, "", found, "at least one view of one pixel")
-    checks.view_size(file, "", cameras.width, cameras.height)
+    checks.check_view_size(file, "", cameras.width, cameras.height)
     R = cameras.c2w[:, :3, :3]
     if not (torch.isfinite(cameras.c2w).all() and torch.isfinite(cameras.K).all()):
         raise InputError(file, "", "numbers that are not finite", "finite poses and intrinsics")
     for K in cameras.K.unique(dim=0):
-        checks.intrinsics(file, "K or fov", K.numpy(), cameras.width, cameras.height)
+        checks.check_intrinsics(file, "K or fov", K.numpy(), cameras.width, cameras.height)
     if not torch.allclose(R @ R.mT, torch.eye(3).expand_as(R), atol=1e-3) or bool((torch.linalg.det(R) < 0).any()):
         raise InputError(file, "", "a pose that is no rotation", "orthonormal rotations, without scale or mirroring")
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras
@@ -87,38 +86,28 @@ def frame_from(scene: Mapping[str, Any], where: object) -> tuple[Frame, Cameras 
     """
     try:
         if "aabb" not in scene:
-            return PictureFrame(*checks.view_size(where, "resolution", *scene["resolution"])), None, None
+            return PictureFrame(*checks.check_view_size(where, "resolution", *scene["resolution"])), None, None
         near, far, pixel = (
-            None if scene[key] is None else checks.number(where, key, scene[key]) for key in ("near", "far", "pixel")
+            None if scene[key] is None else checks.parse_number(where, key, scene[key])
+            for key in ("near", "far", "pixel")
         )
-        checks.near_far(where, near, far)
-        aabb = torch.from_numpy(checks.box(where, "aabb", numbers(where, "aabb", scene["aabb"]))).float()
-        colour = checks.numeric(where, "background", numbers(where, "background", scene["background"]), "3")
-        red, green, blue = colour.tolist()
-        to_source = checks.similarity(where, "to_source", numbers(where, "to_source", scene["to_source"]))
+        checks.check_near_far(where, near, far)
+        aabb = torch.from_numpy(checks.check_box(where, "aabb", scene["aabb"])).float()
+        red, green, blue = checks.parse_array(where, "background", scene["background"], 3).tolist()
+        to_source = checks.check_similarity(where, "to_source", scene["to_source"])
         frame = SceneFrame(Bounds(aabb, bool(scene["unbounded"]), near, far, pixel), (red, green, blue))
         return frame, _read_orbit(where, scene["orbit"]), torch.from_numpy(to_source)
     except (LookupError, TypeError) as error:
         raise InputError(where, "", f"{type(error).__name__}: {error}", WHOLE) from error
 
 
-def numbers(where: object, key: str, value: Any) -> Float[np.ndarray, "..."]:
-    """Lists of numbers as an array.
-
-    Raises:
-        InputError: where they hold anything else, or rows of several lengths.
-    """
-    try:
-        return np.array(value, dtype=np.float64)
-    except (ArithmeticError, TypeError, ValueError) as error:
-        raise InputError(where, key, repr(value)[:60], "numbers, in rows of one length") from error
-
-
 def _read_orbit(where: object, view: Mapping[str, Any]) -> Cameras:
-    width, height = checks.view_size(where, "orbit", view["width"], view["height"])
-    c2w = checks.rigid_poses(where, "orbit.c2w[{}]", numbers(where, "orbit.c2w", view["c2w"]))
-    K = numbers(where, "orbit.K", view["K"])
-    if K.shape != (len(c2w), 3, 3) or not len(c2w):
-        raise InputError(where, "orbit.K", f"shape {K.shape}", f"shape ({len(c2w)}, 3, 3), of at least one view")
-    K = np.stack([checks.intrinsics(where, f"orbit.K[{number}]", one, width, height) for number, one in enumerate(K)])
+    width, height = checks.check_view_size(where, "orbit", view["width"], view["height"])
+    c2w = checks.check_poses(where, "orbit.c2w[{}]", view["c2w"])
+    K = view["K"]
+    if not len(c2w) or len(K) != len(c2w):
+        raise InputError(where, "orbit.K", f"{len(K)} matrices", f"as many as poses, {len(c2w)}, of at least one view")
+    K = np.stack(
+        [checks.check_intrinsics(where, f"orbit.K[{number}]", one, width, height) for number, one in enumerate(K)]
+    )
     return Cameras.of_size(torch.from_numpy(K).float(), torch.from_numpy(c2w).float(), width, height)

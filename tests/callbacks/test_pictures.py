@@ -14,10 +14,10 @@ from nerf_lightning.callbacks import Baselines, Budget, Enlarge, Evaluation, Hel
 from nerf_lightning.callbacks.pictures import curve_chart, error_chart, jpegs, quality_of, shrunk, words
 from nerf_lightning.dataset import Picture, PixelDataModule
 from nerf_lightning.dataset.picture import builtin_picture
-from nerf_lightning.dataset.sources import from_picture
 from nerf_lightning.drawing.panels import narrowed
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import PictureField
+from nerf_lightning.sources import from_picture
 from nerf_lightning.system import NeRF2D, constant
 
 CURVE = [[0.5, 10, 20.0], [1.5, 100, 25.0], [4.0, 300, 31.0]]
