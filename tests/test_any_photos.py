@@ -17,7 +17,6 @@ from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.cli.export import export_compact
 from nerf_lightning.cli.render import render
 from nerf_lightning.dataset import Views
-from nerf_lightning.dataset.views import Runs
 from nerf_lightning.renderer import RenderOutput
 from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
 from nerf_lightning.system import NeRF3D
@@ -88,7 +87,7 @@ def test_run_masked_held_out_photo_does_not_count(folder: Path, tmp_path: Path):
     scene = nl.load_scene(folder)
     mask = scene.val.mask.clone()
     mask[: 24 * 24] = False
-    scene = replace(scene, val=replace(scene.val, known=Runs.of(mask)))
+    scene = replace(scene, val=replace(scene.val, known=mask))
     run = nl.train(scene, steps=4, seed=1, device="cpu", folder=tmp_path / "run", options=QUICK)
     assert np.isfinite(run.psnr) and run.results["psnr_worst_view"] == run.results["psnr"]
     assert len(run.results["curve"]) == 2
