@@ -27,8 +27,8 @@ from nerf_lightning.cli.rightsize import rightsize
 from nerf_lightning.cli.view import view
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.literal import override_of
-from nerf_lightning.dataset import Reading, Scene, open_scene
-from nerf_lightning.dataset.size import AUTO, auto_resize, parse_resize
+from nerf_lightning.dataset import PhotoLoadOptions, Scene, open_scene
+from nerf_lightning.dataset.size import AUTO, auto_resize
 from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.runs.open import open_scene_run
@@ -126,7 +126,7 @@ def load_scene(path: str | Path, resize: int | str | None = AUTO) -> Scene:
     Raises:
         InputError: if there is none, or it is damaged.
     """
-    return open_scene(os.path.abspath(user_path(path)), reading=Reading(parse_resize(resize)))
+    return open_scene(os.path.abspath(user_path(path)), options=PhotoLoadOptions(resize))
 
 
 def load_run(path: str | Path, device: str = "auto") -> Run:
@@ -174,7 +174,7 @@ def train(
     """
     if not isinstance(scene, Scene):
         size = auto_resize(seconds, steps, the_device(device), torch.get_num_threads())
-        scene = open_scene(os.path.abspath(user_path(scene)), reading=Reading(size))
+        scene = open_scene(os.path.abspath(user_path(scene)), options=PhotoLoadOptions(size))
     default = Path("outputs", scene.name, datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
     place = default if folder is None else user_path(folder)
     given = [

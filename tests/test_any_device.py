@@ -115,7 +115,7 @@ def test_steps_on_device_match_steps_on_cpu(variant: str, kind: str, without_dou
 def unbind(system: NeRF3D) -> None:
     """As of a scene with a background."""
     for part in (system.field, system.sampler):
-        part._bounds = replace(part._bounds, unbounded=True)
+        part.bounds = replace(part.bounds, unbounded=True)
 
 
 MOST = {"tensorf": 255, "hashgrid": 255, "voxels": 255, "mlp": 225}
