@@ -30,7 +30,7 @@ def check_page(
         cameras: a map of them.
     """
     worst_first = sorted(photos, key=lambda photo: (-len(photo.troubles), photo.number))
-    shown = [(photo, data_url(photo.small, ".jpg")) for photo in worst_first]
+    shown = [(photo, data_url(photo.small, "jpeg")) for photo in worst_first]
     return render_page(
         HERE / "check.html",
         [HERE / "check.css"],
@@ -39,5 +39,5 @@ def check_page(
         doubts=doubts,
         photos=shown,
         bad=sum(bool(photo.troubles) for photo in photos),
-        map=data_url(cameras, ".png"),
+        map=data_url(cameras, "png"),
     )

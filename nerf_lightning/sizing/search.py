@@ -25,8 +25,16 @@ from nerf_lightning.runs.folder import load_run, plain_config
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.runs.owner import is_empty
 from nerf_lightning.runs.scene_file import scene_content
-from nerf_lightning.sizing.choose import Measured, Target, choose_final, choose_first, choose_second, stop_growing
-from nerf_lightning.sizing.ladder import Ladder, Options
+from nerf_lightning.sizing.choose import (
+    Ladder,
+    Measured,
+    Options,
+    Target,
+    choose_final,
+    choose_first,
+    choose_second,
+    stop_growing,
+)
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.before import left_of
 from nerf_lightning.training.train import prepare, train, warm_up

@@ -10,12 +10,12 @@ import torch
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.dataset import Scene, Views, load_npz, plausible, save_npz
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.extent import border_colour
 from nerf_lightning.dataset.kind import check_visible
 from nerf_lightning.dataset.plausible import check_bounds, check_scene
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.errors import InputError
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.synthetic.corruptions import change_poses, flip_axes, shuffle_poses
 from nerf_lightning.synthetic.objects import MARBLE, PILE, ROD, make_scene
 

@@ -12,11 +12,11 @@ import yaml
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Views, save_npz
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.scene_file import load_scene, save_scene
+from nerf_lightning.synthetic.bricks import bricks
 from tests.helpers.colmap_files import cameras_of, photos, write_colmap
 
 URL = "http://stranger.example/published.npz"
@@ -48,7 +48,7 @@ def again(run: Path, photos: str | None = None) -> Any:
 def published(tmp_path: Path) -> Path:
     path = tmp_path / "data" / "published.npz"
     path.parent.mkdir()
-    save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), path)
+    save_npz(bricks(size=16, train_views=4, val_views=2), path)
     return path
 
 
@@ -66,7 +66,7 @@ def test_downloaded_scene_is_found_from_any_folder(published: Path, tmp_path: Pa
 def test_built_in_scene_is_not_replaced_by_a_download(tmp_path: Path):
     run = a_run(tmp_path / "run", f"dataset.folder={tmp_path}")
     assert again(run).name == "bricks"
-    save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), tmp_path / "published.npz")
+    save_npz(bricks(size=16, train_views=4, val_views=2), tmp_path / "published.npz")
     with pytest.raises(
         InputError, match="found the scene 'published', expected 'bricks', which the run was trained on"
     ):
@@ -79,7 +79,7 @@ def test_resumed_run_of_a_stranger_uses_no_network(small_run: Path, inside, tmp_
     shutil.copytree(small_run, run)
     config = yaml.safe_load((run / "config.yaml").read_text())
     config["dataset"] = {
-        "_target_": "nerf_lightning.dataset.from_download",
+        "_target_": "nerf_lightning.sources.from_download",
         "url": "http://stranger.example/.profile",
         "folder": str(tmp_path),
         "path": None,
@@ -95,7 +95,7 @@ def test_resumed_run_of_a_stranger_uses_no_network(small_run: Path, inside, tmp_
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (5e5, 5.4112e6, 300.0)], ids=["local", "georeferenced"])
 def test_other_photos_are_placed_in_the_frame_of_the_run(shift: tuple[float, float, float], tmp_path: Path):
     """Half of a capture has another middle and another scale than all of it; its cameras still stand where they stood."""
-    whole = bricks(size=16, train_views=12, val_views=2, cache="")
+    whole = bricks(size=16, train_views=12, val_views=2)
     views: Views = whole.train
 
     def capture(name: str, chosen: list[int]) -> str:

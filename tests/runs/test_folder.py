@@ -41,7 +41,6 @@ def test_load_config_takes_what_conf_names(config: dict, tmp_path: Path):
         "builtins.eval",
         "nerf_lightning.utils.files.os.system",  # reachable through the package, but not of it
         "nerf_lightning.dataset.save_npz",  # of the package, but writes wherever it is told to
-        "nerf_lightning.dataset.sources.from_download",
         "nerf_lightning.training.sweep.SweepReport",
         "from_bricks",
         ["nerf_lightning.callbacks.Orbit"],
