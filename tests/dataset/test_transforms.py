@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.cameras import gaze_point, transform
+from nerf_lightning.cameras import transform
 from nerf_lightning.dataset import Scene, load_transforms
 from nerf_lightning.dataset.shots import PhotoLoadOptions
 
@@ -83,16 +83,6 @@ def test_load_transforms_plain_capture_returns_its_views(capture: Path):
     expected = torch.tensor([[140.0, 0, 83], [0, 150, 56], [0, 0, 1]])
     torch.testing.assert_close(scene.train.cameras.K, expected.repeat(10, 1, 1))
     assert not scene.bounds.unbounded and scene.background == (0.0, 0.0, 0.0), "the subject is on plain black"
-
-
-def test_load_transforms_normalises_and_to_source_inverts(capture: Path):
-    scene = load_transforms(capture)
-    train = scene.train.cameras
-    torch.testing.assert_close(gaze_point(train.c2w).float(), torch.zeros(3), atol=1e-2, rtol=0)
-    torch.testing.assert_close(train.centres.norm(dim=-1).median(), torch.tensor(1.0))
-    back = transform(scene.to_source, train.centres)
-    expected = [opengl_pose(0.5 * i)[:3, 3] for i in range(12) if i % 8]
-    np.testing.assert_allclose(back, expected, atol=1e-5)
 
 
 def test_load_transforms_distortion_is_followed(tmp_path: Path):

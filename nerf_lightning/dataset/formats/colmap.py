@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from nerf_lightning.dataset.formats.colmap_model import FILES, find_files, read_model
-from nerf_lightning.dataset.formats.names import exact_file, find_images, list_images, report_missing, walk_images
+from nerf_lightning.dataset.formats.names import exact_file, find_images, keep_present, list_images, walk_images
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.orientation import choose_orientations
 from nerf_lightning.dataset.posed import Hints, build_scene
@@ -81,8 +81,7 @@ def load_colmap(
     names = [image.name for image in images]
     root = find_photo_folder(folder, place, names) if photos is None else photos
     files = find_images(root, names, folder)
-    report_missing(folder, names, files)
-    placed = [(image, file) for image, file in zip(images, files, strict=True) if file is not None]
+    placed = keep_present(folder, images, files)
     found_files = [file for _, file in placed]
     report_unplaced(root, found_files)
     scene_folder = root.parent if root.name in (*PHOTO_FOLDERS, *REDUCED_FOLDERS) else root

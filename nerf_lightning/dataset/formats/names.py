@@ -7,6 +7,7 @@ import re
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import Protocol, TypeVar
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.text import join_truncated
@@ -120,15 +121,24 @@ def _count_shared(wanted: tuple[str, ...], own: tuple[str, ...]) -> int:
     return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def report_missing(where: object, names: Sequence[str], files: Sequence[Path | None]) -> None:
-    """Names the photos that are not there, which are left out."""
-    missing = sorted(name for name, file in zip(names, files, strict=True) if file is None)
-    if 2 * len(missing) > len(names):
+class Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+Photo = TypeVar("Photo", bound=Named)
+
+
+def keep_present(where: object, photos: Sequence[Photo], files: Sequence[Path | None]) -> list[tuple[Photo, Path]]:
+    """The photos whose file is there, and it. A line names the others; InputError if those are the majority."""
+    missing = sorted(photo.name for photo, file in zip(photos, files, strict=True) if file is None)
+    if 2 * len(missing) > len(photos):
         found = f"{missing[0]!r}, which is not there (nor are {len(missing) - 1} more)"
         raise InputError(where, "", found, "at least half of the photos", "is the folder of photos in place?")
     if missing:
         shown = join_truncated(missing, MAX_SHOWN)
-        log.warning("%s: %d of %d photos are not there, %s: left out", where, len(missing), len(names), shown)
+        log.warning("%s: %d of %d photos are not there, %s: left out", where, len(missing), len(photos), shown)
+    return [(photo, file) for photo, file in zip(photos, files, strict=True) if file is not None]
 
 
 def walk_images(root: Path) -> Iterator[Path]:

@@ -11,7 +11,7 @@ import torch
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset.formats.decode import image_header
 from nerf_lightning.dataset.formats.frames import Frame, read_frames, read_optics, read_size
-from nerf_lightning.dataset.formats.names import find_images, fold_name, report_missing
+from nerf_lightning.dataset.formats.names import find_images, fold_name, keep_present
 from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.orientation import choose_orientations
@@ -92,12 +92,6 @@ def load_blender(folder: Path, name: str | None = None, options: PhotoLoadOption
     cameras = None if path is None else make_path(path, shots[0].optics)
     hints = Hints(alpha_background=WHITE, keep_frame=True, path=cameras)
     return build_scene(folder, name or folder.resolve().name, shots, options, parted, hints)
-
-
-def keep_present(file: Path, frames: Sequence[Frame], images: Sequence[Path | None]) -> list[Photo]:
-    """The frames whose photo is there, see `report_missing`."""
-    report_missing(file, [frame.name for frame in frames], images)
-    return [(frame, image) for frame, image in zip(frames, images, strict=True) if image is not None]
 
 
 def read_split(file: Path, content: Mapping[str, Any], names: Sequence[str], present: Sequence[str]) -> Split | None:

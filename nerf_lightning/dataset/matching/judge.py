@@ -108,7 +108,7 @@ def judge_cameras(scene: Scene) -> tuple[list[Doubt], bool]:
         named = join_truncated([scene.train.name(train[view]) for view in lost], MAX_NAMES)
         found = f"{len(lost)} training photos whose poses do not fit the others: {named}"
         return [Doubt(found, "", inexact=True)], True
-    tested = [pair for pair in pairs if pair not in trained]
+    tested = [pair for pair in pairs if max(pair.first, pair.second) >= len(train)]
     held_out = share_explained(Matches.of(tested, cameras), c2w) if has_evidence(tested) else given
     if held_out - chance >= HELD_OUT * (given - chance):
         return [], True
