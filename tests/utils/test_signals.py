@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +17,6 @@ from nerf_lightning.utils.signals import (
     raise_if_signalled,
     received_signal,
 )
-from tests.helpers.command_line import ROOT
 
 
 @pytest.fixture(params=SIGNALS, ids=lambda signum: signum.name)
@@ -45,12 +42,6 @@ def test_deferred_signal_is_raised_after_the_outer_block(signum: int, capfd: pyt
             signal.raise_signal(signum)
         done.append("outer block")
     assert done and capfd.readouterr().err.count("\n") == 1, "says at once that it has heard"
-
-
-def test_deferred_signal_does_not_replace_an_error(signum: int):
-    with handle_signals(), pytest.raises(KeyError), defer_signals():
-        signal.raise_signal(signum)
-        raise KeyError
 
 
 def test_part_of_a_deferring_block_may_be_interrupted(signum: int):
@@ -95,10 +86,3 @@ def test_interrupted_write_leaves_nothing(kind, signum: int, tmp_path: Path):
     with handle_signals(), pytest.raises(Interrupted), kind(tmp_path / "new"):
         signal.raise_signal(signum)
     assert not list(tmp_path.iterdir())
-
-
-def test_import_leaves_handlers_alone():
-    probe = "import signal; before = signal.getsignal(signal.SIGTERM); import nerf_lightning.cli.app;"
-    probe += "assert signal.getsignal(signal.SIGTERM) is before"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    subprocess.run([sys.executable, "-c", probe], env=environment, check=True)
