@@ -1,13 +1,11 @@
 """The photos of a run read back: those it was trained on or none, from anywhere, and never from the network."""
 
-import shutil
 import urllib.request
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-import yaml
 
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
@@ -65,31 +63,13 @@ def test_downloaded_scene_is_found_from_any_folder(published: Path, tmp_path: Pa
 
 def test_built_in_scene_is_not_replaced_by_a_download(tmp_path: Path):
     run = a_run(tmp_path / "run", f"dataset.folder={tmp_path}")
-    assert again(run).name == "bricks"
+    assert again(run).name == "bricks", "and the network is not asked"
     save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), tmp_path / "published.npz")
     with pytest.raises(
         InputError, match="found the scene 'published', expected 'bricks', which the run was trained on"
     ):
         again(run)
     assert again(run, str(tmp_path / "published.npz")).name == "published"
-
-
-def test_resumed_run_of_a_stranger_uses_no_network(small_run: Path, inside, tmp_path: Path):
-    run = tmp_path / "run"
-    shutil.copytree(small_run, run)
-    config = yaml.safe_load((run / "config.yaml").read_text())
-    config["dataset"] = {
-        "_target_": "nerf_lightning.dataset.from_download",
-        "url": "http://stranger.example/.profile",
-        "folder": str(tmp_path),
-        "path": None,
-        "resize": 16,
-    }
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
-    code, _, err = inside(f"resume={run}", "budget.steps=11")
-    assert "the network was asked" not in err
-    assert code == 0, err
-    assert not (tmp_path / ".profile").exists()
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (5e5, 5.4112e6, 300.0)], ids=["local", "georeferenced"])
