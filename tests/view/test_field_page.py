@@ -17,7 +17,7 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.training.train import train
-from nerf_lightning.view.field_page import FieldPage, Visitor, home_of
+from nerf_lightning.view.field_page import FieldPage, Visitor
 from nerf_lightning.view.painter import Painter, Wish
 from tests.helpers.ball_runs import CENTRE, RADIUS, ball_system
 
@@ -65,12 +65,6 @@ def test_painter_near_and_far_cut_away(painter: Painter):
     assert whole is not None and behind is not None and before is not None
     assert behind[20, 30].sum() < whole[20, 30].sum(), "the back of the ball is farther, so darker"
     assert behind[20, 30].any() and not before[15:25, 20:40].any()
-
-
-def test_painter_stops_when_no_longer_wanted(painter: Painter):
-    asked = iter([True, False])
-    assert painter.paint(wish(aspect=1.0), 200, lambda: next(asked)) is None
-    assert torch.equal(painter.system.renderer.colour, torch.zeros(3)), "the run's own background is back"
 
 
 class Browser(viser.ClientHandle):
@@ -142,14 +136,6 @@ def test_field_page_click_shows_the_samples_of_its_ray(page: FieldPage):
     assert f"depth {3 - 0.1 - RADIUS:.1f}" in page.status.content and "opacity 1.00" in page.status.content
 
 
-def test_home_of_is_where_the_orbit_begins():
-    view, distance = home_of(orbit())
-    assert distance == pytest.approx(3.0, rel=1e-3)
-    np.testing.assert_allclose(view.look_at, CENTRE.numpy(), atol=1e-3)
-    np.testing.assert_allclose(view.position, orbit().centres[0].numpy())
-    assert view.fov == pytest.approx(2 * math.atan(12 / 40))
-
-
 SMALL = ["+experiment=smoke_3d", "dataset.size=16", "budget.steps=12", "callbacks.orbit=null", "threads=1", "~logger"]
 
 
@@ -182,9 +168,7 @@ def test_live_shows_progress_stays_open_while_seen_and_leaves_the_training_as_it
     assert all(torch.equal(live[key], alone[key]) for key in alone)
 
 
-def test_live_refuses_an_image_and_a_share_of_one(tmp_path: Path):
-    with pytest.raises(InputError, match="share: found 1.0"):
-        train(composed([*SMALL, "callbacks=live", "callbacks.live.share=1.0"], tmp_path / "a"))
+def test_live_refuses_an_image(tmp_path: Path):
     flat = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=2", "callbacks.orbit=null", "~logger"]
     with pytest.raises(InputError, match="callbacks: found live"):
         train(composed([*flat, "callbacks=live"], tmp_path / "b"))
