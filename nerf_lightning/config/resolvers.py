@@ -27,11 +27,8 @@ def sweep_folder(arguments: Sequence[str]) -> str:
     It is named after the run's name (or else the experiment) and all other options given; flags, Hydra's own settings and
     `overwrite` do not count.
     """
-    given: dict[str, str] = {}
-    for argument in arguments:
-        key, equals, value = argument.lstrip("+").partition("=")
-        if (equals or key.startswith("~")) and not key.startswith(("-", "hydra.", "hydra/")):
-            given[key] = value
+    words = [word.lstrip("+") for word in arguments if not word.startswith("-")]
+    given = dict(word.partition("=")[::2] for word in words if not word.startswith(("hydra.", "hydra/")))
     experiment = given.pop("experiment", "run")
     name = given.pop("name", experiment)
     given.pop("overwrite", None)

@@ -57,20 +57,14 @@ class Viewpoint:
     """Vertical, radians."""
 
 
-def frusta(views: Views, word: str, photo_side: int) -> Iterator[Frustum]:
-    """A frustum for each view.
-
-    Args:
-        views: the photos and their cameras.
-        word: names are this word and the view's number.
-        photo_side: longest side of the photos in pixels.
-    """
+def frusta(views: Views, photo_side: int) -> Iterator[Frustum]:
+    """A frustum for each view, named after its photo, which is reduced to `photo_side` pixels along its longest side."""
     cameras = views.cameras
     for i, (K, c2w) in enumerate(zip(cameras.K.numpy(), cameras.c2w.numpy(), strict=True)):
         width, height = cameras.size(i)
         fov, aspect = 2 * math.atan(height / (2 * K[1, 1])), float(width / K[0, 0] * K[1, 1] / height)
         photo = area_resize(views.image(i).numpy(), *fit_size(width, height, photo_side))
-        yield Frustum(f"{word} {i}", c2w, fov, aspect, photo)
+        yield Frustum(views.name(i), c2w, fov, aspect, photo)
 
 
 def random_rays(cameras: Cameras, view: Int[Tensor, "R"], generator: Generator) -> Rays:

@@ -83,7 +83,7 @@ class Page:
             group = word.replace(" ", "_")
             self.groups[word] = scene.add_frame(f"/{group}", show_axes=False, visible=visible)
             self.names.append(scene.add_frame(f"/{group}/names", show_axes=False, visible=False))
-            for i, frustum in enumerate(frusta(views, word, PHOTO_SIDE)):
+            for i, frustum in enumerate(frusta(views, PHOTO_SIDE)):
                 wxyz = SO3.from_matrix(frustum.c2w[:3, :3].astype(np.float64)).wxyz
                 position = frustum.c2w[:3, 3]
                 handle = scene.add_camera_frustum(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.render.video import check_output, write_video
+from nerf_lightning.render.video import write_video
 
 COLOURS = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
 
@@ -65,19 +65,3 @@ def test_write_video_folder_keeps_its_frames(tmp_path: Path):
     assert write_video({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 3
     with pytest.raises(InputError, match="something else in it"):
         write_video({"what": 2}, plain, 3, tmp_path / "frames", fps=10)
-
-
-@pytest.mark.parametrize(
-    ("name", "transparent", "message"),
-    [
-        ("film.avi", False, "a name ending in .gif, .mp4, .webp, or a folder"),
-        ("film.gif", True, "transparent for .gif"),
-        ("taken", False, "a file, expected a folder for PNGs"),
-        ("folder.gif", False, "a folder, expected a file"),
-    ],
-)
-def test_check_output_refuses_what_cannot_be_written(name: str, transparent: bool, message: str, tmp_path: Path):
-    (tmp_path / "taken").write_text("")
-    (tmp_path / "folder.gif").mkdir()
-    with pytest.raises(InputError, match=message):
-        check_output(tmp_path / name, transparent)

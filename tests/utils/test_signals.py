@@ -3,11 +3,9 @@
 import os
 import signal
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from nerf_lightning.utils.files import atomic, atomic_folder
 from nerf_lightning.utils.signals import (
     SIGNALS,
     Interrupted,
@@ -79,10 +77,3 @@ def test_command_line_exits_with_a_line(error: type[Exception] | None, signum: i
     assert end.value.code == 128 + signum
     line = capsys.readouterr().err
     assert signal.Signals(signum).name in line and line.count("\n") == 1 and ("resume it" in line) == (error is None)
-
-
-@pytest.mark.parametrize("kind", [atomic, atomic_folder])
-def test_interrupted_write_leaves_nothing(kind, signum: int, tmp_path: Path):
-    with handle_signals(), pytest.raises(Interrupted), kind(tmp_path / "new"):
-        signal.raise_signal(signum)
-    assert not list(tmp_path.iterdir())

@@ -26,8 +26,8 @@ def off_centre(views: Views) -> Views:
 
 
 def test_frusta_are_where_the_cameras_are(scene: Scene):
-    drawn = list(frusta(scene.train, "training", 8))
-    assert [f.name for f in drawn] == ["training 0", "training 1", "training 2", "training 3"]
+    drawn = list(frusta(scene.train, 8))
+    assert [f.name for f in drawn] == ["photo 0", "photo 1", "photo 2", "photo 3"]
     for frustum, c2w, K in zip(drawn, scene.train.cameras.c2w, scene.train.cameras.K, strict=True):
         assert np.array_equal(frustum.c2w, c2w.numpy())
         assert frustum.fov == pytest.approx(2 * math.atan(8 / float(K[1, 1])))
@@ -83,7 +83,7 @@ def test_overview_sees_all_cameras_and_the_box(scene: Scene):
 
 
 def test_through_a_frustum_looks_as_its_camera_did(scene: Scene):
-    frustum = next(frusta(scene.train, "training", 8))
+    frustum = next(frusta(scene.train, 8))
     view = through(frustum, 4.0, np.array([0.0, 0.0, 1.0], np.float32))
     right, down, ahead, centre = scene.train.cameras.c2w[0, :3].T.numpy()
     np.testing.assert_allclose(view.position, centre)

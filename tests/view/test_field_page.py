@@ -110,23 +110,6 @@ def test_field_page_sends_coarse_then_finer_images_then_rests(page: FieldPage):
     assert not page.paint()
 
 
-def test_field_page_is_coarse_again_after_a_movement(page: FieldPage):
-    browser = Browser()
-    page._welcome(browser)
-    (visitor,) = page.visitors.values()
-    while page.paint():
-        pass
-    browser.camera.position = browser.camera.position + np.array([0.0, 0.5, 0.0])
-    page._want(visitor)
-    page.painter.rate = 1.0
-    assert page.paint()
-    assert browser.pictures[-1].shape[1] == 24
-    version = visitor.version
-    page.painter.paint = lambda wish, side, wanted: page._want(visitor)  # type: ignore[method-assign,assignment]
-    assert page.paint(), "moved on while it was painted: nothing is sent, and there is more to do"
-    assert visitor.version == version + 1 and visitor.side == 0
-
-
 def test_field_page_click_shows_the_samples_of_its_ray(page: FieldPage):
     page.click((3.0, -0.2, 0.05), (-2.0, 0.0, 0.0))
     page.paint()

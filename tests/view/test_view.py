@@ -129,16 +129,3 @@ def test_view_ends_with_ctrl_c_and_writes_nothing(scene: Scene, tmp_path: Path):
         process.communicate(timeout=60)
     assert process.returncode in (0, 130)
     assert list(tmp_path.iterdir()) == [tmp_path / "small.npz"]
-
-
-@pytest.mark.parametrize(
-    ("path", "given", "message"),
-    [
-        ("nowhere", {}, "nowhere: found nothing there"),
-        ("a.npz", {"holdout": 1}, "holdout: found 1"),
-        ("a.npz", {"port": 70000}, "port: found 70000"),
-    ],
-)
-def test_view_bad_input_is_refused(path: str, given: dict[str, int], message: str):
-    with pytest.raises(InputError, match=message):
-        view(Path(path), **given)

@@ -18,7 +18,7 @@ from nerf_lightning.dataset.bricks.model import bulldozer
 from nerf_lightning.dataset.bricks.trace import picture, shadow
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.errors import InputError, Unwritable
+from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.utils.files import atomic, cache_folder
 from nerf_lightning.utils.memory import check_memory
 
@@ -120,5 +120,5 @@ def _save(path: Path, train: np.ndarray, val: np.ndarray) -> None:
     try:
         with atomic(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, images_train=train, images_val=val)
-    except (OSError, Unwritable) as error:
+    except (OSError, NoRoom) as error:
         warnings.warn(f"the built-in scene is not cached, the next run traces it again: {error}", stacklevel=3)
