@@ -69,10 +69,14 @@ def has_run(path: Path) -> bool:
     import zipfile
 
     path = path.expanduser()
+    if is_run(path) or path.absolute() == OUTPUTS.absolute():
+        return True
     if not path.is_file():
-        return path.absolute() == OUTPUTS.absolute() or any(is_run(file.parent) for file in path.rglob("config.yaml"))
+        scene = any(path.glob("transforms*.json")) or any((path / name).exists() for name in ("images", "sparse"))
+        return not scene and any(is_run(file.parent) for file in path.rglob("config.yaml"))
     try:
-        return "header.npy" in zipfile.ZipFile(path).namelist()
+        with zipfile.ZipFile(path) as file:
+            return "header.npy" in file.namelist()
     except (OSError, zipfile.BadZipFile):  # whatever reads it says what is wrong
         return False
 

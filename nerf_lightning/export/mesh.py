@@ -66,13 +66,6 @@ def colours_at(system: NeRF3D, places: Float[Tensor, "N 3"], outwards: Float[Ten
     return to_bytes(torch.cat([torch.zeros(0, 3), *parts]))
 
 
-def upright(run: SceneRun) -> Float[ndarray, "4 4"]:
-    """The rotation from the photos' frame, whatever is up in it, to the scene's, whose z axis points up."""
-    turn = np.eye(4)
-    turn[:3, :3] = np.linalg.inv(run.to_source[:3, :3].numpy()) * run.scale
-    return turn
-
-
 def coloured_mesh(
     run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None
 ) -> tuple["trimesh.Trimesh", Surface]:
@@ -92,7 +85,7 @@ def coloured_mesh(
 def mesh_file(run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None, suffix: str) -> Shape:
     """A coloured mesh as .ply, .obj or .glb; its triangles alone as .stl."""
     mesh, surface = coloured_mesh(run, cameras, volume, threshold)
-    content, offset = encode_mesh(mesh, suffix, upright(run))
+    content, offset = encode_mesh(mesh, suffix, run.to_source[:3, :3].T.numpy() / run.scale)
     words = [
         f"{len(mesh.faces):,} triangles",
         "watertight" if mesh.is_watertight else "with open edges",

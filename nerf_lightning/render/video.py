@@ -70,9 +70,10 @@ def write_video(plan: dict[str, Any], draw: Callable[[int], Image], count: int, 
     for index in tracked(missing, len(missing), "frames"):
         image = draw(index)
         if index == missing[0]:  # nothing is left of a video of which not even a frame can be drawn
+            if output.suffix == ".webp":  # whose writer keeps all frames in memory
+                needed = 4 * count * image[..., 0].size
+                check_memory("render", "frames", f"{count:,} frames", needed, "give less, or -o FILE.mp4")
             write_json(folder / PLAN, plan)
-            needed = image.size * count if output.suffix == ".webp" else 0  # its writer keeps all frames in memory
-            check_memory("render", "frames", f"{count:,} frames", needed, "give less, or -o FILE.mp4")
         with atomic(files[index]) as temporary:
             imageio.imwrite(temporary, image, compress_level=1)
     if output.suffix:

@@ -104,7 +104,8 @@ def test_announce_says_who_can_see_the_page_and_refuses_another_machines_address
 def test_has_run_tells_runs_from_scenes(scene: Scene, small_run: Path, tmp_path: Path):
     save_npz(scene, tmp_path / "scene.npz")
     shutil.copytree(small_run, tmp_path / "runs" / "first")
-    (tmp_path / "photos").mkdir()
+    shutil.copytree(small_run, tmp_path / "photos" / "outputs" / "first")
+    (tmp_path / "photos" / "transforms.json").touch()
     np.savez(tmp_path / "compact.npz", header=np.zeros(3, np.uint8))
     (tmp_path / "damaged.npz").write_bytes((tmp_path / "scene.npz").read_bytes()[:-30])
     expected = {"scene.npz": False, "runs": True, "runs/first": True, "photos": False, "compact.npz": True}
