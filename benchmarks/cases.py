@@ -125,7 +125,7 @@ def sparse(field: VoxelField) -> None:
     """Leaves out some of a field's vertices, and gives the others something to tell."""
     keep = torch.rand(len(field.index)) > GONE
     rows = 1 + int(keep.sum())
-    field.hold(keep, [torch.randn(rows, *table.shape[1:]) for table in field.tables])
+    field.set_vertices(keep, [torch.randn(rows, *table.shape[1:]) for table in field.tables])
 
 
 @torch.no_grad()

@@ -13,6 +13,7 @@ from benchmarks.speed import build, take_step
 from nerf_lightning.config.build import build_trainer, device_of
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.system.growth import follow_resolution
 
 BLOCK = 32
 """Steps in a row of one kind: two rounds of the occupancy grid, short against a machine's moods."""
@@ -40,7 +41,7 @@ class Alternation(L.Callback):
             optimizer = pl_module.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Optimizer)
             steps = range(step - BLOCK, step)
-            times = [take_step(pl_module, self.data, optimizer, past, pl_module.progress) for past in steps]
+            times = [take_step(pl_module, self.data, optimizer, past, pl_module.state.progress) for past in steps]
             self.bare_blocks.append(fmean(times[:-1]))
             self._starts = []
         self._starts.append(time.perf_counter())
@@ -58,6 +59,7 @@ def measure_overhead(overrides: list[str]) -> dict[str, float]:
     own = RayDataModule(
         data.scene, rays=data.rays, samples=data.samples, seed=cfg.seed
     )  # the Trainer has drawn its batch
+    follow_resolution(system, own)
     with tempfile.TemporaryDirectory() as folder:
         trainer, alternation = build_trainer(cfg, Path(folder), device_of(cfg)), Alternation(own)
         trainer.callbacks.insert(0, alternation)  # type: ignore[attr-defined]

@@ -23,6 +23,8 @@ from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import RayDataModule, Views
 from nerf_lightning.dataset.resize import resize_views
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.system.growth import follow_resolution, grow_field, next_stage
+from nerf_lightning.system.system import total_loss
 from nerf_lightning.training.train import prepare
 from nerf_lightning.utils.device import CPU, synchronize
 from nerf_lightning.utils.libraries import silence_lightning
@@ -51,6 +53,7 @@ def build(overrides: list[str], device: torch.device = CPU) -> tuple[DictConfig,
         system = build_system(cfg, frame_of(data), device).to(device)
     if not isinstance(system, NeRF3D) or not isinstance(data, RayDataModule):
         raise TypeError("only 3D runs are measured here")
+    follow_resolution(system, data)
     return cfg, data, system
 
 
@@ -60,16 +63,15 @@ def take_step(
     """One step as NeRF3D does it under a Trainer, without Lightning, on the system's device. Returns its seconds."""
     synchronize(system.device)
     start = time.perf_counter()
-    system.progress = progress
-    for group in optimizer.param_groups:
-        group["lr"] = group["initial_lr"] * system.schedule(progress, step)
-    for parameter in system.field.grow(system.ripeness(step)):
-        optimizer.state.pop(parameter, None)
-    system.follow_field(data)
-    batch = data.draw(step).to(system.device)
+    system.state.advance(progress)
+    system.set_learning_rates(optimizer, step)
+    if (stage := next_stage(system, step)) is not None:
+        grow_field(system, data, stage, optimizer)
+    batch, generator = data.draw(step).to(system.device), step_generator(system.seed, Stream.STEP, step, system.device)
     optimizer.zero_grad()
-    loss, system.stats = system.loss(batch, step_generator(system.seed, Stream.STEP, step, system.device), step)
-    loss.backward()
+    system.sampler.update(step, system.field.density, generator)
+    losses, system.stats = system.compute_losses(batch, generator)
+    total_loss(losses).backward()
     optimizer.step()
     assert system.stats.squares is not None  # a NeRF3D's
     data.note_errors(system.stats.squares, system.stats.whole)
@@ -91,7 +93,7 @@ def measure_method(overrides: list[str], device: torch.device) -> Row:
     """One line. Operations and waits are counted step by step over a whole period of the sampler's updates."""
     forget_peak(device)
     cfg, data, system = build(overrides, device)
-    system.sampler.look_through(data.scene.train.cameras)
+    system.sampler.mark_invisible_cells(data.scene.train.cameras)
     optimizer = system.configure_optimizers()
     period = int(cfg.sampler.update_every)
     first = -(-WARMUP // period) * period

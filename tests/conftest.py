@@ -58,7 +58,6 @@ from torch.nn.functional import normalize
 from benchmarks.synthetic.photos import Flaws, Truth, write_capture
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import use_kernels
-from nerf_lightning.kernels.cpu import apart
 from tests.helpers.fake_device import device, without_doubles  # noqa: F401  (fixtures)
 from tests.helpers.shared_fixtures import make_once, shared_folder
 
@@ -88,7 +87,6 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
 def kernels_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
     """On a new machine each kernel is compiled by one test process, itself; the others wait and load what it has cached."""
     compile, folder = Dispatcher.compile, shared_folder(tmp_path_factory)
-    apart.ask = lambda dispatcher, signature: None
 
     def compile_once(self: Dispatcher, signature: object) -> object:
         # One lock object a file: a kernel that needs itself in another signature does not wait for itself.

@@ -11,9 +11,11 @@ import torch
 from benchmarks.count import Count
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.system import NeRF3D
+from nerf_lightning.system.system import total_loss
 from nerf_lightning.utils.seeding import Stream, step_generator
 from tests.helpers.device_runs import SAMPLERS, SCENES, options, stepped, system_of
 from tests.helpers.fake_device import NAME
+from tests.helpers.growth import grow
 from tests.helpers.train_models import SCENE
 
 VARIANTS = {
@@ -70,12 +72,13 @@ def test_step_on_device_needs_few_operations_and_no_wait(name: str, device: torc
     system, period, counts = system.to(device), system.sampler.update_every, []
     optimizer = system.configure_optimizers()
     for step in range(2 * period):
-        for parameter in system.field.grow(0.9):
-            optimizer.state.pop(parameter, None)
+        grow(system.field, 0.9)
         batch = data.draw(step).to(device)
         with Count() as count:
-            loss, stats = system.loss(batch, step_generator(0, Stream.STEP, step, device), step)
-            loss.backward()
+            generator = step_generator(0, Stream.STEP, step, device)
+            system.sampler.update(step, system.field.density, generator)
+            losses, stats = system.compute_losses(batch, generator)
+            total_loss(losses).backward()
             optimizer.step()
             optimizer.zero_grad()
         if stats.counted:
@@ -105,11 +108,11 @@ def test_rays_beyond_room_do_not_train(device: torch.device, tmp_path: Path):
     stepped(system.to(device), data, 2, device)
     batch, sampler = data.draw(2).to(device), system.sampler
     sampler.update(2, system.field.density, step_generator(0, Stream.STEP, 2, device))
-    before = sampler.per_ray
+    before = sampler.counts_per_ray
     assert before is not None, "there is room for as many as were counted"
 
     def drawn(per_ray: tuple[float, float] | None) -> Any:
-        sampler.per_ray = per_ray
+        sampler.counts_per_ray = per_ray
         return sampler(batch.rays, system.field.density, step_generator(0, Stream.STEP, 2, device))
 
     with torch.no_grad():
@@ -123,9 +126,10 @@ def test_rays_beyond_room_do_not_train(device: torch.device, tmp_path: Path):
     assert torch.equal(tight.t[: ends[int(whole.sum())]].cpu(), counted.t[: ends[int(whole.sum())]].cpu())
 
     def loss(pixels: torch.Tensor) -> float:
-        sampler.per_ray = (before[0], 0.4 * before[1])
+        sampler.counts_per_ray = (before[0], 0.4 * before[1])
         changed = replace(batch, pixels=pixels)
-        return float(system.loss(changed, step_generator(0, Stream.STEP, 2, device), 2)[0].detach())
+        losses, _ = system.compute_losses(changed, step_generator(0, Stream.STEP, 2, device))
+        return float(total_loss(losses).detach())
 
     others = batch.pixels.clone()
     others[~tight.whole] = 255 - others[~tight.whole]

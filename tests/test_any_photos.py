@@ -18,7 +18,7 @@ from nerf_lightning.cli.export import export_compact
 from nerf_lightning.cli.render import render
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
-from nerf_lightning.renderer import Rendered
+from nerf_lightning.renderer import RenderOutput
 from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.view.drawing import frusta
@@ -101,10 +101,10 @@ def test_run_nan_pictures_is_collapsed(
     """As where weights are finite and what they add up to is not; or where corrections of cameras are not either."""
     render_well = NeRF3D.render
 
-    def render_badly(self: NeRF3D, *given: Any) -> Rendered:
+    def render_badly(self: NeRF3D, *given: Any) -> RenderOutput:
         rendered = render_well(self, *given)
         if cameras_too and self.corrections is not None:
-            self.corrections.motions.data.fill_(torch.nan)
+            self.corrections.poses.motions.data.fill_(torch.nan)
         return replace(rendered, rgb=rendered.rgb * torch.nan)
 
     monkeypatch.setattr(NeRF3D, "render", render_badly)
@@ -112,7 +112,7 @@ def test_run_nan_pictures_is_collapsed(
     options = [*QUICK, "refine=both"] if cameras_too else QUICK
     run = nl.train(nl.load_scene(folder), steps=4, seed=1, device="cpu", folder=tmp_path / "run", options=options)
     found = run.results
-    told = "corrections.motions is no longer finite" if cameras_too else "what is rendered is not finite"
+    told = "corrections.poses.motions is no longer finite" if cameras_too else "what is rendered is not finite"
     assert found["status"] == "collapsed" and told in found["diagnosis"]
     assert found["psnr"] is None and found["psnr_aligned"] is None and found["curve"] == []
     assert found["corrections"] is None

@@ -12,6 +12,7 @@ from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.system import NeRF2D, NeRF3D, System
+from nerf_lightning.system.system import total_loss
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.seeding import Stream, step_generator
 from tests.helpers.command_line import BARE
@@ -47,7 +48,7 @@ def take_a_step(cfg: DictConfig) -> System:
     system = build_system(cfg, frame_of(data))
     batch, optimizer = data.draw(0), system.configure_optimizers()
     if isinstance(system, NeRF3D):
-        loss, _ = system.loss(batch, step_generator(0, Stream.STEP, 0), 1)
+        loss = total_loss(system.compute_losses(batch, step_generator(0, Stream.STEP, 0))[0])
     else:
         assert isinstance(system, NeRF2D)
         loss = system.loss(batch)
@@ -123,7 +124,14 @@ def test_run_leaves_results_pictures_checkpoints_and_curves(tmp_path: Path):
     (file,) = tmp_path.glob("events.out.tfevents.*")
     events = EventAccumulator(str(file)).Reload()
     scalars = set(events.Tags()["scalars"])
-    assert {"val/psnr", "val/ssim", "loss/rgb", "train/psnr", "speed/rays_per_second", "speed/train_seconds"} < scalars
+    assert {
+        "val/psnr",
+        "val/ssim",
+        "loss/photometric",
+        "train/psnr",
+        "speed/rays_per_second",
+        "speed/train_seconds",
+    } < scalars
     assert {name.partition("/")[0] for name in scalars} == {"loss", "lr", "speed", "train", "val"}
     assert events.Scalars("val/psnr")[-1].step == 60 and events.Tags()["images"] == ["images/view"]
     assert not list(tmp_path.glob("**/.*")), "no temporary file stays behind"

@@ -1,32 +1,24 @@
 """Budget: how long to train, by the steps or by the clock, and the clock itself."""
 
-import math
-import time
-from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from statistics import fmean
 from typing import Any
 
 import lightning as L
-import torch
 
 from nerf_lightning.callbacks.attached import agreed, attached, data_of
 from nerf_lightning.callbacks.plateau import HALF_AGAIN, Plateau
 from nerf_lightning.callbacks.render_plan import MIN_SECONDS, RenderPlan
 from nerf_lightning.dataset.subset import thin
 from nerf_lightning.errors import InputError
-from nerf_lightning.system import System
-from nerf_lightning.utils.device import CPU, synchronize
-from nerf_lightning.utils.machine import Load, work_clocks
+from nerf_lightning.system import System, TrainingState
+from nerf_lightning.utils.options import Count, Positive
 from nerf_lightning.utils.signals import defer_signals
 from nerf_lightning.utils.text import subsample
 
 LOOK_AT, LOOK_PIXELS = 3, 1 << 16
 """Held-out views rendered to look for a plateau, and about the most pixels of each."""
-RECENT, UNDISTURBED = 20, 0.1
-"""With `alone`: steps that are looked back on, and the share of them that other work never disturbs: each time it has a core in
-between, it leaves this process's data out of the caches too."""
 COOLING = 0.15
 """Cooling down after a plateau takes this share of what was spent up to it."""
 
@@ -51,40 +43,30 @@ class Budget(L.Callback):
         alone: whether seconds are those the machine would need without other work.
 
     Raises:
-        InputError: where steps and seconds are None, or one of the three is not positive and finite.
+        InputError: where steps and seconds are None.
     """
 
     def __init__(
         self,
-        steps: int | None = None,
-        seconds: float | None = None,
-        patience: float | None = None,
+        steps: Count | None = None,
+        seconds: Positive | None = None,
+        patience: Positive | None = None,
         alone: bool = False,
     ):
         if steps is None and seconds is None:
             raise InputError("budget", "", "neither steps nor seconds", "budget.steps=N or budget.seconds=S")
-        for key, value in (("steps", steps), ("seconds", seconds), ("patience", patience)):
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"budget.{key}", "", str(value), "more than 0, and finite")
         self.steps = steps
         self.limit_seconds = seconds
         self.plateau = Plateau(patience) if patience is not None else None
+        self.alone = alone
+        self.state = TrainingState()
+        """The system's, from `setup` on."""
         self.stopped: dict[str, float] | None = None
         """The plateau that ends the run: its `seconds` and `step`, and `rest_db`, what the rest of the budget would add."""
         self._line = (0.0, 0.0, 1.0)
         """Progress is a line over the share spent: (start, progress there, slope)."""
-        self._before = 0.0  # spent up to the last pause or restart
-        self._since: float | None = None
-        self.began = False
-        """Whether training has begun, or gone on."""
-        self._device = CPU
-        self._alone = alone
-        self._worked = (0.0, 0.0)  # `work_clocks` when the step began
-        self._took: deque[float] = deque(maxlen=RECENT)  # work of the last steps, seconds
         self.plan = RenderPlan()
         """Of what is rendered beside training."""
-        self.load = Load()
-        """CPU use of this process and of others while the clock ran."""
 
     @staticmethod
     def of(trainer: L.Trainer) -> "Budget":
@@ -97,21 +79,7 @@ class Budget(L.Callback):
     @property
     def seconds(self) -> float:
         """Seconds trained so far."""
-        if self._since is None or self._by_step:
-            return self._before
-        return self._before + time.perf_counter() - self._since
-
-    @property
-    def _by_step(self) -> bool:
-        """Whether the clock goes on by what a step takes undisturbed."""
-        return self._alone and self._device.type == "cpu"
-
-    def _count_step(self) -> None:
-        """Lets that clock go on by a step."""
-        now = work_clocks(torch.get_num_threads())
-        self._took.append(max(a - b for a, b in zip(now, self._worked, strict=True)))
-        self._worked = now
-        self._before += sorted(self._took)[round(UNDISTURBED * (len(self._took) - 1))]
+        return self.state.clock.seconds
 
     def spent(self, step: int) -> float:
         """Fraction of the limits spent after `step` steps."""
@@ -138,16 +106,9 @@ class Budget(L.Callback):
         end = min(1.0, start + (1 - reached) / slope)
         return max(0.0, end - spent) * self.seconds / spent if spent else None
 
-    @contextmanager
-    def paused(self) -> Iterator[None]:
+    def paused(self) -> AbstractContextManager[None]:
         """Stops the clock for work that is not training."""
-        running = self._since is not None
-        self._stop()
-        try:
-            yield
-        finally:
-            if running:
-                self._start()
+        return self.state.clock.paused()
 
     @contextmanager
     def rendering(self, trainer: L.Trainer, subject: str) -> Iterator[None]:
@@ -156,38 +117,28 @@ class Budget(L.Callback):
         with self.paused(), self.plan.rendering(subject), defer_signals(False) if alone else nullcontext():
             yield
 
-    def _start(self) -> None:
-        synchronize(self._device)
-        self.load.start()
-        self._since, self._worked = time.perf_counter(), work_clocks(torch.get_num_threads())
-
-    def _stop(self) -> None:
-        synchronize(self._device)  # work still queued on the device counts as training
-        self._before, self._since = self.seconds, None
-        self.load.stop()
-
     def shared_progress(self, trainer: L.Trainer) -> float:
         """`progress`, the same in all processes of a run."""
         progress = self.progress(trainer.global_step)
         return progress if self.limit_seconds is None else agreed(trainer, progress)
 
+    def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
+        self.state = pl_module.state
+
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        self._device, pl_module.paused, self.began = pl_module.device, self.paused, True
-        trainer.should_stop = (
-            self.shared_progress(trainer) >= 1.0
-        )  # a finished run that is resumed has nothing left to do
-        self._start()
+        # A finished run that is resumed has nothing left to do.
+        trainer.should_stop = self.shared_progress(trainer) >= 1.0
+        self.state.clock.start(pl_module.device, by_work=self.alone)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        pl_module.progress = self.shared_progress(trainer)
+        self.state.advance(self.shared_progress(trainer))
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        if self._by_step:
-            self._count_step()
-        pl_module.progress = self.shared_progress(trainer)
-        if self.plateau is not None and self.stopped is None and pl_module.progress < 1.0:
+        self.state.clock.count_step()
+        self.state.advance(self.shared_progress(trainer))
+        if self.plateau is not None and self.stopped is None and self.state.progress < 1.0:
             self._look_for_plateau(trainer, pl_module, self.plateau)
-        if pl_module.progress >= 1.0:
+        if self.state.progress >= 1.0:
             trainer.should_stop = True
 
     def _look_for_plateau(self, trainer: L.Trainer, system: System, plateau: Plateau) -> None:
@@ -203,13 +154,14 @@ class Budget(L.Callback):
         flat = plateau.note(spent, quality)
         if not agreed(trainer, flat):
             return
-        if system.progress < system.field.grown_after:
-            reached = system.field.grown_after
+        growth = getattr(system.field, "growth", None)  # a picture's has none
+        if growth is not None and self.state.progress < growth.end:
+            reached = growth.end
             self._line = (spent, reached, (1 - reached) / (1 - spent))
             plateau.start()
             return
         rest, again = plateau.gain(1 / spent) or 0.0, plateau.gain(HALF_AGAIN) or 0.0
-        self._line = (spent, system.progress, (1 - system.progress) / (COOLING * spent))
+        self._line = (spent, self.state.progress, (1 - self.state.progress) / (COOLING * spent))
         self.stopped = {"seconds": round(self.seconds, 3), "step": step, "rest_db": round(rest, 3)}
         print(
             f"budget: plateau after {self.seconds:.1f} s: half as much time again would bring {again:.2f} dB, the rest of the"
@@ -218,7 +170,7 @@ class Budget(L.Callback):
         )
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        self._stop()
+        self.state.clock.stop()
 
     def state_dict(self) -> dict[str, Any]:
         return {
@@ -230,6 +182,7 @@ class Budget(L.Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         start, reached, slope = state_dict["line"]
-        self._before, self._line, self.stopped = state_dict["seconds"], (start, reached, slope), state_dict["stopped"]
+        self._line, self.stopped = (start, reached, slope), state_dict["stopped"]
+        self.state.clock.set_seconds(state_dict["seconds"])
         if self.plateau is not None and state_dict["plateau"] is not None:
             self.plateau.load(state_dict["plateau"])

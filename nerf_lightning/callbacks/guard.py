@@ -94,12 +94,13 @@ class Guard(L.Callback):
                 self._cap_learning_rate(trainer, pl_module)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        pl_module.rate = self.rate
+        scale = self.rate
         start_step = self.monitor.history.start_step
         if start_step and self.rate < 1:
             warmup = min(1.0, (trainer.global_step - start_step + 1) / RESTART_WARMUP_STEPS)
-            done = (pl_module.progress - self.restart_progress) / max(1 - self.restart_progress, 1e-6)
-            pl_module.rate *= warmup * RESTART_LR_DECAY**done
+            done = (pl_module.state.progress - self.restart_progress) / max(1 - self.restart_progress, 1e-6)
+            scale *= warmup * RESTART_LR_DECAY**done
+        pl_module.state.scale_lr(scale)
 
     def on_after_backward(self, trainer: L.Trainer, pl_module: System) -> None:
         if self.monitor.is_due(trainer.global_step + 1) and not self.monitor.has_learned:
@@ -172,7 +173,7 @@ class Guard(L.Callback):
         else:
             action = self._restart(system, step, failure.diverged)
             self.monitor.reset(step)
-            self.restart_progress = system.progress
+            self.restart_progress = system.state.progress
         for optimizer in trainer.optimizers:
             optimizer.state.clear()
             optimizer.zero_grad()
@@ -186,10 +187,10 @@ class Guard(L.Callback):
     def _cap_learning_rate(self, trainer: L.Trainer, system: NeRF3D) -> None:
         """Before the first step: lowers a rate that is known to be too high for the field."""
         optimizer = trainer.optimizers[0]
-        asked, fastest = optimizer.param_groups[0]["initial_lr"], system.field.fastest
-        if isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW) and asked > fastest:
-            self.rate = fastest / asked
-            cause = f"a learning rate of {asked:.3g} is too high for this field, which trains at up to {fastest:.3g}"
+        asked, max_lr = optimizer.param_groups[0]["initial_lr"], system.field.max_lr
+        if isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW) and asked > max_lr:
+            self.rate = max_lr / asked
+            cause = f"a learning rate of {asked:.3g} is too high for this field, which trains at up to {max_lr:.3g}"
             self._record(trainer, cause, f"{self.rate:.2g} times the learning rate")
 
     def _restart(self, system: System, step: int, diverged: bool) -> str:

@@ -79,7 +79,7 @@ class HeldOut(Renders):
             trainer.logger.log_metrics(figures, trainer.global_step)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        self.measure(trainer, pl_module, pl_module.progress)
+        self.measure(trainer, pl_module, pl_module.state.progress)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         """What an interruption left undone is measured where it was due."""

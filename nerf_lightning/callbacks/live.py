@@ -97,7 +97,7 @@ class Live(ChecksData):
             return
         with Budget.of(trainer).paused():
             if now - self._told > PROGRESS_SECONDS:
-                self.page.show_progress(pl_module.progress, self.describe(trainer))
+                self.page.show_progress(pl_module.state.progress, self.describe(trainer))
                 self._told = now
             self.page.again()
             self.page.paint(IMAGE_SECONDS)

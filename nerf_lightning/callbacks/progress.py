@@ -90,7 +90,7 @@ class Progress(L.Callback):
         seconds, left = self.left(trainer)
         budget = Budget.of(trainer)
         done = budget.seconds + budget.plan.spent
-        fraction = system.progress if seconds is None else done / max(done + seconds, 1e-9)
+        fraction = system.state.progress if seconds is None else done / max(done + seconds, 1e-9)
         status = "  ".join(filter(None, (status, left)))
         if self.bar is not None and self.task is not None:
             self.bar.update(self.task, completed=fraction, status=status)

@@ -26,7 +26,7 @@ from nerf_lightning.callbacks.throughput import TRAIN_SECONDS, Throughput
 from nerf_lightning.dataset import Picture, Scene, Views
 from nerf_lightning.dataset.rays import view_batch
 from nerf_lightning.errors import NoRoom
-from nerf_lightning.refine import summary
+from nerf_lightning.refine import summarize_corrections
 from nerf_lightning.system import (
     RENDERED_PIXELS,
     NeRF3D,
@@ -114,7 +114,7 @@ class Results(Renders):
         if not isinstance(scene, Scene):
             return {}
         pixels = 0 if scene.test is None or self.test_views is not None else len(scene.test.pixels)
-        corrected = isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.since
+        corrected = isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.enabled_at
         aligned = RENDERED_PIXELS * len(scene.val) if corrected and not self.aligned else 0
         one_view = pixels / len(scene.test) if scene.test is not None else 0
         return {"test": Need(pixels, one_view, scored=True), "aligned": Need(aligned, aligned / 8)}
@@ -144,7 +144,7 @@ class Results(Renders):
         )
         scene = data_of(trainer).scene
         if isinstance(pl_module, NeRF3D) and isinstance(scene, Scene):
-            if pl_module.corrections is not None and pl_module.corrections.since:
+            if pl_module.corrections is not None and pl_module.corrections.enabled_at:
                 share = share_of(trainer, pl_module, "aligned")
                 with Budget.of(trainer).plan.rendering("aligned held-out photos"):
                     self.aligned = aligned_psnr(pl_module, scene.val, share)
@@ -179,7 +179,9 @@ class Results(Renders):
             if len(self.views) < data_of(trainer).held_out_views:
                 self.views = []  # the mean of some views is another figure
             self.write(trainer, pl_module, "interrupted", f"at step {trainer.global_step}; resume= continues")
-        elif trainer.ckpt_path is None or Budget.of(trainer).began:  # else there was no state to go on from
+        elif (
+            trainer.ckpt_path is None or Budget.of(trainer).state.clock.started
+        ):  # else there was no state to go on from
             with suppress(NoRoom):  # on a full disk what happened first is to be told
                 self.write(trainer, pl_module, "failed", " ".join(f"{type(exception).__name__}: {exception}".split()))
 
@@ -211,7 +213,7 @@ class Results(Renders):
             "threads": torch.get_num_threads(),
             "machine": describe_machine(pl_module.device),
             # Several processes would count each other as other work.
-            "load": budget.load.cores() if trainer.world_size == 1 else None,
+            "load": budget.state.clock.load.cores() if trainer.world_size == 1 else None,
             "versions": {
                 "python": platform.python_version(),
                 "torch": torch.__version__,
@@ -234,7 +236,9 @@ class Results(Renders):
             "warnings": self.warnings,
             "plateau": budget.stopped,
             "misfits": self.misfits,
-            "corrections": summary(corrections) if corrections is not None and corrections.finite else None,
+            "corrections": summarize_corrections(corrections)
+            if corrections is not None and corrections.is_finite
+            else None,
             "recoveries": [asdict(one) for one in guard.recoveries] if guard is not None else [],
             "status": status,
             "diagnosis": diagnosis,

@@ -40,9 +40,9 @@ class Throughput(L.Callback):
         if trainer.logger is not None:
             mse = float(stats.mse)
             scalars = {
-                **{f"loss/{name}": float(term) for name, term in stats.terms.items()},
+                **{f"loss/{name}": float(term) for name, term in stats.losses.items()},
                 "train/psnr": mse_to_psnr(mse),
-                **{f"lr/{n}": group["lr"] for n, group in enumerate(pl_module.parameter_groups)},
+                **{f"lr/{group['name']}": group["lr"] for group in trainer.optimizers[0].param_groups},
                 "speed/rays_per_second": rays / max(seconds - self._mark[0], 1e-9),
                 "speed/samples_per_ray": self._samples / max(rays, 1),
                 TRAIN_SECONDS: seconds,

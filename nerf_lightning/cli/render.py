@@ -81,7 +81,7 @@ def render(
         route = CameraPath(route.cameras.scaled(scale), route.views)
     check_photos_background(colour, found.system, route)
     if background == "scene":
-        red, green, blue = found.system.renderer.colour.tolist()
+        red, green, blue = found.system.renderer.background.color.tolist()
         colour = red, green, blue
     depths = depth_range(found.system, route.cameras) if "depth" in names else (0.0, 1.0)
     style = Style(names, colour, depths)

@@ -28,6 +28,7 @@ from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import Sampler
 from nerf_lightning.system import NeRF2D, NeRF3D, System
+from nerf_lightning.system.compiled import BACKEND
 from nerf_lightning.utils.device import CPU, the_device
 from nerf_lightning.utils.files import output_path
 from nerf_lightning.utils.options import check_options
@@ -165,11 +166,12 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
         raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
     chunk = limits_of(cfg, device).chunk
     common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
+    common["backend"] = BACKEND if cfg.compile else None
     if isinstance(frame, PictureFrame):
         return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
     bounds = frame.bounds
     field = build_field(cfg, Field, "three coordinates", bounds=bounds)
-    sampler = make(cfg, "sampler", Sampler, bounds=bounds)
+    sampler = make(cfg, "sampler", Sampler, bounds=bounds, chunk=chunk)
     seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
     renderer = make(cfg, "renderer", VolumeRenderer, scene_background=frame.background, **seen)
     corrections = None
@@ -224,7 +226,7 @@ def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, sys
     if isinstance(data, PixelDataModule) or data.scene.train.channels == 4:
         return
     assert isinstance(system, NeRF3D)  # what build_system makes for rays
-    wanted = "random" if system.renderer.random else system.background
+    wanted = "random" if system.renderer.background.is_random else system.background
     if wanted != [round(c, 3) for c in data.scene.background]:
         raise InputError(
             "config: renderer.background",

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.drawing.depth import colorize_depth, depth_limits
 from nerf_lightning.drawing.panels import to_bytes
-from nerf_lightning.renderer import Rendered
+from nerf_lightning.renderer import RenderOutput
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.system.metrics import mse_to_psnr
 from nerf_lightning.utils.text import subsample
@@ -54,7 +54,7 @@ def draw(system: NeRF3D, cameras: Cameras, view: int, style: Style) -> dict[str,
     return {name: to_bytes(colours(rendered, name, style).view(shape)) for name in style.channels}
 
 
-def colours(rendered: Rendered, channel: str, style: Style) -> Float[Tensor, "R C"]:
+def colours(rendered: RenderOutput, channel: str, style: Style) -> Float[Tensor, "R C"]:
     """What one channel shows along some rays, rendered on the style's background; black stands for a transparent one."""
     opacity = rendered.opacity[:, None]
     if channel == "opacity":

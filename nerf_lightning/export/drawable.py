@@ -13,7 +13,7 @@ from nerf_lightning.export.reach import NOTHING, Cells, visible_cells
 from nerf_lightning.export.volume import COARSEST, FINEST
 from nerf_lightning.model import TensoRFField, VoxelField
 from nerf_lightning.model.layers.pruning import vertices_in, widened
-from nerf_lightning.model.layers.view_dependence import seen_from
+from nerf_lightning.model.layers.view_dependence import encode_directions
 from nerf_lightning.model.voxels import EMPTY
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D
@@ -70,7 +70,7 @@ def drawable(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: in
     keeps_field, keeps_sampler = isinstance(field, TensoRFField | VoxelField), isinstance(sampler, OccupancySampler)
     made = copy.copy(system)
     made._modules = dict(system._modules)  # the copy's parts are replaced, not changed
-    grid = sampler.resolution if isinstance(sampler, OccupancySampler) else CELLS
+    grid = sampler.grid.resolution if isinstance(sampler, OccupancySampler) else CELLS
     if keeps_field:
         seen = widened(visible_cells(system, cameras, grid))
     else:
@@ -81,9 +81,10 @@ def drawable(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: in
     if not keeps_sampler:
         config["sampler"] = target_of(OccupancySampler, samples=STEPS, resolution=CELLS)
         changes.append(f"{STEPS} steps between {CELLS} cells a side in place of its own samples")
-    made.sampler = copy.deepcopy(sampler) if keeps_sampler else OccupancySampler(field.bounds, STEPS, CELLS)
+    steps = OccupancySampler(field.bounds, STEPS, CELLS, chunk=system.chunk)
+    made.sampler = copy.deepcopy(sampler) if keeps_sampler else steps
     made.sampler.import_state({"occupied": seen.flatten()})
-    made.sampler.to(system.device).chunk = system.chunk
+    made.sampler.to(system.device)
     if not keeps_field:
         teach(made, system, cameras)
     return Drawable(made, config, changes)
@@ -127,7 +128,7 @@ def voxels_like(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[Vo
         colours.new_zeros(1, 3),
         views.new_zeros(1, views.shape[1]),
     )
-    voxels.hold(keep.flatten(), [torch.cat(pair) for pair in zip(nothing, (raw, colours, views), strict=True)])
+    voxels.set_vertices(keep.flatten(), [torch.cat(pair) for pair in zip(nothing, (raw, colours, views), strict=True)])
     return voxels, options
 
 
@@ -166,7 +167,7 @@ def cell_sizes(bounds: Bounds, places: Float[Tensor, "N 3"], across: int) -> Flo
 
 def cells_around(voxels: VoxelField, grid: int) -> Cells:
     """The cells of another grid in which voxels hold something, and their neighbours."""
-    kept = (voxels.index > 0).view(*[voxels.side] * 3).nonzero()
+    kept = voxels.kept.view(*[voxels.side] * 3).nonzero()
     x, y, z = (kept * grid // (voxels.side - 1)).clamp(0, grid - 1).unbind(1)
     found = torch.zeros(grid, grid, grid, dtype=torch.bool, device=kept.device)
     found[x, y, z] = True
@@ -182,7 +183,7 @@ def fitted(
     several = places[:, None].expand_as(directions).flatten(0, 1)
     rgb = system.field(several, directions.flatten(0, 1))[1].view(directions.shape)
     logits = torch.logit(rgb, 1 / (1 + math.exp(LOGITS)))
-    basis = seen_from(directions.flatten(0, 1), 1 + terms)[:, 1:].view(*directions.shape[:2], -1)
+    basis = encode_directions(directions.flatten(0, 1), 1 + terms)[:, 1:].view(*directions.shape[:2], -1)
     mean, middle = logits.mean(1, keepdim=True), basis.mean(1, keepdim=True)
     basis = basis - middle
     normal = basis.mT @ basis + DAMPING * len(centres) * torch.eye(terms, device=basis.device)

@@ -72,7 +72,7 @@ def described(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
         "activation": activation_of(field),
         "density_rate": field.density_rate if isinstance(field, VoxelField) else 1.0,
         "least": LEAST,
-        "background": system.renderer.colour.tolist(),
+        "background": system.renderer.background.color.tolist(),
         "bounds": {
             "low": bounds.aabb[0].tolist(),
             "size": (2 * bounds.half_size).tolist(),
@@ -82,9 +82,9 @@ def described(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
             "far": far,
         },
         "sampler": {
-            "samples": sampler.picture_samples,
-            "step": sampler.length(sampler.picture_samples),
-            "cells": sampler.resolution,
+            "samples": sampler.eval_samples,
+            "step": sampler.step_size(sampler.eval_samples),
+            "cells": sampler.grid.resolution,
             "stop": sampler.early_stop_eps,
         },
         "focus": pivot_of(orbit).tolist(),

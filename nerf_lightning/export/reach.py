@@ -26,7 +26,7 @@ def occupied_cells(system: System) -> Cells | None:
     """Cells in which the sampler looks for something; None for a sampler without a grid."""
     if not isinstance(system, NeRF3D) or not isinstance(system.sampler, OccupancySampler):
         return None
-    return system.sampler.occupied.view(*[system.sampler.resolution] * 3)
+    return system.sampler.grid.occupied.view(*[system.sampler.grid.resolution] * 3)
 
 
 def seen_cells(system: System, cameras: Cameras) -> Cells | None:

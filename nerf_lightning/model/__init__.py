@@ -1,6 +1,7 @@
 """Stage 4, fields: position and direction -> density and rgb; also pictures as fields of two coordinates."""
 
-from nerf_lightning.model.field import Field, PictureField
+from nerf_lightning.model.field import Field, FieldOutput, PictureField
+from nerf_lightning.model.growth import ResolutionSchedule
 from nerf_lightning.model.hashgrid import HashGrid, HashGridField
 from nerf_lightning.model.hashgrid2d import HashGrid2DField
 from nerf_lightning.model.layers.activation import SoftenableReLU, density_activation, truncated_exp
@@ -13,6 +14,7 @@ from nerf_lightning.model.voxels import VoxelField
 
 __all__ = [
     "Field",
+    "FieldOutput",
     "FourierField",
     "HashGrid",
     "HashGrid2DField",
@@ -21,6 +23,7 @@ __all__ = [
     "PictureField",
     "PictureMLP",
     "SoftenableReLU",
+    "ResolutionSchedule",
     "SirenField",
     "TensoRFField",
     "VectorMatrix",

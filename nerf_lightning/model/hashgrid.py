@@ -11,12 +11,12 @@ from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import hash_interpolate, mlp, mlp_heads
 from nerf_lightning.kernels.hashgrid import Cells, corner_count, entry_of
-from nerf_lightning.model.field import Field
-from nerf_lightning.model.layers.activation import density_activation
+from nerf_lightning.model.field import Field, FieldOutput, Size
+from nerf_lightning.model.layers.activation import Activation, density_activation
 from nerf_lightning.model.layers.pruning import vertices_in
-from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
+from nerf_lightning.model.layers.view_dependence import encode_directions, num_sh_bases
 from nerf_lightning.model.layers.widening import widen_all
-from nerf_lightning.utils.options import Count, Entries, Layers, Side
+from nerf_lightning.utils.options import Count, Entries, Layers, SHDegree, Side
 
 
 def level_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
@@ -121,12 +121,12 @@ class HashGridField(Field):
         size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
 
     Raises:
-        InputError: where coarsest > finest, for another `size`, or for a degree above 3.
+        InputError: where coarsest > finest.
     """
 
     GEOMETRY = 15  # features handed from density to colour network, Instant-NGP section 5.4
     START = -1.0  # an exponential density starts as thin fog
-    fastest = 0.1
+    max_lr = 0.1
 
     def __init__(
         self,
@@ -137,16 +137,16 @@ class HashGridField(Field):
         coarsest: Side = 16,
         finest: Side = 256,
         width: Count = 64,
-        degree: int = 3,
+        degree: SHDegree = 3,
         split_colour: bool = False,
-        density: str = "exp",
-        size: str = "auto",
+        density: Activation = "exp",
+        size: Size = "auto",
     ):
         super().__init__(bounds)
         self.grid = HashGrid(levels, log2_entries, features, *self.grid_sizes(coarsest, finest, size))
         self.activation = density_activation(density)
         self.density_net = layers(self.grid.width, width, 1 + self.GEOMETRY)
-        self.terms = harmonics_up_to(degree)
+        self.terms = num_sh_bases(degree)
         self.split_colour = split_colour
         self.colour_net = layers(self.GEOMETRY + self.terms, width, width, 3)
         self.starts_thin = density == "exp"
@@ -175,19 +175,9 @@ class HashGridField(Field):
         raw, geometry = mlp_heads(encoded, weights(self.density_net), 1)
         return self.activation(raw.squeeze(1)), geometry
 
-    def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(self.logits(features, directions)[0])
-
-    def logits(
-        self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]
-    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"] | None]:
-        """Of the colour, and what the direction adds to them."""
-        seen = mlp(features, weights(self.colour_net), seen_from(directions, self.terms))
-        return (features[:, :3] + seen, seen) if self.split_colour else (seen, None)
-
-    def with_view_part(
-        self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
-    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"], Float[Tensor, "N 3"] | None]:
+    def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
         density, features = self.features(positions)
-        logits, view_part = self.logits(features, directions)
-        return density / self.unit_length, torch.sigmoid(logits), view_part
+        logits = mlp(features, weights(self.colour_net), encode_directions(directions, self.terms))
+        if not self.split_colour:
+            return FieldOutput(density / self.unit_length, torch.sigmoid(logits))
+        return FieldOutput(density / self.unit_length, torch.sigmoid(features[:, :3] + logits), logits)

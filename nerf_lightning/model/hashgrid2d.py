@@ -1,17 +1,17 @@
 """A picture as features on nested hash grids and one small network (Instant-NGP, Müller et al. 2022, section 5.1)."""
 
 import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import hash_interpolate, mlp
 from nerf_lightning.model.field import PictureField
 from nerf_lightning.model.hashgrid import layers, level_resolutions, table_sizes, weights
 from nerf_lightning.model.layers.widening import widen_all
-from nerf_lightning.utils.options import Count, Entries, Layers, Side
+from nerf_lightning.utils.options import AtLeast, AtMost, Count, Layers, Positive, Side
 
 STEP = 2.4
 """How much finer each level is than the one before, unless their number is given."""
@@ -41,17 +41,15 @@ class HashGrid2DField(PictureField):
         self,
         size: tuple[int, int],
         levels: Layers | None = None,
-        log2_entries: Entries | None = None,
-        share: float = 1.0,
+        log2_entries: Annotated[int, AtLeast(1), AtMost(24)] | None = None,
+        share: Positive = 1.0,
         features: Count = 2,
         coarsest: Side = 16,
         finest: Side | None = None,
         width: Count = 64,
-        rate: float = 2.0,
+        rate: Positive = 2.0,
     ):
         super().__init__(size, rate)
-        if not share > 0:
-            raise InputError("model.share", "", str(share), "above 0")
         cells = [max(side - 1, 1) for side in size]
         pixels, finest = max(cells), min(max(cells), finest or max(cells))
         first = finest if levels == 1 else min(coarsest, finest)
@@ -67,8 +65,6 @@ class HashGrid2DField(PictureField):
                 f"{len(self.resolutions)} grids up to the picture's {size[0]} x {size[1]} pixels: together {held:.2f} times as"
                 " many numbers as the picture"
             )
-        if log2_entries > 24:
-            raise InputError("model.log2_entries", "", str(log2_entries), "at most 24")
         self.sizes = table_sizes(self.resolutions, 2**log2_entries)
         self.tables = torch.nn.Parameter(torch.empty(sum(self.sizes), features).uniform_(-1e-4, 1e-4))
         self.net = layers(len(self.sizes) * features, width, 3)

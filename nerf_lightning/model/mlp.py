@@ -7,7 +7,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.model.field import Field
-from nerf_lightning.model.layers.activation import density_activation
+from nerf_lightning.model.layers.activation import Activation, density_activation
 from nerf_lightning.model.layers.encoding import sinusoidal
 from nerf_lightning.model.layers.widening import widen, widen_all
 from nerf_lightning.utils.options import Count, Layers, Octaves
@@ -28,7 +28,7 @@ class MLPField(Field):
         InputError: where `skip` is not one of the trunk's layers after the first.
     """
 
-    fastest = 0.05
+    max_lr = 0.05
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class MLPField(Field):
         skip: int | None = 4,
         position_frequencies: Octaves = 10,
         direction_frequencies: Octaves = 4,
-        density: str = "relu",
+        density: Activation = "relu",
     ):
         super().__init__(bounds)
         if skip is not None and not 0 < skip < depth:

@@ -6,12 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.model.field import PictureField
 from nerf_lightning.model.hashgrid import layers
 from nerf_lightning.model.layers.encoding import sinusoidal
 from nerf_lightning.model.layers.widening import widen_all
-from nerf_lightning.utils.options import Count, Layers, Octaves
+from nerf_lightning.utils.options import Count, Layers, Octaves, Positive
 
 
 def relu_layers(sizes: list[int]) -> torch.nn.Sequential:
@@ -42,10 +41,6 @@ class PictureMLP(PictureField):
             # same value at all pixels, up to its sign, and anything between them.
             frequencies = 1 + max(0, round(math.log2(self.nyquist)))
             self.sizing = f"{frequencies} octaves, up to about half of what {max(size)} pixels can show"
-        if frequencies < 0:
-            raise InputError(
-                "model.frequencies", "", str(frequencies), "0 or more, or null to take them from the picture"
-            )
         self.frequencies = frequencies
         self.net = relu_layers([2 * (1 + 2 * frequencies), *[width] * depth, 3])
 
@@ -71,23 +66,18 @@ class FourierField(PictureField):
         width: neurons of each hidden layer.
         depth: hidden layers.
         rate: factor on the learning rate.
-
-    Raises:
-        InputError: if spread or rate is not above 0.
     """
 
     def __init__(
         self,
         size: tuple[int, int],
         features: Count = 256,
-        spread: float = 0.1,
+        spread: Positive = 0.1,
         width: Count = 256,
         depth: Layers = 3,
-        rate: float = 1.0,
+        rate: Positive = 1.0,
     ):
         super().__init__(size, rate)
-        if not spread > 0:
-            raise InputError("model.spread", "", str(spread), "above 0")
         self.cycles: Tensor
         """[2, features], over the picture's longer side; the seed decides them, and checkpoints keep them."""
         self.register_buffer("cycles", torch.randn(2, features) * spread * self.nyquist)
@@ -108,19 +98,14 @@ class SirenField(PictureField):
         reach: angular frequency of the first layer as a share of the Nyquist frequency; 0.075 gives the paper's 30 for a
             picture of 256 pixels.
         rate: factor on the learning rate.
-
-    Raises:
-        InputError: if reach or rate is not above 0.
     """
 
     HIDDEN_FREQUENCY = 30.0  # omega_0 of the later layers, which the paper keeps whatever the signal
 
     def __init__(
-        self, size: tuple[int, int], width: Count = 256, depth: Layers = 3, reach: float = 0.15, rate: float = 0.1
+        self, size: tuple[int, int], width: Count = 256, depth: Layers = 3, reach: Positive = 0.15, rate: Positive = 0.1
     ):
         super().__init__(size, rate)
-        if not reach > 0:
-            raise InputError("model.reach", "", str(reach), "above 0")
         # In radians per unit; the longer side is 2 units long.
         self.first_frequency = reach * math.pi * self.nyquist
         self.hidden = layers(2, *[width] * depth)

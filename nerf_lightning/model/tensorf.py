@@ -11,20 +11,21 @@ from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import mlp, plane_line_sum, plane_line_sum_and_products
 from nerf_lightning.kernels.planes import PLANE_AXES
-from nerf_lightning.model.field import Field, replace_data
+from nerf_lightning.model.field import Field, Size
+from nerf_lightning.model.growth import ResolutionSchedule, replace_data
 from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
-from nerf_lightning.model.layers.activation import density_activation
+from nerf_lightning.model.layers.activation import Activation, density_activation
 from nerf_lightning.model.layers.pruning import vertices_in
-from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
+from nerf_lightning.model.layers.view_dependence import encode_directions, num_sh_bases
 from nerf_lightning.model.layers.widening import widen_all
-from nerf_lightning.utils.options import Count, Layers, Side
+from nerf_lightning.utils.options import Count, Fraction, Layers, SHDegree, Side
 
 FINEST = 160
 """Cells along a side at the end, where photos are of usual size."""
 WIDTH = 32
 """Neurons of the hidden layer there."""
-SETTLED, LEARNED = 80, 1000
-"""Steps that a size needs before the next is worth its time, and after which it has learned what it can."""
+MIN_STEPS_PER_STAGE, MAX_STEPS_PER_STAGE = 80, 1000
+"""Steps that a stage needs before the next is worth its time, and after which it has learned what it can."""
 
 
 class VectorMatrix(torch.nn.Module):
@@ -109,7 +110,7 @@ class TensoRFField(Field):
             `Bounds.fineness`.
         stages: number of sizes, growing geometrically.
         grown: fraction of the budget after which the planes have their finest size; the stages before are equally long, of at
-            least `SETTLED` and at most `LEARNED` steps.
+            least `MIN_STEPS_PER_STAGE` and at most `MAX_STEPS_PER_STAGE` steps.
         width: neurons of the hidden layer. Without a width: 32, and up to 64 where planes are finer for larger photos, which
             show more of how surfaces shine.
         degree: of the spherical harmonics of the direction that the network sees, 0 to 3; with 0, colours are the same from
@@ -118,11 +119,10 @@ class TensoRFField(Field):
         size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
 
     Raises:
-        InputError: where coarsest > finest, for another `size`, for a single stage of two sizes, for a degree above 3, or
-            `grown` outside [0, 1].
+        InputError: where coarsest > finest, and for a single stage of two sizes.
     """
 
-    fastest = 0.2
+    max_lr = 0.2
 
     def __init__(
         self,
@@ -132,11 +132,11 @@ class TensoRFField(Field):
         coarsest: Side = 64,
         finest: Side | None = None,
         stages: Layers = 4,
-        grown: float = 0.3,
+        grown: Fraction = 0.3,
         width: Count | None = None,
-        degree: int = 3,
-        density: str = "exp",
-        size: str = "auto",
+        degree: SHDegree = 3,
+        density: Activation = "exp",
+        size: Size = "auto",
     ):
         super().__init__(bounds)
         self.follows_photos = finest is None
@@ -148,21 +148,19 @@ class TensoRFField(Field):
         coarsest, finest = self.grid_sizes(coarsest, finest, size)
         if stages == 1 and coarsest < finest:
             raise InputError("model.stages", "", f"1 with sizes {coarsest} and {finest}", "at least 2, or one size")
-        if not 0 <= grown <= 1:
-            raise InputError("model.grown", "", str(grown), "between 0 and 1")
         self.resolutions = level_resolutions(stages, coarsest, finest)
-        self.grown = grown
         if coarsest < finest:
-            self.grown_after = grown
-            self.growing_steps, self.growing_steps_most = SETTLED * (stages - 1), LEARNED * (stages - 1)
+            starts = [grown * i / (stages - 1) for i in range(stages)]
+            steps = MIN_STEPS_PER_STAGE * (stages - 1), MAX_STEPS_PER_STAGE * (stages - 1)
+            self.growth = ResolutionSchedule(self.resolutions, starts, *steps)
         self.density_volume = VectorMatrix(coarsest, density_components)
         self.colour_volume = VectorMatrix(coarsest, colour_components)
         self.activation = density_activation(density)
-        self.terms = harmonics_up_to(degree)
+        self.terms = num_sh_bases(degree)
         self.colour_net = layers(3 * colour_components + self.terms, width, 3)
 
     @property
-    def finer(self) -> float:
+    def resolution_scale(self) -> float:
         return max(1.0, self.density_volume.cells / FINEST) if self.follows_photos else 1.0
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
@@ -176,16 +174,11 @@ class TensoRFField(Field):
         return self.activation(self.density_volume.total(self.bounds.to_unit(positions))) / self.unit_length
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(mlp(features, weights(self.colour_net), seen_from(directions, self.terms)))
+        return torch.sigmoid(mlp(features, weights(self.colour_net), encode_directions(directions, self.terms)))
 
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
         self.density_volume.prune(reached)
         self.colour_volume.prune(reached)
-
-    def resolution_at(self, progress: float) -> int:
-        """Cells along a side that the planes should have after this fraction of the budget."""
-        last = len(self.resolutions) - 1
-        return self.resolutions[last if progress >= self.grown else int(progress / self.grown * last)]
 
     @torch.no_grad()
     def warm_start_from(self, smaller: Field) -> None:
@@ -207,15 +200,11 @@ class TensoRFField(Field):
         now, last = self.density_volume.cells + 1, self.resolutions[-1] + 1
         return self.values + 3 * components * (last * last + last - now * now - now)
 
-    def grows_at(self, progress: float) -> bool:
-        return self.density_volume.cells < self.resolution_at(progress)
+    @property
+    def stage(self) -> int:
+        return max(sum(cells <= self.density_volume.cells for cells in self.resolutions) - 1, 0)
 
-    def grow(self, progress: float) -> list[torch.nn.Parameter]:
-        """Refines planes and lines to the size that `progress` asks for; they never shrink."""
-        wanted = self.resolution_at(progress)
-        replaced: list[torch.nn.Parameter] = []
+    def upsample(self, stage: int) -> list[torch.nn.Parameter]:
         for volume in (self.density_volume, self.colour_volume):
-            if volume.cells < wanted:
-                volume.resize(wanted)
-                replaced += volume.parameters()
-        return replaced
+            volume.resize(self.resolutions[stage])
+        return [*self.density_volume.parameters(), *self.colour_volume.parameters()]

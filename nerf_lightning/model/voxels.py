@@ -1,14 +1,14 @@
 """A sparse grid of densities and spherical-harmonics colours, without any network (Plenoxels, Fridovich-Keil et al. 2022)."""
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import (
     interpolate_rows,
     locate,
@@ -17,12 +17,13 @@ from nerf_lightning.kernels import (
     roughness,
     voxel_value,
 )
-from nerf_lightning.model.field import Field, replace_data
+from nerf_lightning.model.field import Field, FieldOutput, Size
+from nerf_lightning.model.growth import ResolutionSchedule, replace_data
 from nerf_lightning.model.hashgrid import level_resolutions
 from nerf_lightning.model.layers.activation import truncated_exp
 from nerf_lightning.model.layers.pruning import vertices_in, widened
-from nerf_lightning.model.layers.view_dependence import harmonics_up_to, seen_from
-from nerf_lightning.utils.options import Layers, Side
+from nerf_lightning.model.layers.view_dependence import encode_directions, num_sh_bases
+from nerf_lightning.utils.options import Above, AtMost, Layers, Positive, SHDegree, Side, Weight
 
 EMPTY = -8.0
 """Logarithm of the density (in 1 / half-size) where no vertex is kept: too thin to matter."""
@@ -31,13 +32,11 @@ RECENT = 0.5
 PIECES = 4
 """Each step measures the roughness of one of this many pieces of the table."""
 TABLES = ("log_density", "colours", "views")
-COUNTS = {"stage": torch.int64, "steps": torch.int32, "started": torch.int32}
-"""Whole numbers in checkpoints."""
 CHUNK = 1 << 16
 """Vertices interpolated at a time when growing, to bound the memory."""
 
-VERTEX = 13
-"""Bytes of each vertex of a grid, kept or not, while it grows: whether it is kept, how many are before it, and its row."""
+BYTES_PER_VERTEX = 14
+"""Of a grid while it grows, kept or not: whether it is kept, twice, how many are before it, and its row."""
 
 
 class VoxelField(Field):
@@ -59,13 +58,17 @@ class VoxelField(Field):
         size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
 
     Raises:
-        InputError: where coarsest > finest, for another `size`, for a degree above 3, a rate that is not positive, a negative
-            smoothness, or `grown` outside (0, 1].
+        InputError: where coarsest > finest.
     """
 
+    kept: Tensor
+    """Which vertices of the grid hold values."""
     index: Tensor
+    """Row of every vertex; 0 for those that are not kept."""
     vertex: Tensor
+    """Vertex of every row, its inverse."""
     seen: Tensor
+    """Step of the last reading of every row."""
 
     def __init__(
         self,
@@ -73,37 +76,29 @@ class VoxelField(Field):
         coarsest: Side = 40,
         finest: Side = 128,
         stages: Layers = 4,
-        grown: float = 0.3,
-        degree: int = 1,
-        density_rate: float = 6.0,
-        smoothness: float = 1e-4,
-        size: str = "auto",
+        grown: Annotated[float, Above(0), AtMost(1)] = 0.3,
+        degree: SHDegree = 1,
+        density_rate: Positive = 6.0,
+        smoothness: Weight = 1e-4,
+        size: Size = "auto",
     ):
         super().__init__(bounds)
         coarsest, finest = self.grid_sizes(coarsest, finest, size)
-        if not 0 < grown <= 1:
-            raise InputError("model.grown", "", str(grown), "above 0, at most 1")
-        if not density_rate > 0:
-            raise InputError("model.density_rate", "", str(density_rate), "above 0")
-        if not smoothness >= 0:
-            raise InputError("model.smoothness", "", str(smoothness), "at least 0")
-        intervals = max(stages - 1, 1)
-        self.resolutions = level_resolutions(stages, coarsest, finest)
         # Early stages are short: a coarse grid learns what it can in a few steps a vertex.
-        self.times = [grown * (i / intervals) ** 2 for i in range(stages)]
-        self.grown_after = self.times[-1]
-        self.terms = harmonics_up_to(degree) - 1  # without the constant one
+        starts = [grown * (i / max(stages - 1, 1)) ** 2 for i in range(stages)]
+        self.growth: ResolutionSchedule = ResolutionSchedule(level_resolutions(stages, coarsest, finest), starts)
+        self.terms = num_sh_bases(degree) - 1  # without the constant one
         self.density_rate = density_rate
         # Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog in front of cameras.
-        self.fastest = 1 / density_rate
+        self.max_lr = 1 / density_rate
         self.smoothness = smoothness
-        rows = (self.resolutions[0] + 1) ** 3 + 1
-        self.register_buffer("index", torch.arange(1, rows, dtype=torch.int32))
+        rows = (self.growth.resolutions[0] + 1) ** 3 + 1
+        self.register_buffer("kept", torch.ones(rows - 1, dtype=torch.bool))
+        self.register_buffer("index", torch.arange(1, rows, dtype=torch.int32), persistent=False)
         self.register_buffer("vertex", torch.arange(-1, rows - 1, dtype=torch.int32), persistent=False)
-        self.register_buffer("seen", torch.zeros(rows, dtype=torch.int32))  # step of the last reading
+        self.register_buffer("seen", torch.zeros(rows, dtype=torch.int32))
         self.stage, self.steps, self.started = 0, 1, 1
-        """Which size it has, steps so far, and the first one at that size. Checkpoints hold them too (`COUNTS`), but a step
-        must not ask a device for them."""
+        """Of `growth`, steps so far, and the first one of the stage; on the host, as a step must not ask a device for them."""
         self.log_density = torch.nn.Parameter(torch.zeros(rows))  # divided by density_rate
         self.log_density.data[0] = EMPTY / density_rate
         self.colours = torch.nn.Parameter(torch.zeros(rows, 3))
@@ -116,7 +111,7 @@ class VoxelField(Field):
 
     @property
     def training_bytes(self) -> int:
-        return max(super().training_bytes, VERTEX * (self.resolutions[-1] + 1) ** 3)
+        return max(super().training_bytes, BYTES_PER_VERTEX * (self.growth.resolutions[-1] + 1) ** 3)
 
     @property
     def side(self) -> int:
@@ -131,58 +126,45 @@ class VoxelField(Field):
         """As `forward` gives it, but without marking the vertices as read."""
         return self.per_length(voxel_value(self.log_density, self.index, self.bounds.to_unit(positions)))
 
-    def forward(
-        self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
-    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
+    def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
         rows, weights = locate(self.index, self.bounds.to_unit(positions))
-        basis = seen_from(directions, 1 + self.terms)[:, 1:]
+        basis = encode_directions(directions, 1 + self.terms)[:, 1:]
         raw, rgb = read_voxels(self.log_density, self.colours, self.views, rows, weights, basis)
-        found = self.per_length(raw), torch.sigmoid(rgb)
         if torch.is_grad_enabled():
             self.mark(rows)
-        return found
+        return FieldOutput(self.per_length(raw), torch.sigmoid(rgb))
 
     @torch.compiler.disable  # each step would be compiled again
     def mark(self, rows: Int[Tensor, "N 8"]) -> None:
-        """Notes that these rows were read."""
+        """Notes that a training step read these rows."""
+        self.steps += 1
         mark_rows(self.seen, rows, self.steps)
 
-    def penalty(self) -> Float[Tensor, ""] | None:
-        """The roughness of the log-densities, of another piece of the table in each step."""
+    def losses(self) -> dict[str, Float[Tensor, ""]]:
+        """The total variation of the log-densities, of another piece of the table in each step."""
         rows, piece = len(self.vertex) - 1, self.steps % PIECES
         first, last = (1 + rows * i // PIECES for i in (piece, piece + 1))
         if not self.smoothness or first == last:
-            return None
-        return self.smoothness * roughness(self.log_density, self.vertex, self.index, first, last)
-
-    def stage_at(self, progress: float) -> int:
-        """Number of the size that it should have after this fraction of the budget."""
-        return max(i for i, time in enumerate(self.times) if progress >= time)
-
-    def grows_at(self, progress: float) -> bool:
-        return self.stage_at(progress) > self.stage
+            return {}
+        return {"tv": self.smoothness * roughness(self.log_density, self.vertex, self.index, first, last)}
 
     @torch.no_grad()
-    def grow(self, progress: float) -> list[torch.nn.Parameter]:
-        """Moves on to the size that `progress` asks for."""
-        self.steps += 1
-        if not self.grows_at(progress):
-            return []
-        wanted = self.stage_at(progress)
-        keep = self.surroundings(self.resolutions[wanted] + 1)
+    def upsample(self, stage: int) -> list[torch.nn.Parameter]:
+        keep = self.surroundings(self.growth.resolutions[stage] + 1)
         values = torch.cat([table.view(len(table), -1) for table in self.tables], dim=1)
         parts = (keep.nonzero() / (keep.shape[0] - 1)).split(CHUNK)
         new = torch.cat([values[:1], *(interpolate_rows(values, *locate(self.index, part)) for part in parts)])
-        self.hold(keep.flatten(), new.split([1, 3, 3 * self.terms], dim=1))
-        self.stage, self.started = wanted, self.steps
+        self.set_vertices(keep.flatten(), new.split([1, 3, 3 * self.terms], dim=1))
+        self.stage, self.started = stage, self.steps + 1
         return list(self.tables)
 
-    def hold(self, keep: Bool[Tensor, "V"], tables: Sequence[Tensor]) -> None:
+    def set_vertices(self, keep: Bool[Tensor, "V"], tables: Sequence[Tensor]) -> None:
         """Replaces the tables: row 0 for all other vertices, then those of the kept vertices in order."""
         for table, columns in zip(self.tables, tables, strict=True):
             replace_data(table, columns.reshape(len(columns), *table.shape[1:]).contiguous())
-        self.index = torch.where(keep, keep.cumsum(0), 0).int()
-        self.find_vertices()
+        self.kept, self.index = keep, torch.where(keep, keep.cumsum(0), 0).int()
+        rows = self.index.nonzero()[:, 0]  # in the order of their vertices
+        self.vertex = torch.cat([rows.new_tensor([-1]), rows]).int()
         self.seen = torch.zeros(len(self.vertex), dtype=torch.int32, device=keep.device)
 
     @torch.no_grad()
@@ -190,42 +172,32 @@ class VoxelField(Field):
         """Copies everything; from there it grows to its finest size in the usual number of stages."""
         assert isinstance(smaller, VoxelField)
         cells = smaller.side - 1
-        if cells > self.resolutions[-1]:
+        resolutions = self.growth.resolutions
+        if cells > resolutions[-1]:
             return
-        self.resolutions = level_resolutions(len(self.resolutions), cells, self.resolutions[-1])
+        self.growth = replace(self.growth, resolutions=level_resolutions(len(resolutions), cells, resolutions[-1]))
         views = smaller.views.view(len(smaller.views), 3, smaller.terms)[..., : self.terms]
         wider = views.new_zeros(len(views), 3, self.terms)
         wider[..., : views.shape[2]] = views
         density = smaller.log_density * (smaller.density_rate / self.density_rate)
-        self.hold(smaller.index > 0, [density, smaller.colours.detach(), wider.flatten(1)])
+        self.set_vertices(smaller.kept, [density, smaller.colours.detach(), wider.flatten(1)])
 
     @torch.no_grad()
     def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
-        keep = vertices_in(reached, self.side - 1).flatten() & (self.index > 0)
+        keep = vertices_in(reached, self.side - 1).flatten() & self.kept
         rows = torch.cat([self.index.new_zeros(1), self.index[keep]]).long()
-        self.hold(keep, [table.detach()[rows] for table in self.tables])
+        self.set_vertices(keep, [table.detach()[rows] for table in self.tables])
 
     def export_state(self) -> dict[str, Tensor]:
         tables = zip(TABLES, self.tables, strict=True)
-        return {"kept": self.index > 0, **{name: table.detach() for name, table in tables}}
+        return {"kept": self.kept, **{name: table.detach() for name, table in tables}}
 
-    @torch.no_grad()
     def import_state(self, state: dict[str, Tensor]) -> None:
-        keep, tables = state["kept"], [state[name] for name in TABLES]
-        if keep.dtype != torch.bool or not of_grid(keep):
-            raise RuntimeError("vertices that are none of a cubic grid")
-        if any(len(table) != int(keep.sum()) + 1 for table in tables):
-            raise RuntimeError("tables of another length than there are vertices")
-        self.hold(keep, tables)
-
-    def find_vertices(self) -> None:
-        """Makes `vertex`, the inverse of `index`: rows stand in the order of their vertices."""
-        kept = self.index.nonzero()[:, 0]
-        self.vertex = torch.cat([kept.new_tensor([-1]), kept]).int()
+        self.load_state_dict({name: state[name] for name in ("kept", *TABLES)}, strict=False)
 
     def surroundings(self, side: int) -> Bool[Tensor, "S S S"]:
         """Which vertices of a grid of side^3 lie among current vertices that were read lately, or next to those."""
-        fresh = self.seen > self.steps - 1 - RECENT * (self.steps - self.started)
+        fresh = self.seen > self.steps - RECENT * (self.steps + 1 - self.started)
         fresh[0] = False
         old = self.side
         keep = fresh[self.index.long()].view(old, old, old)
@@ -235,51 +207,28 @@ class VoxelField(Field):
         # Before anything was rendered, everything stays.
         return widened(keep) if keep.any() else torch.ones_like(keep)
 
-    def _save_to_state_dict(self, destination: dict[str, Tensor], prefix: str, keep_vars: bool) -> None:
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-        for name, dtype in COUNTS.items():
-            destination[prefix + name] = torch.tensor(getattr(self, name), dtype=dtype)
+    def get_extra_state(self) -> Tensor:
+        return torch.tensor([self.stage, self.steps, self.started])
 
-    def _check(self, prefix: str, state: dict[str, Tensor]) -> None:
-        """Refuses a state whose index, tables and counts do not belong together: what it has, as a part may be missing."""
-        found = {name: state[prefix + name] for name in ("index", "seen", *TABLES, *COUNTS) if prefix + name in state}
-        if any(name in found and found[name].numel() != 1 for name in COUNTS):
-            raise RuntimeError("counts of another shape than one number has")
-        if "stage" in found and not 0 <= int(found["stage"]) < len(self.resolutions):
-            raise RuntimeError(f"stage {int(found['stage'])} of {len(self.resolutions)}")
-        if "index" not in found:
-            return
-        index = found["index"]
-        kept = index[index > 0]
-        rising = torch.equal(kept, torch.arange(1, len(kept) + 1).to(kept))
-        if index.dtype != torch.int32 or not of_grid(index) or int(index.min()) < 0 or not rising:
-            raise RuntimeError("an index that is none of a cubic grid")
-        rows = len(kept) + 1
-        shapes = {"seen": (rows,), "log_density": (rows,), "colours": (rows, 3), "views": (rows, 3 * self.terms)}
-        for name, shape in shapes.items():
-            if name in found and found[name].shape != shape:
-                raise RuntimeError(f"{name} of shape {tuple(found[name].shape)}, where the index asks for {shape}")
+    def set_extra_state(self, state: Tensor) -> None:
+        self.stage, self.steps, self.started = state.tolist()
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        """Takes the sizes of the loaded state: a grid of another stage has other shapes.
+        """Takes the size of the loaded state: a grid of another stage has other shapes.
 
         Raises:
-            RuntimeError: where they are none of such a grid.
+            RuntimeError: where vertices are none of a cubic grid.
         """
-        self._check(prefix, state_dict)
-        for name in COUNTS:
-            if prefix + name in state_dict:
-                setattr(self, name, int(state_dict.pop(prefix + name)))
-        for name in ("index", "seen"):
-            if prefix + name in state_dict:
-                setattr(self, name, torch.empty_like(state_dict[prefix + name], device=self.aabb.device))
-        for name in TABLES:
-            if prefix + name in state_dict:
-                replace_data(getattr(self, name), torch.empty_like(state_dict[prefix + name], device=self.aabb.device))
+        if (kept := state_dict.get(f"{prefix}kept")) is not None:
+            if (
+                kept.dtype != torch.bool
+                or kept.ndim != 1
+                or round(len(kept) ** (1 / 3)) ** 3 != len(kept)
+                or not len(kept)
+            ):
+                raise RuntimeError("vertices that are none of a cubic grid")
+            rows = int(kept.sum()) + 1
+            self.set_vertices(
+                kept.to(self.aabb.device), [table.new_empty(rows, table[0].numel()) for table in self.tables]
+            )
         super()._load_from_state_dict(state_dict, prefix, *rest)
-        self.find_vertices()
-
-
-def of_grid(vertices: Tensor) -> bool:
-    """Whether there is one for each vertex of a cubic grid, in a row."""
-    return vertices.ndim == 1 and len(vertices) > 0 and round(len(vertices) ** (1 / 3)) ** 3 == len(vertices)

@@ -1,6 +1,8 @@
 """Between cameras and samplers: small corrections of cameras and light, learned together with the field."""
 
+from nerf_lightning.refine.color_correction import ColorCorrection
 from nerf_lightning.refine.corrections import Corrections
-from nerf_lightning.refine.found import summary, told
+from nerf_lightning.refine.pose_refinement import PoseRefinement
+from nerf_lightning.refine.report import format_report, summarize_corrections
 
-__all__ = ["Corrections", "summary", "told"]
+__all__ = ["ColorCorrection", "Corrections", "PoseRefinement", "format_report", "summarize_corrections"]

@@ -13,7 +13,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.render.camera_path import CameraPath
 from nerf_lightning.render.video import Image
 from nerf_lightning.renderer import over
-from nerf_lightning.renderer.renderer import NAMED
+from nerf_lightning.renderer.background import COLORS
 from nerf_lightning.system import NeRF3D
 
 Colour = tuple[float, float, float]
@@ -40,7 +40,7 @@ def parse_background(text: str) -> Colour | None:
     if text in ("scene", "transparent"):
         return None
     try:
-        red, green, blue = NAMED.get(text) or map(float, text.split(","))
+        red, green, blue = COLORS.get(text) or map(float, text.split(","))
     except ValueError:
         red = green = blue = -1.0
     if not all(0 <= part <= 1 for part in (red, green, blue)):
@@ -51,7 +51,7 @@ def parse_background(text: str) -> Colour | None:
 
 def check_photos_background(colour: Colour | None, system: NeRF3D, path: CameraPath) -> None:
     """Raises InputError where photos have a background that cannot be taken off."""
-    own = system.renderer.colour.tolist()
+    own = system.renderer.background.color.tolist()
     if path.photos is not None and path.photos.channels == 3 and not np.allclose(colour or own, own, atol=1e-3):
         expected = f"scene: these photos have no alpha, and their background is {[round(part, 3) for part in own]}"
         raise InputError("render", "background", str(colour), expected)

@@ -1,5 +1,6 @@
 """Stage 5, renderer: Samples with density and rgb -> colour, opacity, depth."""
 
-from nerf_lightning.renderer.renderer import FieldFn, Rendered, VolumeRenderer, over
+from nerf_lightning.renderer.background import Background
+from nerf_lightning.renderer.renderer import FieldFn, RenderOutput, VolumeRenderer, over
 
-__all__ = ["FieldFn", "Rendered", "VolumeRenderer", "over"]
+__all__ = ["Background", "FieldFn", "RenderOutput", "VolumeRenderer", "over"]

@@ -5,7 +5,7 @@ from torch import Generator
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import inverse_cdf
-from nerf_lightning.sampler.samples import DensityFn, Samples, interval_weights, pack
+from nerf_lightning.sampler.samples import CHUNK, DensityFn, Samples, interval_weights, pack
 from nerf_lightning.sampler.uniform import UniformSampler
 from nerf_lightning.utils.options import Count
 
@@ -20,10 +20,13 @@ class ImportanceSampler(UniformSampler):
         samples: intervals of the first pass.
         fine: further samples per ray.
         stratified: jitter both passes in training.
+        chunk: see `Sampler`.
     """
 
-    def __init__(self, bounds: Bounds, samples: Count = 64, fine: Count = 64, stratified: bool = True):
-        super().__init__(bounds, samples, stratified)
+    def __init__(
+        self, bounds: Bounds, samples: Count = 64, fine: Count = 64, stratified: bool = True, chunk: int = CHUNK
+    ):
+        super().__init__(bounds, samples, stratified, chunk)
         self.fine = fine
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:

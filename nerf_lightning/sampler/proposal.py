@@ -1,21 +1,20 @@
 """Proposals: a small field of density alone learns where the large one's samples are worth their time."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import along, resample
 from nerf_lightning.model.hashgrid import HashGrid
-from nerf_lightning.sampler.samples import DensityFn, Histogram, Proposals, Sampler, Samples, interval_weights
-from nerf_lightning.utils.options import Count, Entries, Layers, Side
+from nerf_lightning.sampler.samples import CHUNK, DensityFn, Histogram, Proposals, Sampler, Samples, interval_weights
+from nerf_lightning.utils.options import Above, AtMost, Below, Count, Entries, Layers, Side
 
-START = -1.0
+INIT_LOG_DENSITY = -1.0
 """Logarithm of the density that proposals begin with, 1 / half-size: thin fog."""
-SLOPE = 10.0
+ANNEAL_SLOPE = 10.0
 """How quickly proposals come to count in full."""
 
 
@@ -36,9 +35,7 @@ class ProposalSampler(Sampler):
         levels, coarsest, finest, log2_entries: of the small field, see `HashGrid`.
         final: what its learning rate has fallen to in the end, besides the schedule. A small field that goes on learning
             quickly follows every flicker of the large one, which then has no samples where plain surfaces really are.
-
-    Raises:
-        InputError: padding that is not above 0 and below 1, or `final` that is not above 0 and at most 1.
+        chunk: see `Sampler`.
     """
 
     def __init__(
@@ -48,18 +45,15 @@ class ProposalSampler(Sampler):
         first: Count = 48,
         second: Count = 24,
         anneal: int = 500,
-        padding: float = 0.01,
+        padding: Annotated[float, Above(0), Below(1)] = 0.01,
         levels: Layers = 2,
         coarsest: Side = 32,
         finest: Side = 128,
         log2_entries: Entries = 18,
-        final: float = 0.02,
+        final: Annotated[float, Above(0), AtMost(1)] = 0.02,  # at 0 it would learn nothing after the first step
+        chunk: int = CHUNK,
     ):
-        super().__init__(bounds)
-        if not 0 < padding < 1:
-            raise InputError("sampler.padding", "", str(padding), "above 0, below 1")
-        if not 0 < final <= 1:  # at 0 they would learn nothing after the first step
-            raise InputError("sampler.final", "", str(final), "above 0, at most 1")
+        super().__init__(bounds, chunk)
         self.samples = samples
         self.first, self.second = first, second
         self.anneal = anneal
@@ -71,56 +65,59 @@ class ProposalSampler(Sampler):
         """The step at which training began."""
         self.step = 0
 
-    @property
-    def groups(self) -> list[dict[str, Any]]:
-        return [{"params": list(self.parameters()), "final": self.final}]
+    def param_groups(self) -> list[dict[str, Any]]:
+        return [{"name": "sampler", "params": list(self.parameters())}]
+
+    def lr_factors(self, progress: float) -> dict[str, float]:
+        return {"sampler": self.final**progress}
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
         count, device = len(rays), near.device
         s = torch.linspace(0, 1, self.first + 1, device=device).expand(count, -1)
         if generator is not None:
-            s = torch.cat([s[:, :1], s[:, 1:-1] + self._shift(rays, generator) / self.first, s[:, -1:]], dim=1)
+            s = torch.cat([s[:, :1], s[:, 1:-1] + self._jitter(rays, generator) / self.first, s[:, -1:]], dim=1)
         histograms: list[Histogram] = []
         for wanted in (self.second, self.samples):
             with torch.set_grad_enabled(generator is not None):
                 histograms.append(Histogram(s, self.weights(rays, near, far, s)))
             share = histograms[-1].weights.detach() + self.padding / s.shape[1]
             if generator is not None:
-                share = share**self.trust
-            s = resample(s, share, self._shift(rays, generator)[:, 0], wanted)
+                share = share**self.anneal_exponent
+            s = resample(s, share, self._jitter(rays, generator)[:, 0], wanted)
         _, t, dt = along(rays, self.bounds, near, far, s)
         ray = torch.arange(count, device=device).repeat_interleave(self.samples)
         offsets = torch.arange(count + 1, device=device) * self.samples
         proposals = None if generator is None else Proposals(tuple(histograms), s)
         return Samples(t.flatten(), dt.flatten(), ray, offsets, proposals=proposals)
 
-    def _shift(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "R 1"]:
+    def _jitter(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "R 1"]:
         """By how much of an interval edges move, in -1/2 ... 1/2; not at all without a generator."""
         if generator is None:
             return torch.zeros(len(rays), 1, device=rays.origins.device)
         return torch.rand(len(rays), 1, generator=generator, device=rays.origins.device) - 0.5
 
     @property
-    def trust(self) -> float:
+    def anneal_exponent(self) -> float:
         """The power of the proposals: 0 spreads samples evenly, 1 follows them (mip-NeRF 360, section 3.2)."""
         share = min(1.0, (self.step - self.first_step + 1) / max(self.anneal, 1))
-        return SLOPE * share / ((SLOPE - 1) * share + 1)
+        return ANNEAL_SLOPE * share / ((ANNEAL_SLOPE - 1) * share + 1)
 
     def weights(
         self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "R S_plus_1"]
     ) -> Float[Tensor, "R S"]:
         """How much the small field thinks that each interval contributes to its ray's pixel, see `volume_weights`."""
         unit, t, dt = along(rays, self.bounds, near, far, s)
-        density = torch.exp(self.grid(unit).sum(1) + START)
+        density = torch.exp(self.grid(unit).sum(1) + INIT_LOG_DENSITY)
         return interval_weights(density.view(t.shape) * (dt / self.unit_length))
 
-    def loss(self, samples: Samples, weights: Float[Tensor, "N"]) -> Tensor | None:
-        if samples.proposals is None:
-            return None
+    def losses(self, samples: Samples, weights: Float[Tensor, "N"] | None) -> dict[str, Float[Tensor, ""]]:
+        if samples.proposals is None or weights is None:
+            return {}
         histograms, edges = samples.proposals
-        found = weights.view(len(edges), -1)
-        return torch.stack([interlevel_loss(edges, found, histogram) for histogram in histograms]).sum()
+        found = weights.detach().view(len(edges), -1)
+        terms = [interlevel_loss(edges, found, histogram) for histogram in histograms]
+        return {"interlevel": torch.stack(terms).sum()}
 
     def export_state(self) -> dict[str, Tensor]:
         return {"tables": self.grid.tables.detach()}

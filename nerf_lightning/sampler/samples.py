@@ -9,15 +9,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Cameras, InBounds, Rays
+from nerf_lightning.cameras import Bounds, Cameras, InBounds, Rays
 from nerf_lightning.kernels import merge_faint, pack_intervals, points
 
 DensityFn = Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N"]]
 """World positions -> density (1 / world unit); all that samplers know of a field."""
 
 
-RAY_SAMPLES = 8
-"""Samples that a ray takes about; most rays take few, or many that need little room."""
+CHUNK = 1 << 15
+"""Default of `Sampler`'s and `System`'s chunk."""
+SAMPLES_PER_RAY = 8
+"""That a ray takes about; most rays take few, or many that need little memory."""
 FAINT = 0.01
 """Weight below which a sample of a picture takes its neighbour's colour: a quarter of Lego's at 800 pixels, for 0.001 dB."""
 
@@ -122,20 +124,29 @@ def split(samples: Samples, most: int) -> Iterator[tuple[slice, Samples]]:
 
 
 class Sampler(InBounds):
-    """Base of samplers. Without a generator (evaluation) the samples are not random."""
+    """Base of samplers. Without a generator (evaluation) the samples are not random.
 
-    chunk = 1 << 15
-    """Samples that a device renders at a time; samplers work on multiples of it."""
+    Args:
+        bounds: where the content is.
+        chunk: samples that a device renders at a time; samplers work on multiples of it.
+    """
+
+    def __init__(self, bounds: Bounds, chunk: int = CHUNK):
+        super().__init__(bounds)
+        self.chunk = chunk
 
     @property
     def rays_at_once(self) -> int:
         """Rays to sample together without gradient."""
-        return max(1, self.chunk // RAY_SAMPLES)
+        return max(1, self.chunk // SAMPLES_PER_RAY)
 
-    @property
-    def groups(self) -> list[dict[str, Any]]:
-        """The optimiser's groups of what is learned at a rate of its own, see `System.learned`."""
+    def param_groups(self) -> list[dict[str, Any]]:
+        """The optimiser's groups of what is learned at a rate of its own, each with a name."""
         return []
+
+    def lr_factors(self, progress: float) -> dict[str, float]:
+        """Factors on the scheduled learning rate of these groups after this share of the training, by name."""
+        return {}
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         raise TypeError(f"{type(self).__name__} must define forward(rays, density, generator) -> Samples")
@@ -155,23 +166,23 @@ class Sampler(InBounds):
         """Copies what another sampler of the same kind and size has learned."""
         self.load_state_dict(other.state_dict())
 
-    def look_through(self, cameras: Cameras) -> None:
+    def mark_invisible_cells(self, cameras: Cameras) -> None:
         """Called before training with the photos' cameras, for samplers that skip what no camera sees."""
 
-    def refine(self, finer: float) -> None:
-        """Called when the field is `finer` than usual, see `Field.finer`, for samplers whose steps follow it."""
+    def set_resolution_scale(self, scale: float) -> None:
+        """Called with the field's `resolution_scale`, for samplers whose steps follow it."""
 
     def restart(self, step: int) -> None:
         """Called when training starts again at a step, with a fresh field."""
 
-    def loss(self, samples: Samples, weights: Float[Tensor, "N"]) -> Tensor | None:
-        """What training adds to the squared error so that the sampler learns, or None.
+    def losses(self, samples: Samples, weights: Float[Tensor, "N"] | None) -> dict[str, Float[Tensor, ""]]:
+        """Losses by name from which the sampler learns.
 
         Args:
             samples: that it gave.
-            weights: how much each contributed to its ray's pixel.
+            weights: how much each contributed to its ray's pixel, if known.
         """
-        return None
+        return {}
 
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         """Called before each training step, for samplers that learn where the content is."""

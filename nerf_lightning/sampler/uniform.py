@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.sampler.samples import DensityFn, Sampler, Samples, pack
+from nerf_lightning.sampler.samples import CHUNK, DensityFn, Sampler, Samples, pack
 from nerf_lightning.utils.options import Count
 
 
@@ -24,10 +24,11 @@ class UniformSampler(Sampler):
         bounds: where the content is; rays that miss it get no samples.
         samples: intervals per ray.
         stratified: jitter the intervals in training, so that over time the field is evaluated everywhere.
+        chunk: see `Sampler`.
     """
 
-    def __init__(self, bounds: Bounds, samples: Count = 64, stratified: bool = False):
-        super().__init__(bounds)
+    def __init__(self, bounds: Bounds, samples: Count = 64, stratified: bool = False, chunk: int = CHUNK):
+        super().__init__(bounds, chunk)
         self.samples = samples
         self.stratified = stratified
 

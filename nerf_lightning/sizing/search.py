@@ -225,7 +225,7 @@ def find_sampler(cfg: DictConfig, data: Data, system: System, samplers: Sequence
         assert isinstance(probe, NeRF3D)  # of the same data
         probe.field = system.field
         probe.to(system.device)
-        probe.sampler.look_through(data.scene.train.cameras)
+        probe.sampler.mark_invisible_cells(data.scene.train.cameras)
         for number in range(GRID_UPDATES):
             step = number * getattr(probe.sampler, "update_every", 1)
             generator = step_generator(probe.seed, Stream.STUDY, number, probe.device)

@@ -6,6 +6,7 @@ from nerf_lightning.system.metrics import mse_to_psnr, psnr, ssim
 from nerf_lightning.system.nerf2d import NeRF2D
 from nerf_lightning.system.nerf3d import NeRF3D
 from nerf_lightning.system.schedule import constant, cosine, exponential
+from nerf_lightning.system.state import TrainingClock, TrainingState
 from nerf_lightning.system.system import StepStats, System, ViewResult
 
 __all__ = [
@@ -14,6 +15,8 @@ __all__ = [
     "NeRF3D",
     "StepStats",
     "System",
+    "TrainingClock",
+    "TrainingState",
     "ViewResult",
     "aligned_psnr",
     "constant",

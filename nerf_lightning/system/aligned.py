@@ -12,7 +12,16 @@ from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import over
 from nerf_lightning.system.metrics import mse_to_psnr
 from nerf_lightning.system.nerf3d import NeRF3D
-from nerf_lightning.system.trial import LIGHT, POSES, derivatives, least_squares, seen_by, some_pixels, squared_errors
+from nerf_lightning.system.trial import (
+    LIGHT,
+    POSES,
+    derivatives,
+    frozen_render,
+    least_squares,
+    seen_by,
+    some_pixels,
+    squared_errors,
+)
 from nerf_lightning.utils.progress import tracked
 from nerf_lightning.utils.seeding import Stream, step_generator
 
@@ -39,9 +48,9 @@ def halves(views: Views, view: int) -> tuple[Int[Tensor, "L"], Int[Tensor, "R"]]
 
 def fitted(system: NeRF3D, views: Views, half: int, corrections: Corrections, count: int) -> None:
     """Finds corrections with which a field, that stays as it is, fits `count` pixels of this half of each photo best."""
-    see, behind = system.as_it_is(), system.renderer.colour
+    see, behind = frozen_render(system), system.renderer.background.color
     generator = step_generator(system.seed, Stream.STUDY, 1, system.device)
-    poses, light = ("poses" in corrections.since), ("light" in corrections.since)
+    poses, light = ("poses" in corrections.enabled_at), ("light" in corrections.enabled_at)
     together = TOGETHER if poses else 0
     for step in tracked(range(together + APART), together + APART, "aligning held-out photos"):
         # Photo by photo, as there may be many of them.
@@ -50,7 +59,7 @@ def fitted(system: NeRF3D, views: Views, half: int, corrections: Corrections, co
         left, jacobian = (torch.cat(parts) for parts in zip(*found, strict=True))
         change = torch.zeros_like(jacobian[:, 0])
         if step < together:
-            common = corrections.common.unflatten(0, (-1, 6))
+            common = corrections.poses.gauge.unflatten(0, (-1, 6))
             shared = least_squares(left.flatten(0, 1)[None], (jacobian[..., POSES] @ common).flatten(0, 1)[None])
             change[:, POSES] = (common @ shared.mT)[..., 0]
             if light:
@@ -59,14 +68,17 @@ def fitted(system: NeRF3D, views: Views, half: int, corrections: Corrections, co
             own = slice(POSES.start if poses else LIGHT.start, LIGHT.stop if light else POSES.stop)
             change[:, own] = least_squares(left, jacobian[..., own])
         other = copy.deepcopy(corrections)
-        other.motions.data += change[:, POSES]
-        other.log_gains.data += change[:, LIGHT]
+        other.poses.motions.data += change[:, POSES]
+        other.color.log_gains.data += change[:, LIGHT]
         before, after = (
             torch.cat([squared_errors(seen_by(see, by, pixels), by, pixels, 1) for pixels in photos])
             for by in (corrections, other)
         )
         better = (after < before)[:, None]
-        for parameter, changed in ((corrections.motions, other.motions), (corrections.log_gains, other.log_gains)):
+        for parameter, changed in (
+            (corrections.poses.motions, other.poses.motions),
+            (corrections.color.log_gains, other.color.log_gains),
+        ):
             parameter.data = torch.where(better, changed.data, parameter.data)
 
 
@@ -88,13 +100,13 @@ def aligned_psnr(system: NeRF3D, views: Views, share: float = 1.0) -> list[float
     parts = [[half[:: -(-len(half) // SCORED_PIXELS)] for half in halves(views, view)] for view in range(len(views))]
     squares, counts = torch.zeros(len(views), dtype=torch.float64), torch.zeros(len(views))
     for side in (0, 1):
-        corrections = system.corrections.alike(views.cameras, system.sampler.bounds).to(system.device)
+        corrections = system.corrections.for_held_out(views.cameras, system.sampler.bounds).to(system.device)
         fitted(system, views, side, corrections, max(MIN_PIXELS, round(share * PIXELS)))
         with torch.no_grad():
             for view, part in enumerate(parts):
                 given, of = rays_through(views, part[1 - side])
-                seen, behind = system.render(corrections.rays(given, of)), system.renderer.backgrounds(len(of))
-                rgb = corrections.lit(seen.rgb, seen.opacity, behind, given, of).clamp(0, 1)
+                seen, behind = system.render(corrections.poses(given, of)), system.renderer.background.sample(len(of))
+                rgb = corrections.color(seen.rgb, seen.opacity, behind, given, of).clamp(0, 1)
                 squares[view] += float((rgb - over(views.pixels[part[1 - side]], behind)).square().sum())
                 counts[view] += rgb.numel()
     return [mse_to_psnr(mse) for mse in (squares / counts.clamp_min(1)).tolist()]

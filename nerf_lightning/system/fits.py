@@ -24,7 +24,7 @@ def psnr_of_photos(system: NeRF3D, views: Views) -> list[float]:
     """
     views = views.to(system.device)
     generator = step_generator(system.seed, Stream.STUDY, 2, system.device)
-    pixels = some_pixels(views, range(len(views)), PIXELS, system.renderer.colour, generator)
+    pixels = some_pixels(views, range(len(views)), PIXELS, system.renderer.background.color, generator)
     seen = seen_by(lambda rays, _: system.render(rays), system.corrections, pixels)
     squares = squared_errors(seen, system.corrections, pixels, len(views))
     known = pixels.known.view(len(views), -1).sum(1)

@@ -6,9 +6,11 @@ from torch import Tensor
 
 from nerf_lightning.dataset import PictureBatch, PixelBatch
 from nerf_lightning.model import PictureField
+from nerf_lightning.sampler import CHUNK
 from nerf_lightning.system.compiled import part
 from nerf_lightning.system.metrics import psnr
-from nerf_lightning.system.system import CHUNK, MakeOptimizer, Schedule, StepStats, System
+from nerf_lightning.system.state import TrainingState
+from nerf_lightning.system.system import MakeOptimizer, Schedule, StepStats, System
 
 PIXELS = 2
 """Pixels rendered at once for each sample of `chunk`."""
@@ -25,22 +27,26 @@ class NeRF2D(System):
 
     Args:
         field: place -> rgb.
-        optimizer, schedule, seed, chunk: see `System`.
+        optimizer, schedule, seed, chunk, backend, state: see `System`.
     """
 
     field: PictureField
 
     def __init__(
-        self, field: PictureField, optimizer: MakeOptimizer, schedule: Schedule, seed: int = 0, chunk: int = CHUNK
+        self,
+        field: PictureField,
+        optimizer: MakeOptimizer,
+        schedule: Schedule,
+        seed: int = 0,
+        chunk: int = CHUNK,
+        backend: str | None = None,
+        state: TrainingState | None = None,
     ):
-        super().__init__(optimizer, schedule, seed, chunk)
+        super().__init__(optimizer, schedule, seed, chunk, backend, state)
         self.field = field
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        optimizer = super().configure_optimizers()
-        for group in optimizer.param_groups:
-            group["initial_lr"] = group["lr"] = group["lr"] * self.field.rate
-        return optimizer
+    def lr_factors(self, progress: float, step: int) -> dict[str, float]:
+        return {"field": self.field.rate * self.schedule(progress, step)}
 
     def loss(self, batch: PixelBatch) -> Float[Tensor, ""]:
         """What a step minimises."""
@@ -48,7 +54,7 @@ class NeRF2D(System):
 
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
         loss = self.loss(batch)
-        self.stats = StepStats(loss.detach(), len(batch.uv), len(batch.uv), terms={"rgb": loss.detach()})
+        self.stats = StepStats(loss.detach(), len(batch.uv), len(batch.uv), losses={"photometric": loss.detach()})
         return loss
 
     def truth(self, batch: PixelBatch) -> Tensor:

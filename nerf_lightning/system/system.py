@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -17,14 +16,13 @@ from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.system.metrics import psnr, ssim
+from nerf_lightning.system.state import TrainingState
 from nerf_lightning.utils.device import synchronize
 from nerf_lightning.utils.memory import give_back_freed_memory
 
 MakeOptimizer = Callable[[list[dict[str, Any]]], torch.optim.Optimizer]
 Schedule = Callable[[float, int], float]
-"""Progress in [0, 1] -> factor on the learning rate."""
-CHUNK = 1 << 15
-"""Default of `System`'s chunk."""
+"""Progress in [0, 1] and step -> factor on the learning rate."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ class StepStats:
     """Squared error of each ray, on the device."""
     whole: Bool[Tensor, "R"] | None = None
     """Which rays have all their samples; None for all."""
-    terms: Mapping[str, Tensor] = field(default_factory=dict)
+    losses: Mapping[str, Tensor] = field(default_factory=dict)
     """What the loss is the sum of, by name, on the device."""
 
     @property
@@ -88,6 +86,12 @@ class ViewResult:
         return (self.rgb - self.comparable).abs()
 
 
+def total_loss(losses: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+    """What a step minimises: the sum of its losses."""
+    first, *others = losses.values()
+    return sum(others, first)
+
+
 class System(L.LightningModule):
     """Base of the two systems.
 
@@ -96,24 +100,28 @@ class System(L.LightningModule):
         schedule: factor on its learning rate by progress and step.
         seed: of all randomness in training steps.
         chunk: samples rendered at once without gradient: bounds the memory that a view of any size takes.
+        backend: compiler of the parts of a training step, see `compiled.part`; None does not compile.
+        state: of the training, shared with the callbacks that steer it; None makes one.
     """
 
     field: Field | PictureField
 
-    def __init__(self, optimizer: MakeOptimizer, schedule: Schedule, seed: int, chunk: int):
+    def __init__(
+        self,
+        optimizer: MakeOptimizer,
+        schedule: Schedule,
+        seed: int,
+        chunk: int,
+        backend: str | None = None,
+        state: TrainingState | None = None,
+    ):
         super().__init__()
         self.make_optimizer = optimizer
         self.schedule = schedule
         self.seed = seed
         self.chunk = chunk
-        self.progress = 0.0
-        """Share of the training done: set by the Budget callback; without one, the share of the trainer's max_steps."""
-        self.paused: Callable[[], AbstractContextManager[None]] | None = None
-        """Stops the Budget callback's clock; None without one."""
-        self.rate = 1.0
-        """Further factor on the learning rate: the Guard callback lowers it when training breaks down."""
-        self.backend: str | None = None
-        """Compiler of the parts of a training step, see `compiled.part`; None does not compile."""
+        self.backend = backend
+        self.state = state or TrainingState()
         self.stats = StepStats(torch.tensor(math.nan), 0, 0)
 
     def warm_start_from(self, smaller: "System") -> None:
@@ -121,33 +129,30 @@ class System(L.LightningModule):
         field: Any = self.field
         field.warm_start_from(smaller.field)
 
-    def learned(self) -> list[dict[str, Any]]:
-        """The optimiser's groups of parameters.
+    def param_groups(self) -> list[dict[str, Any]]:
+        """The optimiser's groups of parameters, each with a name; without `lr`, one takes the optimiser's own."""
+        return [{"name": "field", "params": list(self.parameters())}]
 
-        Those that say no learning rate `lr` take the optimiser's own, and those that say `final` have it fall to this share by
-        the end, besides the schedule.
-        """
-        return [{"params": list(self.parameters())}]
+    def lr_factors(self, progress: float, step: int) -> dict[str, float]:
+        """Factors on the groups' learning rates, by name."""
+        return {"field": self.schedule(progress, step)}
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        optimizer = self.make_optimizer(self.learned())
+        optimizer = self.make_optimizer(self.param_groups())
         for group in optimizer.param_groups:
             group["initial_lr"] = group["lr"]
         return optimizer
 
-    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        if self.paused is None and self.trainer.max_steps > 0:
-            self.progress = self.global_step / self.trainer.max_steps
-        factor = self.schedule(self.progress, self.global_step) * self.rate
-        for group in self.parameter_groups:
-            group["lr"] = group["initial_lr"] * factor * group.get("final", 1.0) ** self.progress
+    def set_learning_rates(self, optimizer: torch.optim.Optimizer, step: int) -> None:
+        """Sets each group's learning rate for a step."""
+        factors = self.lr_factors(self.state.progress, step)
+        for group in optimizer.param_groups:
+            group["lr"] = group["initial_lr"] * factors[group["name"]] * self.state.lr_scale
 
-    @property
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        """The optimiser's groups, with their present learning rates `lr`."""
-        optimizer = self.optimizers(use_pl_optimizer=False)
-        assert isinstance(optimizer, torch.optim.Optimizer)  # configure_optimizers makes exactly one
-        return optimizer.param_groups
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        if self.trainer.max_steps > 0:
+            self.state.advance(max(self.state.progress, self.global_step / self.trainer.max_steps))
+        self.set_learning_rates(self.trainer.optimizers[0], self.global_step)
 
     def truth(self, batch: Any) -> Float[Tensor, "N 3"]:
         """The colours that a batch should have in evaluation."""

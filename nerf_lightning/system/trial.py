@@ -2,8 +2,11 @@
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from functools import partial
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import lightning as L
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
@@ -12,10 +15,16 @@ from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.rays import rays_through
 from nerf_lightning.refine import Corrections
-from nerf_lightning.refine.poses import spanned, without
-from nerf_lightning.renderer import Rendered, over
+from nerf_lightning.refine.gauge import orthonormal_basis, project_out
+from nerf_lightning.renderer import RenderOutput, over
+from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.utils.text import subsample
 
+if TYPE_CHECKING:
+    from nerf_lightning.system.nerf3d import NeRF3D
+
+UNSURE_SHARE, DRAWS = 0.5, 4
+"""Share of what corrections have to explain from which on this many draws of pixels decide, by their mean."""
 PHOTOS, PIXELS = 64, 128
 """How many photos are looked at, and pixels of each that decide; as many others judge."""
 DAMPING = 0.3
@@ -24,7 +33,7 @@ TINY = 1e-6
 """Likewise, of the mean over a photo's unknowns: some have no effect at all."""
 POSES, LIGHT = slice(0, 6), slice(6, 9)
 """Columns of the unknowns: a camera's `motions`, then its `log_gains`."""
-See = Callable[[Rays, Float[Tensor, "R 3"]], Rendered]
+See = Callable[[Rays, Float[Tensor, "R 3"]], RenderOutput]
 """Renders rays onto backgrounds, with gradient in the rays."""
 
 
@@ -61,19 +70,21 @@ def some_pixels(
     return Pixels(rays, view, over(views.pixels[places], backgrounds), backgrounds, views.mask[places])
 
 
-def seen_by(see: See, corrections: Corrections | None, pixels: Pixels) -> Rendered:
+def seen_by(see: See, corrections: Corrections | None, pixels: Pixels) -> RenderOutput:
     """What cameras see through these pixels, as corrected if they are."""
     with torch.no_grad():
-        rays = pixels.rays if corrections is None else corrections.rays(pixels.rays, pixels.views)
+        rays = pixels.rays if corrections is None else corrections.poses(pixels.rays, pixels.views)
         return see(rays, pixels.behind)
 
 
-def squared_errors(seen: Rendered, corrections: Corrections | None, pixels: Pixels, photos: int) -> Float[Tensor, "V"]:
+def squared_errors(
+    seen: RenderOutput, corrections: Corrections | None, pixels: Pixels, photos: int
+) -> Float[Tensor, "V"]:
     """Of each photo: the sum over its known pixels and their channels, in corrected light if it is."""
     with torch.no_grad():
         rgb = seen.rgb
         if corrections is not None:
-            rgb = corrections.lit(rgb, seen.opacity, pixels.behind, pixels.rays, pixels.views)
+            rgb = corrections.color(rgb, seen.opacity, pixels.behind, pixels.rays, pixels.views)
         rgb = rgb.clamp(0, 1)
         return ((rgb - pixels.truth).square().sum(1) * pixels.known).view(photos, -1).sum(1)
 
@@ -84,16 +95,18 @@ def derivatives(
     """What is left to explain of one channel of each pixel, red, green and blue in turn, and how it follows its photo's
     `motions` and `log_gains`. All three channels would cost three times the gradient and say little more."""
     with torch.no_grad():
-        rays = corrections.rays(pixels.rays, pixels.views)
+        rays = corrections.poses(pixels.rays, pixels.views)
     origins, directions = (x.detach().requires_grad_() for x in (rays.origins, rays.directions))
     channel = (torch.arange(len(pixels.views), device=directions.device) % 3)[:, None]
     with torch.enable_grad():
         seen = see(Rays(origins, directions), pixels.behind)
-        rgb = corrections.lit(seen.rgb, seen.opacity, pixels.behind, pixels.rays, pixels.views, pixels.truth)
+        rgb = corrections.color(seen.rgb, seen.opacity, pixels.behind, pixels.rays, pixels.views, pixels.truth)
         moves, turns = torch.autograd.grad(rgb.gather(1, channel).sum(), (origins, directions))
     with torch.no_grad():
         turns = torch.linalg.cross(directions, turns, dim=1)
-        by_motion = torch.cat([turns, moves], dim=1)[:, None] @ corrections.scales.index_select(0, pixels.views)
+        by_motion = torch.cat([turns, moves], dim=1)[:, None] @ corrections.poses.preconditioner.index_select(
+            0, pixels.views
+        )
         lit = rgb - (1 - seen.opacity)[:, None] * pixels.behind
         by_gain = torch.zeros_like(lit).scatter(1, channel, lit.gather(1, channel))
         counted = pixels.known[:, None].float()
@@ -117,13 +130,13 @@ def changed(
     trial = copy.deepcopy(corrections)
     with torch.no_grad():
         if motions is not None:
-            trial.motions.requires_grad_(True)
-            trial.motions[chosen] += without(
-                motions, spanned(corrections.common.unflatten(0, (-1, 6))[chosen].flatten(0, 1))
+            trial.poses.motions.requires_grad_(True)
+            trial.poses.motions[chosen] += project_out(
+                motions, orthonormal_basis(corrections.poses.gauge.unflatten(0, (-1, 6))[chosen].flatten(0, 1))
             )
         if log_gains is not None:
-            trial.log_gains.requires_grad_(True)
-            trial.log_gains[chosen] += log_gains - log_gains.mean(0)
+            trial.color.log_gains.requires_grad_(True)
+            trial.color.log_gains[chosen] += log_gains - log_gains.mean(0)
     return trial
 
 
@@ -151,7 +164,9 @@ def worth(
     deciding, judging = (some_pixels(views, chosen, PIXELS, behind, generator) for _ in range(2))
     left, jacobian = derivatives(see, corrections, deciding, len(chosen))
 
-    def errors(motions: Tensor | None, log_gains: Tensor | None, seen: Rendered | None = None) -> Float[Tensor, "V"]:
+    def errors(
+        motions: Tensor | None, log_gains: Tensor | None, seen: RenderOutput | None = None
+    ) -> Float[Tensor, "V"]:
         trial = changed(corrections, chosen, motions, log_gains)
         return squared_errors(seen or seen_by(see, trial, judging), trial, judging, len(chosen))
 
@@ -166,7 +181,37 @@ def worth(
         fallen = {
             "poses": torch.minimum(as_it_is, only_light) - torch.minimum(only_poses, corrected),
             "light": torch.minimum(as_it_is, only_poses) - torch.minimum(only_light, corrected),
-            "stated": as_it_is - errors(None, corrections.stated[chosen], given),
+            "stated": as_it_is - errors(None, corrections.color.stated[chosen], given),
         }
     shares = {name: by / as_it_is for name, by in fallen.items()}  # nan where all is masked
     return {name: float(share.nanmedian().nan_to_num()) for name, share in shares.items()}
+
+
+def frozen_render(system: "NeRF3D") -> See:
+    """Renders without randomness and with gradient in the rays alone: the field does not learn from it."""
+    field, renderer = copy.deepcopy(system.field).requires_grad_(False), copy.deepcopy(system.renderer).eval()
+
+    def see(rays: Rays, behind: Tensor) -> RenderOutput:
+        with torch.no_grad():
+            samples = system.sampler(rays.detach(), field.density)
+        return renderer(rays, samples, field, behind)
+
+    return see
+
+
+class TryCorrections(L.Callback):
+    """Corrects cameras and light from the first trial on that shows that it helps; where it might, more pixels are asked."""
+
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: "NeRF3D", batch: Any, batch_idx: int) -> None:
+        corrections, step, progress = pl_module.corrections, trainer.global_step, pl_module.state.progress
+        if corrections is None or not corrections.is_trial_due(step, progress):
+            return
+        views = pl_module.data.scene.train.to(pl_module.device)
+        generator = step_generator(pl_module.seed, Stream.TRIAL, step, pl_module.device)
+        color, light = pl_module.renderer.background.color, "light" in corrections.list_candidates(step)
+        ask = partial(worth, frozen_render(pl_module), views, color, corrections, generator, light)
+        found = ask()
+        if corrections.choose(step, found, UNSURE_SHARE):
+            several = [found, *(ask() for _ in range(DRAWS - 1))]
+            found = {name: fmean(one[name] for one in several) for name in found}
+        corrections.decide(step, progress, found)

@@ -35,7 +35,7 @@ from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, S
 from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
-from nerf_lightning.refine import summary, told
+from nerf_lightning.refine import format_report, summarize_corrections
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.find import link_latest
@@ -44,6 +44,7 @@ from nerf_lightning.runs.owner import clear
 from nerf_lightning.runs.scene_file import load_scene, save_scene
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND, check_compiler
+from nerf_lightning.system.system import total_loss
 from nerf_lightning.training.loggers import TensorBoard, finishing_wandb, log_summary
 from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.machine import CROWDED, crowding
@@ -152,8 +153,7 @@ def prepare_system(
     what = "numbers, with their gradients and moments,"
     check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
     if isinstance(system, NeRF3D) and system.corrections is not None and poses_are_off:
-        system.corrections.begin_poses()
-    system.backend = BACKEND if cfg.compile else None
+        system.corrections.enable_poses_at_once()
     if system.field.sizing:
         log.info("model: %s", system.field.sizing)
     check_background(cfg, data, system)
@@ -177,7 +177,7 @@ def fit(
     except Exception as error:
         if checkpoint is None and trainer.global_step == 0 and trainer.is_global_zero and out_of_memory(error):
             clear(folder)  # nothing was trained
-        if checkpoint is None or Budget.of(trainer).began or isinstance(error, InputError):
+        if checkpoint is None or Budget.of(trainer).state.clock.started or isinstance(error, InputError):
             raise
         found = f"{type(error).__name__}: {error}"  # only the checkpoint has been at work yet
         raise InputError(checkpoint, "", found, "a state of this run to continue from", "start the run anew") from error
@@ -185,14 +185,14 @@ def fit(
 
 def report_photos(system: System, data: RayDataModule | PixelDataModule, results: Results, folder: Path) -> None:
     """Saves corrected cameras, and prints what training has found out about the photos."""
-    if isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.finite:
+    if isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.is_finite:
         assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
-        if "poses" in system.corrections.since:
-            cameras = system.corrections.cameras(data.scene.train.cameras)
-            save_scene(data, folder, cameras, summary(system.corrections)["focal_factor"])
+        if "poses" in system.corrections.enabled_at:
+            cameras = system.corrections.poses.refine_cameras(data.scene.train.cameras)
+            save_scene(data, folder, cameras, summarize_corrections(system.corrections)["focal_factor"])
         found = results.summary["psnr_aligned"]
         aligned = "" if found is None else f"; {found:.2f} dB held out with held-out photos corrected too"
-        print(told(system.corrections, data.scene.train.name) + aligned)
+        print(format_report(system.corrections, data.scene.train.name) + aligned)
     if results.misfits:
         named = join_truncated([f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results.misfits], MAX_NAMED)
         print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}")
@@ -259,11 +259,10 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
         trial = copy.deepcopy(system).to(device)
         if isinstance(trial, NeRF3D):
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
-            generator, plain = step_generator(0, Stream.BATCH, 0), trial.renderer.prices_plain
+            generator, plain = step_generator(0, Stream.BATCH, 0), trial.renderer.uses_texture
             batch = draw_rays(data.scene.train, 64, generator, plain=plain).to(device)
-            # Step 1: step 0 would update the whole occupancy grid.
-            loss, _ = trial.loss(batch, step_generator(0, Stream.STEP, 0, device), 1)
-            loss.backward()
+            losses, _ = trial.compute_losses(batch, step_generator(0, Stream.STEP, 0, device))
+            total_loss(losses).backward()
         elif isinstance(trial, NeRF2D):
             uv, rgb = torch.rand(64, 5, generator=step_generator(0, Stream.BATCH, 0)).to(device).split([2, 3], dim=1)
             trial.loss(PixelBatch(uv, rgb)).backward()

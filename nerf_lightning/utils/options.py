@@ -1,6 +1,7 @@
 """Checks options against the signature they configure, so that errors name the config's keys."""
 
 import inspect
+import operator
 import types
 import typing
 from collections.abc import Callable, Container, Mapping, Sequence
@@ -30,6 +31,32 @@ class AtMost:
     value: float
 
 
+@dataclass(frozen=True)
+class Above:
+    """A lower bound that is itself too low."""
+
+    value: float
+
+
+@dataclass(frozen=True)
+class Below:
+    """An upper bound that is itself too high."""
+
+    value: float
+
+
+BOUNDS: dict[type, tuple[str, Callable[[Any, float], bool]]] = {
+    AtLeast: ("at least", operator.ge),
+    AtMost: ("at most", operator.le),
+    Above: ("above", operator.gt),
+    Below: ("below", operator.lt),
+}
+"""In words, and as a comparison."""
+Positive = Annotated[float, Above(0)]
+Weight = Annotated[float, AtLeast(0)]
+"""Of a term of the loss; 0 does without it."""
+
+
 Count = Annotated[int, AtLeast(1)]
 Side = Annotated[int, AtLeast(1), AtMost(2**20)]
 """Cells along a side of a grid: single precision tells 16 places within each apart, and their cube is below `MAX_INT`."""
@@ -39,6 +66,9 @@ Layers = Annotated[int, AtLeast(1), AtMost(1024)]
 """Layers or levels, which are made and run one after the other."""
 Octaves = Annotated[int, AtLeast(0), AtMost(127)]
 """A number of frequencies, each twice the one before: the next is infinite in single precision."""
+Fraction = Annotated[float, AtLeast(0), AtMost(1)]
+SHDegree = Annotated[int, AtLeast(0), AtMost(3)]
+"""Of spherical harmonics."""
 Seed = Annotated[int, AtLeast(0), AtMost(2**32 - 1)]
 Port = Annotated[int, AtLeast(0), AtMost(65535)]
 FramesPerSecond = Annotated[float, AtLeast(0.01), AtMost(1000)]
@@ -109,17 +139,14 @@ def _fits(value: Any, hint: Any) -> bool:
 
 def _is_within(value: Any, bound: Any) -> bool:
     """Whether a number keeps a bound; other annotations are none."""
-    if isinstance(bound, AtLeast):
-        return value >= bound.value
-    return not isinstance(bound, AtMost) or value <= bound.value
+    return type(bound) not in BOUNDS or BOUNDS[type(bound)][1](value, bound.value)
 
 
 def _describe(hint: Any) -> str:
     """An annotation in words."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        sides = {AtLeast: "at least", AtMost: "at most"}
-        bounds = [f"{sides[type(bound)]} {bound.value:.12g}" for bound in arguments[1:] if type(bound) in sides]
+        bounds = [f"{BOUNDS[type(bound)][0]} {bound.value:.12g}" for bound in arguments[1:] if type(bound) in BOUNDS]
         return f"{_describe(arguments[0])} {' and '.join(bounds)}"
     if origin in (typing.Union, types.UnionType):
         return " or ".join(_describe(argument) for argument in arguments)

@@ -15,7 +15,7 @@ from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.frame import CHANNELS
 from nerf_lightning.drawing.ink import GREEN, GREY, VERMILLION, rgb
-from nerf_lightning.renderer.renderer import NAMED
+from nerf_lightning.renderer.background import COLORS
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.view.drawing import box_edges, home_of
 from nerf_lightning.view.page import Page
@@ -70,8 +70,8 @@ class FieldPage(Page):
         super().__init__(name, home, distance, host, port)
         self.system = system
         self.painter = Painter(system, orbit)
-        red, green, blue = system.renderer.colour.tolist()
-        self.backgrounds = {"scene": (red, green, blue), **NAMED}
+        red, green, blue = system.renderer.background.color.tolist()
+        self.backgrounds = {"scene": (red, green, blue), **COLORS}
         self.scene = scene
         self.visitors: dict[int, Visitor] = {}
         self.changed = threading.Condition()

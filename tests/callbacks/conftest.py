@@ -51,12 +51,7 @@ class Scripted(NeRF2D):
         self.psnrs = iter(range(10, 1000))
         self.asked: list[Any] = []
         mse = torch.tensor(0.01, dtype=torch.float64)
-        self.stats = StepStats(mse, 30, 90, terms={"rgb": mse})
-        self.groups = [{"lr": 0.1}]
-
-    @property
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        return self.groups
+        self.stats = StepStats(mse, 30, 90, losses={"photometric": mse})
 
     def evaluate(self, view: Any) -> ViewResult:
         self.asked.append(view)
@@ -97,6 +92,7 @@ def trainer_with(tmp_path: Path) -> Callable[..., L.Trainer]:
         trainer.global_step, trainer.should_stop = 0, False
         trainer.default_root_dir = str(tmp_path)
         trainer.logger = Mock()
+        trainer.optimizers = [Mock(param_groups=[{"name": "field", "lr": 0.1}])]
         trainer.world_size, trainer.is_global_zero = 1, True
         return trainer
 

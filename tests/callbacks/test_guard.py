@@ -60,16 +60,16 @@ class Broken(NeRF2D):
                 self.done = True
                 with torch.no_grad():
                     self.field.colours[:, 0] = math.nan  # the step's own gradient is fine
-            case "rise" if self.rate == 1:
+            case "rise" if self.state.lr_scale == 1:
                 with torch.no_grad():
                     self.field.colours.uniform_()
             case "spike":
                 self.done = True
                 with torch.no_grad():
                     self.field.colours.copy_(1 - self.field.colours)
-            case "rise a little" if self.rate == 1:
+            case "rise a little" if self.state.lr_scale == 1:
                 self.show(0.4 if self.global_step < 200 else 0.5)
-            case "hover" if self.rate == 1:  # two steps down, one up
+            case "hover" if self.state.lr_scale == 1:  # two steps down, one up
                 self.show(1.3 - 0.0004 * self.global_step + 0.1 * (self.global_step // 10 % 3 == 2))
             case "no gradient":
                 return loss * 0 + (self.field.colours * 0).sum()

@@ -7,6 +7,7 @@ from nerf_lightning.errors import InputError
 def test_heldout_measures_at_fractions_with_clock_stopped(clock, system, trainer_with):
     budget, held_out = Budget(steps=10), HeldOut([0.2, 0.5, 0.55], views=2)
     trainer = trainer_with(budget, held_out)
+    budget.setup(trainer, system, "fit")
     budget.on_train_start(trainer, system)
     assert held_out.latest is None and held_out.needs(trainer)["curve"].pixels == 6 * 12 * 16
     for step in range(1, 11):
@@ -24,7 +25,8 @@ def test_heldout_measures_at_fractions_with_clock_stopped(clock, system, trainer
 def test_heldout_step_passing_several_marks_measures_once(clock, system, trainer_with):
     budget, held_out = Budget(steps=10), HeldOut([0.2, 0.5, 0.55], views=1)
     trainer = trainer_with(budget, held_out)
-    system.progress, trainer.global_step = 0.52, 5
+    trainer.global_step = 5
+    system.state.advance(0.52)
     held_out.on_train_batch_end(trainer, system, None, None, 0)
     assert held_out.curve == [[0, 5, 11], [0, 5, 11]] and len(system.asked) == 2
     resumed = HeldOut([0.2, 0.5, 0.55], views=1)

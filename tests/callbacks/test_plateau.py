@@ -6,11 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from nerf_lightning.callbacks import Budget
 from nerf_lightning.callbacks.plateau import FIRST, Plateau
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.objects import PILE, make_scene
 from nerf_lightning.training.train import train
 
@@ -37,11 +35,6 @@ def test_plateau_is_reported_where_more_time_is_not_worth_it():
     spent = measured(Plateau(8.0), lambda spent: 20 - 1 / spent)
     assert spent is not None and math.log(1.5) / 8 < spent < 2.5 * math.log(1.5) / 8
     assert measured(Plateau(0.2), lambda spent: 20 - 1 / spent) is None
-
-
-def test_budget_patience_zero_is_refused():
-    with pytest.raises(InputError, match=r"budget\.patience: .*found 0"):
-        Budget(steps=10, patience=0)
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from nerf_lightning.cameras import Rays
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.bricks.scene import bricks
-from nerf_lightning.renderer import Rendered
+from nerf_lightning.renderer import RenderOutput
 from nerf_lightning.system import NeRF3D, StepStats
 from nerf_lightning.training.train import train
 
@@ -82,12 +82,12 @@ def simulated(clock: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Ca
         scene = replace(small, val=Views(photos, cameras), orbit=small.orbit.resized((side, side)))
         rendering = 0.0
 
-        def render(self: NeRF3D, rays: Rays, **given: Any) -> Rendered:
+        def render(self: NeRF3D, rays: Rays, **given: Any) -> RenderOutput:
             nonlocal rendering
-            seconds = len(rays) * pixel_seconds * (fog if self.progress < 0.03 else 1.0)
+            seconds = len(rays) * pixel_seconds * (fog if self.state.progress < 0.03 else 1.0)
             clock.wait(seconds)
             rendering += seconds
-            return Rendered(torch.rand(len(rays), 3), torch.ones(len(rays)), torch.ones(len(rays)))
+            return RenderOutput(torch.rand(len(rays), 3), torch.ones(len(rays)), torch.ones(len(rays)))
 
         lines: list[tuple[float, str]] = []
         off = [f"callbacks.{name}=null" for name in ("guard", "checkpoints")]

@@ -18,7 +18,7 @@ def test_throughput_speeds_are_averages_since_last_entry(clock, system, trainer_
     # The system says 30 rays, 90 samples and an error of 0.01 at each step.
     assert first["speed/rays_per_second"] == pytest.approx(30) and second["speed/rays_per_second"] == pytest.approx(10)
     assert first["speed/samples_per_ray"] == second["speed/samples_per_ray"] == 3
-    assert first["train/psnr"] == pytest.approx(20) and first["loss/rgb"] == 0.01
-    assert first["lr/0"] == 0.1
+    assert first["train/psnr"] == pytest.approx(20) and first["loss/photometric"] == 0.01
+    assert first["lr/field"] == 0.1
     assert (first["speed/train_seconds"], second["speed/train_seconds"]) == (4, 16)
     assert throughput.rays == 240

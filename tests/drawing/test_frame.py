@@ -6,16 +6,16 @@ import torch
 
 from nerf_lightning.drawing.depth import colorize_depth, depth_limits
 from nerf_lightning.drawing.frame import Style, colours, error_picture
-from nerf_lightning.renderer import Rendered
+from nerf_lightning.renderer import RenderOutput
 
 RED = torch.tensor([1.0, 0.0, 0.0])
 
 
-def seen(background: torch.Tensor) -> Rendered:
+def seen(background: torch.Tensor) -> RenderOutput:
     """Three rays: nothing there, half a red thing at 2, all of it at 4."""
     opacity = torch.tensor([0.0, 0.5, 1.0])
     rgb = opacity[:, None] * RED + (1 - opacity)[:, None] * background
-    return Rendered(rgb, opacity, opacity * torch.tensor([0.0, 2.0, 4.0]))
+    return RenderOutput(rgb, opacity, opacity * torch.tensor([0.0, 2.0, 4.0]))
 
 
 def test_colours_background_shows_through_all_channels_but_opacity():

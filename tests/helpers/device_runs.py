@@ -7,6 +7,8 @@ import torch
 from nerf_lightning.config.build import build_data, build_system, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.system import System
+from nerf_lightning.system.growth import grow_field, next_stage
+from nerf_lightning.system.system import total_loss
 from nerf_lightning.utils.seeding import Stream, step_generator
 from tests.helpers.train_models import MODELS
 
@@ -42,10 +44,13 @@ def stepped(system: System, data: object, steps: int, where: torch.device) -> li
     """The losses of the first steps of a scene's training, drawn alike on every device."""
     optimizer, losses = system.configure_optimizers(), []
     for step in range(steps):
-        for parameter in system.field.grow(step / steps):
-            optimizer.state.pop(parameter, None)
-        batch = data.draw(step).to(where)
-        loss, stats = system.loss(batch, step_generator(0, Stream.STEP, step, where), step)
+        system.state.advance(step / steps)
+        if (stage := next_stage(system, step)) is not None:
+            grow_field(system, data, stage, optimizer)
+        batch, generator = data.draw(step).to(where), step_generator(0, Stream.STEP, step, where)
+        system.sampler.update(step, system.field.density, generator)
+        found, stats = system.compute_losses(batch, generator)
+        loss = total_loss(found)
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()

@@ -46,7 +46,7 @@ def ways(count: int) -> torch.Tensor:
 @pytest.mark.parametrize(("unbounded", "count"), [(False, 0), (False, 1), (False, 50), (True, 50)])
 def test_field_any_positions_gives_density_and_colour(make: Make, unbounded: bool, count: int):
     field, positions = make(Bounds(BOX, unbounded)), places(count) * 3
-    density, rgb = field(positions, ways(count))
+    density, rgb, _ = field(positions, ways(count))
     assert density.shape == (count,) and rgb.shape == (count, 3)
     assert (density >= 0).all() and density.isfinite().all()
     assert (rgb >= 0).all() and (rgb <= 1).all()
@@ -60,7 +60,7 @@ def test_field_other_unit_of_length_gives_same_colours(make: Make):
     small, large = make(Bounds(BOX)), make(Bounds(BOX * 10))
     large.load_state_dict(small.state_dict())
     positions, directions = places(40), ways(40)
-    (density, rgb), (density10, rgb10) = small(positions, directions), large(positions * 10, directions)
+    (density, rgb, _), (density10, rgb10, _) = small(positions, directions), large(positions * 10, directions)
     torch.testing.assert_close(density10 * 10, density, rtol=1e-3, atol=1e-5)
     torch.testing.assert_close(rgb10, rgb, rtol=1e-3, atol=1e-4)
 
@@ -68,7 +68,7 @@ def test_field_other_unit_of_length_gives_same_colours(make: Make):
 @FIELDS
 def test_field_every_parameter_gets_gradient(make: Make):
     field = make(Bounds(BOX))
-    density, rgb = field(places(500), ways(500))
+    density, rgb, _ = field(places(500), ways(500))
     (density.sum() + rgb.square().sum()).backward()
     for name, parameter in field.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 0, name

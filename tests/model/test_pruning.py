@@ -41,9 +41,9 @@ def test_prune_reached_places_keep_their_values(make: Make):
     field, reached = make(), some_cells()
     positions = inside(reached)
     directions = normalize(torch.randn(len(positions), 3), dim=1)
-    before = [part.detach() for part in field(positions, directions)]
+    before = [part.detach() for part in field(positions, directions)[:2]]
     field.prune(reached)
-    for found, was in zip(field(positions, directions), before, strict=True):
+    for found, was in zip(field(positions, directions)[:2], before, strict=True):
         torch.testing.assert_close(found, was)
 
 
@@ -64,5 +64,5 @@ def test_export_state_of_pruned_field_imports_alike(make: Make):
     field.prune(some_cells())
     other.import_state(field.export_state())
     positions, directions = BOX.to_world(torch.rand(40, 3)), normalize(torch.randn(40, 3), dim=1)
-    for found, was in zip(other(positions, directions), field(positions, directions), strict=True):
+    for found, was in zip(other(positions, directions)[:2], field(positions, directions)[:2], strict=True):
         assert torch.equal(found, was)

@@ -9,7 +9,6 @@ import torch
 from nerf_lightning.cameras import Bounds, Cameras, bounds
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, save_npz
-from nerf_lightning.errors import InputError
 from nerf_lightning.model import HashGridField, TensoRFField, VoxelField
 from nerf_lightning.model import tensorf as planes
 from nerf_lightning.runs.folder import load_run
@@ -31,7 +30,7 @@ def tensorf(bounds: Bounds, coarsest: int, finest: int, size: str) -> list[int]:
 
 
 def voxels(bounds: Bounds, coarsest: int, finest: int, size: str) -> list[int]:
-    return VoxelField(bounds, coarsest, finest, size=size).resolutions
+    return VoxelField(bounds, coarsest, finest, size=size).growth.resolutions
 
 
 GRIDS = pytest.mark.parametrize("resolutions", [hashgrid, tensorf, voxels])
@@ -55,8 +54,6 @@ def test_grid_auto_size_has_two_cells_a_pixel_at_most(resolutions: Resolutions):
     assert resolutions(bounds, 16, 30, "auto") == resolutions(bounds, 16, 30, "fixed")
     assert resolutions(Bounds(BOX), 16, 100, "auto") == fixed, "without photos sizes are as asked"
     assert set(resolutions(Bounds(BOX, pixel=0.5), 16, 100, "auto")) == {8}, "few pixels lower the coarsest too"
-    with pytest.raises(InputError, match=r"model\.size: found 'large', expected auto or fixed"):
-        resolutions(bounds, 16, 100, "large")
 
 
 @pytest.mark.parametrize(
@@ -75,7 +72,7 @@ def test_tensorf_large_photos_enlarge_planes_and_network(unbounded: bool, across
 
 def test_run_on_large_photos_resumes_with_finer_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(bounds, "USUAL_WIDTH", 4)  # so that small photos count as large
-    monkeypatch.setattr(planes, "SETTLED", 2)
+    monkeypatch.setattr(planes, "MIN_STEPS_PER_STAGE", 2)
     monkeypatch.setattr(planes, "FINEST", 24)
     scene = tmp_path / "scene.npz"
     save_npz(make_scene(MARBLE, size=24, views=5, held_out=1), scene)
@@ -91,10 +88,10 @@ def test_run_on_large_photos_resumes_with_finer_field(tmp_path: Path, monkeypatc
 
     def look(sampler: OccupancySampler, cameras: Cameras) -> None:
         """What it finds with finer cells is not what coarse cells become."""
-        sampler.allowed.copy_(torch.arange(len(sampler.allowed)) % 2 == 0)
+        sampler.grid.in_view.copy_(torch.arange(len(sampler.grid.in_view)) % 2 == 0)
 
     monkeypatch.setattr(RayDataModule, "note_samples", note)
-    monkeypatch.setattr(OccupancySampler, "look_through", look)
+    monkeypatch.setattr(OccupancySampler, "mark_invisible_cells", look)
     train(cfg, folder=tmp_path / "run")
     with pytest.raises(ZeroDivisionError):
         train(cfg, folder=tmp_path / "stopped")
@@ -104,9 +101,9 @@ def test_run_on_large_photos_resumes_with_finer_field(tmp_path: Path, monkeypatc
         torch.equal(a, b) for a, b in zip(found.state_dict().values(), resumed.state_dict().values(), strict=True)
     )
     assert isinstance(found, NeRF3D) and isinstance(found.sampler, OccupancySampler)
-    assert found.sampler.allowed.float().mean() > 0.8
+    assert found.sampler.grid.in_view.float().mean() > 0.8
     del told[7:]
-    finer = found.field.finer
+    finer = found.field.resolution_scale
     assert told == [1.0] * 4 + [finer] * 3, "the data aims for more samples once the field is finer"
-    assert finer > 1.1 and found.sampler.samples == 3 * found.sampler.resolution > 192 * 1.1
+    assert finer > 1.1 and found.sampler.samples == 3 * found.sampler.grid.resolution > 192 * 1.1
     assert found.field.resolutions[-1] == round(24 * finer)

@@ -16,9 +16,9 @@ from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
-from nerf_lightning.refine import Corrections, summary
-from nerf_lightning.refine.corrections import FIRST
-from nerf_lightning.refine.poses import drifts
+from nerf_lightning.refine import Corrections, summarize_corrections
+from nerf_lightning.refine.corrections import FIRST_TRIAL_STEP
+from nerf_lightning.refine.gauge import gauge_directions
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config
@@ -54,34 +54,36 @@ def some_pixels(count: int) -> tuple[Tensor, Tensor, Tensor]:
 def test_corrections_at_start_change_nothing(cameras: Cameras):
     corrections = Corrections(cameras, BOX)
     rays, (views, *_) = cameras.rays(*(pixels := some_pixels(50))), pixels
-    same = corrections.rays(rays, views)
+    same = corrections.poses(rays, views)
     torch.testing.assert_close((same.origins, same.directions), (rays.origins, rays.directions))
-    torch.nn.init.normal_(corrections.motions), torch.nn.init.normal_(corrections.log_gains)
-    before = corrections.cameras(cameras).c2w
-    together = drifts(cameras.centres, BOX.centre) @ torch.randn(10)
-    corrections.motions.data += torch.linalg.solve(corrections.scales, together)
-    torch.testing.assert_close(corrections.cameras(cameras).c2w, before, atol=1e-4, rtol=0)
-    torch.testing.assert_close(corrections.gains.log().mean(0), torch.zeros(3), atol=1e-6, rtol=0)
+    torch.nn.init.normal_(corrections.poses.motions), torch.nn.init.normal_(corrections.color.log_gains)
+    before = corrections.poses.refine_cameras(cameras).c2w
+    together = gauge_directions(cameras.centres, BOX.centre) @ torch.randn(10)
+    corrections.poses.motions.data += torch.linalg.solve(corrections.poses.preconditioner, together)
+    torch.testing.assert_close(corrections.poses.refine_cameras(cameras).c2w, before, atol=1e-4, rtol=0)
+    torch.testing.assert_close(corrections.color.gains.log().mean(0), torch.zeros(3), atol=1e-6, rtol=0)
 
 
 def test_corrected_rays_are_of_corrected_cameras(cameras: Cameras):
     corrections = everything(cameras)
-    torch.nn.init.normal_(corrections.motions, std=2)
-    corrections.lens.zoom.data -= 1
+    torch.nn.init.normal_(corrections.poses.motions, std=2)
+    corrections.poses.log_focal.data -= 1
     pixels = some_pixels(50)
-    found = corrections.rays(cameras.rays(*pixels), pixels[0])
-    expected = corrections.cameras(cameras).rays(*pixels)
+    found = corrections.poses(cameras.rays(*pixels), pixels[0])
+    expected = corrections.poses.refine_cameras(cameras).rays(*pixels)
     torch.testing.assert_close(found.origins, expected.origins)
     torch.testing.assert_close(found.directions, expected.directions, atol=1e-5, rtol=0)
 
 
 def test_gains_leave_background_alone(cameras: Cameras):
     corrections, views = Corrections(cameras, BOX, poses=False), torch.arange(VIEWS)
-    torch.nn.init.normal_(corrections.log_gains)
+    torch.nn.init.normal_(corrections.color.log_gains)
     behind, opacity = torch.rand(VIEWS, 3), torch.tensor([0, 0.5, 1, 1, 1])
     red, given = torch.tensor([0.5, 0, 0]).expand(VIEWS, 3), cameras.rays(views, views, views)
-    found = corrections.lit(opacity[:, None] * red + (1 - opacity)[:, None] * behind, opacity, behind, given, views)
-    torch.testing.assert_close(found, opacity[:, None] * red * corrections.gains + (1 - opacity)[:, None] * behind)
+    found = corrections.color(opacity[:, None] * red + (1 - opacity)[:, None] * behind, opacity, behind, given, views)
+    torch.testing.assert_close(
+        found, opacity[:, None] * red * corrections.color.gains + (1 - opacity)[:, None] * behind
+    )
 
 
 def learned(corrections: Corrections, truth: Corrections, cameras: Cameras) -> None:
@@ -89,11 +91,11 @@ def learned(corrections: Corrections, truth: Corrections, cameras: Cameras) -> N
     sampler, renderer, behind = UniformSampler(BOX, 32), VolumeRenderer("black"), torch.zeros(200, 3)
 
     def seen(by: Corrections, pixels: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        rays = by.rays(given := cameras.rays(*pixels), pixels[0])
+        rays = by.poses(given := cameras.rays(*pixels), pixels[0])
         found = renderer(rays, sampler(rays.detach(), lambda x: x[:, 0]), soft_ball)
-        return by.lit(found.rgb, found.opacity, behind, given, pixels[0])
+        return by.color(found.rgb, found.opacity, behind, given, pixels[0])
 
-    optimizer = torch.optim.Adam(corrections.groups)
+    optimizer = torch.optim.Adam(corrections.param_groups())
     for step in range(STEPS):
         for group, rate in zip(optimizer.param_groups, (0.1, 0.02), strict=True):
             group["lr"] = rate * 0.02 ** (step / STEPS)
@@ -106,30 +108,34 @@ def learned(corrections: Corrections, truth: Corrections, cameras: Cameras) -> N
 def test_poses_and_gains_known_field_are_recovered(cameras: Cameras):
     """Photos by cameras that stand elsewhere than was said, in changing light."""
     truth, corrections = Corrections(cameras, BOX), Corrections(cameras, BOX)
-    torch.nn.init.normal_(truth.motions, std=0.5), torch.nn.init.normal_(truth.log_gains, std=0.1)
+    torch.nn.init.normal_(truth.poses.motions, std=0.5), torch.nn.init.normal_(truth.color.log_gains, std=0.1)
     learned(corrections, truth, cameras)
     before, after = (
-        by.cameras(cameras).c2w - truth.cameras(cameras).c2w for by in (Corrections(cameras, BOX), corrections)
+        by.poses.refine_cameras(cameras).c2w - truth.poses.refine_cameras(cameras).c2w
+        for by in (Corrections(cameras, BOX), corrections)
     )
     assert float(after.norm()) < 0.15 * float(before.norm())
     left, wrong = (
-        float((by.gains - truth.gains).abs().max().detach()) for by in (corrections, Corrections(cameras, BOX))
+        float((by.color.gains - truth.color.gains).abs().max().detach())
+        for by in (corrections, Corrections(cameras, BOX))
     )
     assert left < 0.2 * wrong
 
 
 def test_lens_and_colours_known_field_are_recovered(cameras: Cameras):
     truth, corrections = everything(cameras), everything(cameras)
-    truth.lens.zoom.data += 0.5
-    truth.lens.darkening.data += 0.4
-    torch.nn.init.normal_(truth.mixing, std=0.1)
+    truth.poses.log_focal.data += 0.5
+    truth.color.falloff.data += 0.4
+    torch.nn.init.normal_(truth.color.mixing, std=0.1)
     learned(corrections, truth, cameras)
     wrong = everything(cameras)
     for name in ("focal_factor", "corner_brightness"):
-        left, before = (abs(summary(by)[name] - summary(truth)[name]) for by in (corrections, wrong))
-        assert left < 0.3 * before
+        found, before, right = (summarize_corrections(by)[name] for by in (corrections, wrong, truth))
+        assert abs(found - right) < 0.3 * abs(before - right)
     # A photo's gains are the diagonal of how it mixes colours.
-    found, meant, none = (by.mixing[:, :, :3] + torch.diag_embed(by.gains) for by in (corrections, truth, wrong))
+    found, meant, none = (
+        by.color.mixing[:, :, :3] + torch.diag_embed(by.color.gains) for by in (corrections, truth, wrong)
+    )
     mean = (found - meant).mean(0)
     assert bool((found - meant - mean).norm() < 0.4 * (none - meant).norm())
 
@@ -137,11 +143,11 @@ def test_lens_and_colours_known_field_are_recovered(cameras: Cameras):
 def test_vignetting_darkens_corners_alone():
     K = torch.tensor([[60.0, 0, 50], [0, 60, 40], [0, 0, 1]])
     camera = Cameras.of_size(K[None], torch.eye(4)[None], 100, 80)
-    lens = everything(camera).lens
-    lens.darkening.data = torch.tensor([0.3, 0.2])
+    lens = everything(camera).color
+    lens.falloff.data = torch.tensor([0.3, 0.2])
     ends = torch.tensor([[0.0, 0, 1], [50 / 60, 40 / 60, 1]])
     found = lens.shade(torch.nn.functional.normalize(ends, dim=1), torch.zeros(2, dtype=torch.long))
-    torch.testing.assert_close(found[:, 0], torch.tensor([1.0, float(lens.corner.detach())]))
+    torch.testing.assert_close(found[:, 0], torch.tensor([1.0, float(lens.corner_brightness.detach())]))
 
 
 FIELDS = {
@@ -155,9 +161,9 @@ FIELDS = {
 def loss(field: Field, corrections: Corrections, rays: Rays, views: Tensor, samples: Samples, way: Tensor) -> Tensor:
     """A sum over what is seen along these samples, from directions that do not follow the cameras."""
     seen = VolumeRenderer("black").to(way.device, way.dtype)(
-        corrections.rays(rays, views), samples, lambda x, _: field(x, samples.directions(rays))
+        corrections.poses(rays, views), samples, lambda x, _: field(x, samples.directions(rays))
     )
-    return (corrections.lit(seen.rgb, seen.opacity, torch.zeros_like(way), rays, views) * way).sum()
+    return (corrections.color(seen.rgb, seen.opacity, torch.zeros_like(way), rays, views) * way).sum()
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -223,7 +229,7 @@ def test_run_with_corrections_reports_and_exports_them(tmp_path: Path, capsys, m
 
 def test_refine_auto_bad_outlines_start_pose_correction(tmp_path: Path):
     size = {"size": 16, "train_views": 12, "val_views": 1}
-    options = ["+experiment=smoke_3d", "refine=auto", "dataset.rays=64", f"budget.steps={FIRST - 1}", *OFF]
+    options = ["+experiment=smoke_3d", "refine=auto", "dataset.rays=64", f"budget.steps={FIRST_TRIAL_STEP - 1}", *OFF]
     for scene, wanted in ((bricks(**size), False), (corruptions.add_pose_noise(bricks(**size), 0, 15.0, 0.1), True)):
         folder = tmp_path / str(wanted)
         train(composed(options, folder), folder=folder, scene=scene)
@@ -236,7 +242,6 @@ def test_refine_auto_bad_outlines_start_pose_correction(tmp_path: Path):
     ("options", "key"),
     [
         ({"poses": False, "light": False}, "refine.poses"),
-        ({"pose_rate": 0.0}, "refine.pose_rate"),
         ({"poses": False, "focal": True}, "refine.focal.*refine.poses=false.*give refine.poses=true"),
         ({"light": False, "affine": True}, "refine.affine.*refine.light=false"),
     ],

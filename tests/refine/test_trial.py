@@ -10,18 +10,19 @@ from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.refine import Corrections
+from nerf_lightning.refine.color_correction import GAMMA
 from nerf_lightning.refine.corrections import (
-    EARLY,
-    FASTER,
-    FIRST,
-    GAMMA,
-    GROWTH,
-    LAST,
+    EARLY_FACTOR,
+    EARLY_STEPS,
+    FAST_FACTOR,
+    FIRST_TRIAL_STEP,
+    LAST_TRIAL,
+    LR_FINAL_FACTOR,
+    MIN_GAIN,
     START,
-    TWICE,
-    WORTHWHILE,
+    TRIAL_GROWTH,
 )
-from nerf_lightning.renderer import Rendered, VolumeRenderer
+from nerf_lightning.renderer import RenderOutput, VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system.fits import misfits
 from nerf_lightning.system.trial import least_squares, worth
@@ -31,7 +32,7 @@ VIEWS, SIZE = 6, 24
 BLACK = torch.zeros(3)
 
 
-def see(rays: Rays, behind: Tensor) -> Rendered:
+def see(rays: Rays, behind: Tensor) -> RenderOutput:
     samples = UniformSampler(BOX, 48)(rays.detach(), lambda x: x[:, 0])
     return VolumeRenderer("black")(rays, samples, soft_ball, behind)
 
@@ -66,9 +67,9 @@ def tried(views: Views, given: Cameras | None = None) -> dict[str, float]:
 
 def test_trial_names_what_is_wrong_with_photos(views: Views):
     wrong = Corrections(views.cameras, BOX)
-    torch.nn.init.normal_(wrong.motions, std=0.5)
-    assert max(tried(views, wrong.cameras(views.cameras)).values()) > 0.5
-    assert tried(views, wrong.cameras(views.cameras))["light"] < 0.1
+    torch.nn.init.normal_(wrong.poses.motions, std=0.5)
+    assert max(tried(views, wrong.poses.refine_cameras(views.cameras)).values()) > 0.5
+    assert tried(views, wrong.poses.refine_cameras(views.cameras))["light"] < 0.1
     gains = torch.linspace(0.7, 1.3, VIEWS)[:, None, None, None]
     lit = Views.of((views.images * gains).clamp(0, 255).round().to(torch.uint8), views.cameras)
     assert tried(lit)["light"] > 0.5 and tried(lit)["poses"] < 0.1
@@ -105,24 +106,37 @@ def test_least_squares_is_damped():
 
 def test_trial_schedule_corrects_what_helps_and_retries_rest(views: Views):
     corrections = Corrections(views.cameras, BOX, auto=True)
-    assert corrections.factors(1.0) == [0.0, 0.0] and not corrections.since
-    assert not corrections.due(FIRST - 1, START) and corrections.due(FIRST, START)
-    assert not corrections.due(FIRST, LAST + 0.01), "too late"
-    assert not Corrections(views.cameras, BOX, poses=False, auto=True).due(FIRST, START), "too early for gains"
-    assert FIRST < EARLY and corrections.open_at(FIRST) == ["poses"], "too early for gains"
-    enough = {"poses": 1.5 * WORTHWHILE["poses"], "light": 0.0}
-    assert TWICE > 1.5 and not corrections.helps(FIRST, enough) and corrections.helps(EARLY, enough) == ["poses"]
-    assert corrections.helps(FIRST, enough, 0.5) == ["poses"] and not corrections.helps(FIRST, enough, 0.8)
-    corrections.note(FIRST, START, {"poses": 0.3})
-    assert corrections.motions.requires_grad and not corrections.log_gains.requires_grad
-    assert not corrections.due(EARLY - 1, START) and corrections.due(EARLY, START)
-    assert corrections.factors(START - 0.001) == [0.0, 0.0] and corrections.factors(START) == [FASTER, 0.0]
-    assert corrections.factors(1.0) == [Corrections.FINAL, 0.0]
+    assert set(corrections.lr_factors(1.0).values()) == {0.0} and not corrections.enabled_at
+    assert not corrections.is_trial_due(FIRST_TRIAL_STEP - 1, START) and corrections.is_trial_due(
+        FIRST_TRIAL_STEP, START
+    )
+    assert not corrections.is_trial_due(FIRST_TRIAL_STEP, LAST_TRIAL + 0.01), "too late"
+    assert not Corrections(views.cameras, BOX, poses=False, auto=True).is_trial_due(FIRST_TRIAL_STEP, START), (
+        "too early for gains"
+    )
+    assert FIRST_TRIAL_STEP < EARLY_STEPS and corrections.list_candidates(FIRST_TRIAL_STEP) == ["poses"], (
+        "too early for gains"
+    )
+    enough = {"poses": 1.5 * MIN_GAIN["poses"], "light": 0.0}
+    assert (
+        EARLY_FACTOR > 1.5
+        and not corrections.choose(FIRST_TRIAL_STEP, enough)
+        and corrections.choose(EARLY_STEPS, enough) == ["poses"]
+    )
+    assert corrections.choose(FIRST_TRIAL_STEP, enough, 0.5) == ["poses"]
+    assert not corrections.choose(FIRST_TRIAL_STEP, enough, 0.8)
+    corrections.decide(FIRST_TRIAL_STEP, START, {"poses": 0.3})
+    assert corrections.poses.motions.requires_grad and not corrections.color.log_gains.requires_grad
+    assert not corrections.is_trial_due(EARLY_STEPS - 1, START) and corrections.is_trial_due(EARLY_STEPS, START)
+    assert not any(corrections.lr_factors(START - 0.001).values())
+    assert corrections.lr_factors(START) == {"poses": FAST_FACTOR, "light": 0.0}
+    assert corrections.lr_factors(1.0) == {"poses": LR_FINAL_FACTOR, "light": 0.0}
     again = Corrections(views.cameras, BOX, auto=True)
-    again.decide(corrections.decided())
-    assert again.motions.requires_grad and again.decided() == corrections.decided()
-    corrections.note(10 * EARLY, START, {"poses": 0.0, "light": 0.005, "stated": 0.0})
-    assert not corrections.due(10 * EARLY, START) and corrections.due(int(10 * EARLY * GROWTH), START)
+    again.load_trial_state(corrections.trial_state())
+    assert again.poses.motions.requires_grad and again.trial_state() == corrections.trial_state()
+    corrections.decide(10 * EARLY_STEPS, START, {"poses": 0.0, "light": 0.005, "stated": 0.0})
+    assert not corrections.is_trial_due(10 * EARLY_STEPS, START)
+    assert corrections.is_trial_due(int(10 * EARLY_STEPS * TRIAL_GROWTH), START)
 
 
 def test_gains_start_from_exposures_that_explain_photos(views: Views):
@@ -132,16 +146,18 @@ def test_gains_start_from_exposures_that_explain_photos(views: Views):
     lit = Views.of((views.images * gains.exp()[:, :1, None, None] / 4).clamp(0, 255).to(torch.uint8), views.cameras)
     for photos, brightness, fits in ((lit, 0.25, True), (views, 1.0, False)):
 
-        def darker(rays: Rays, behind: Tensor, brightness: float = brightness) -> Rendered:
+        def darker(rays: Rays, behind: Tensor, brightness: float = brightness) -> RenderOutput:
             return replace(seen := see(rays, behind), rgb=seen.rgb * brightness)
 
         corrections = Corrections(views.cameras, BOX, exposures=exposures, auto=True)
         found = worth(darker, photos, BLACK, corrections, torch.Generator().manual_seed(1))
         assert (found["stated"] > 0.5) == fits
-        corrections.note(EARLY, START, found | {"light": 1.0})
-        torch.testing.assert_close(corrections.log_gains.data, gains * fits)
-    assert torch.equal(Corrections(views.cameras, BOX, exposures=exposures).log_gains.data, corrections.stated)
-    assert not Corrections(views.cameras, BOX, exposures=exposures, light=False).log_gains.any()
+        corrections.decide(EARLY_STEPS, START, found | {"light": 1.0})
+        torch.testing.assert_close(corrections.color.log_gains.data, gains * fits)
+    assert torch.equal(
+        Corrections(views.cameras, BOX, exposures=exposures).color.log_gains.data, corrections.color.stated
+    )
+    assert not Corrections(views.cameras, BOX, exposures=exposures, light=False).color.log_gains.any()
 
 
 def test_misfits_far_worse_photos_stand_out():

@@ -44,18 +44,20 @@ def test_occupancy_inside_solid_is_queried_after_updates_only():
     assert all(deepest[step] < 0.2 for step in range(32)), "everywhere at first"
     assert all((deepest[step] < 0.2) == (step % 16 == 0) for step in range(64, 96))
     assert min(deepest[step] for step in range(64, 96) if step % 16) > 0.6 - 0.4
-    shell = {"lit": sampler.lit.clone(), "reached": sampler.reached.clone()}
+    shell = {"active": sampler.grid.active.clone(), "last_visible": sampler.grid.last_visible.clone()}
     whole = sampler(toward_the_cube(200, 1000), solid)
     assert asked[-1].norm(dim=-1).min() < 0.2, "pictures look at all that is occupied"
-    assert torch.equal(shell["lit"], sampler.lit) and torch.equal(shell["reached"], sampler.reached)
-    sampler.look_everywhere = False
+    assert torch.equal(shell["active"], sampler.grid.active) and torch.equal(
+        shell["last_visible"], sampler.grid.last_visible
+    )
+    sampler.full_pass = False
     trained = sampler(toward_the_cube(200, 1000), solid, seeded(1))
     near = torch.full((200,), torch.inf)
     full = solid(whole.positions(toward_the_cube(200, 1000))) > 0  # a picture keeps empty steps, training does not
     first = near.clone().scatter_reduce(0, trained.ray, trained.t, "amin")
     second = near.clone().scatter_reduce(0, whole.ray[full], whole.t[full], "amin")
     hit = second.isfinite()
-    close = (first - second)[hit].abs() < 2 * sampler.length(sampler.samples)
+    close = (first - second)[hit].abs() < 2 * sampler.step_size(sampler.samples)
     assert hit.sum() > 150 and close.float().mean() > 0.95, "and both see the surface"
 
 
@@ -71,9 +73,9 @@ def test_occupancy_cell_reached_again_is_queried_again():
         sampler.update(step, density, seeded(step))
         sampler(rays, density, seeded(step))
         if step == 16 * 8 - 1:
-            assert sampler.occupied[behind] and not sampler.lit[behind]
+            assert sampler.grid.occupied[behind] and not sampler.grid.active[behind]
     middle = int(cell_index(torch.tensor([[0.51, 0.55, 0.55]]), 8))
-    assert sampler.lit[middle] and not sampler.lit[behind]
+    assert sampler.grid.active[middle] and not sampler.grid.active[behind]
 
 
 def ball(centre: float = 0.0):
@@ -88,12 +90,12 @@ def cells(resolution: int) -> tuple[Tensor, float]:
 
 def test_occupancy_updates_find_content():
     sampler = OccupancySampler(CUBE, samples=64, resolution=12, warmup=64)
-    assert sampler.occupied.all(), "nothing is skipped before anything is known"
+    assert sampler.grid.occupied.all(), "nothing is skipped before anything is known"
     centre, corner = cells(12)
     for step in range(0, 800, 16):
         sampler.update(step, ball(), seeded(step))
-        assert sampler.occupied[centre.norm(dim=-1) < 0.5 - corner].all(), "never without content"
-    assert not sampler.occupied[centre.norm(dim=-1) > 0.5 + corner].any()
+        assert sampler.grid.occupied[centre.norm(dim=-1) < 0.5 - corner].all(), "never without content"
+    assert not sampler.grid.occupied[centre.norm(dim=-1) > 0.5 + corner].any()
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.5, False), (2.0, True)])
@@ -101,14 +103,14 @@ def test_occupancy_threshold_is_optical_thickness_of_step(share: float, kept: bo
     sampler = OccupancySampler(CUBE, samples=100, resolution=4, threshold=0.02)
     thin = share * 0.02 / (2 * math.sqrt(3) / 100)
     sampler.update(0, lambda x: torch.where(x[:, 0] < 0, thin, 1000.0), seeded())
-    assert sampler.occupied.tolist() == [kept] * 32 + [True] * 32
+    assert sampler.grid.occupied.tolist() == [kept] * 32 + [True] * 32
 
 
 def test_occupancy_unbounded_scene_is_learned_outside_box():
     sampler = OccupancySampler(replace(CUBE, unbounded=True), samples=64, resolution=16)
     sampler.update(0, lambda x: 10.0 * (x[:, 0] > 3).float(), seeded())
     unit = replace(CUBE, unbounded=True).to_unit(torch.tensor([[20.0, 0, 0], [0.0, 0, 0], [-20.0, 0, 0]]))
-    assert sampler.occupied[cell_index(unit, 16)].tolist() == [True, False, False]
+    assert sampler.grid.occupied[cell_index(unit, 16)].tolist() == [True, False, False]
 
 
 def test_occupancy_restored_sampler_continues_alike():
@@ -121,8 +123,8 @@ def test_occupancy_restored_sampler_continues_alike():
     for step in range(80):
         if step == stop:
             restored.load_state_dict(sampler.state_dict())
-            for name in ("occupied", "thickness", "reached", "lit"):
-                assert torch.equal(getattr(restored, name), getattr(sampler, name)), name
+            for name in ("occupied", "optical_depth", "last_visible", "active"):
+                assert torch.equal(getattr(restored.grid, name), getattr(sampler.grid, name)), name
         taken = []
         for s in (sampler, restored) if step >= stop else (sampler,):
             s.update(step, solid, seeded(step))
@@ -139,65 +141,63 @@ def test_occupancy_cells_few_cameras_see_stay_empty():
     c2w = look_at(eyes, targets, torch.tensor([0.0, 0, 1]))
     K = torch.tensor([[80.0, 0, 8], [0, 80, 8], [0, 0, 1]]).repeat(4, 1, 1)  # a beam of 0.4 at a distance of 4
     sampler = OccupancySampler(CUBE, samples=100, resolution=16, seen_by=3)
-    sampler.look_through(Cameras.of_size(K, c2w, 16, 16))
+    sampler.mark_invisible_cells(Cameras.of_size(K, c2w, 16, 16))
     sampler.update(0, lambda x: torch.full((len(x),), 10.0), seeded())
-    grid = sampler.occupied.view(16, 16, 16)
+    grid = sampler.grid.occupied.view(16, 16, 16)
     assert grid[:, 8, 8].all() and grid[2, 8, 8] and not grid[8, 0, 8] and not grid[8, 8, 0]
-    assert torch.equal(grid, sampler.allowed.view(16, 16, 16)) and sampler.lit.sum() <= grid.sum()
+    assert torch.equal(grid, sampler.grid.in_view.view(16, 16, 16)) and sampler.grid.active.sum() <= grid.sum()
     # Through the lone camera's beam nothing is found but where the others look too.
     along_y = Rays(torch.tensor([[0.0, -4, 0]]), torch.tensor([[0.0, 1, 0]]))
     found = sampler(along_y, lambda x: torch.full((len(x),), 0.1)).positions(along_y)
     assert len(found) and found[:, 1].abs().max() < 0.7
     near = OccupancySampler(replace(CUBE, near=4.0), samples=100, resolution=16, seen_by=3)
-    near.look_through(Cameras.of_size(K, c2w, 16, 16))
-    assert not near.allowed.view(16, 16, 16)[2, 8, 8], "nearer than rays begin"
+    near.mark_invisible_cells(Cameras.of_size(K, c2w, 16, 16))
+    assert not near.grid.in_view.view(16, 16, 16)[2, 8, 8], "nearer than rays begin"
 
 
 def test_occupancy_refine_steps_follow_field_unless_stated():
     usual, stated = OccupancySampler(CUBE), OccupancySampler(CUBE, resolution=16)
-    assert (usual.samples, usual.resolution) == (192, 64)
-    before = usual.length(usual.samples)
+    assert (usual.samples, usual.grid.resolution) == (192, 64)
+    before = usual.step_size(usual.samples)
     for sampler in (usual, stated):
-        sampler.refine(2.0)
-    assert (usual.samples, usual.resolution) == (384, 128) and usual.length(usual.samples) == pytest.approx(before / 2)
-    assert (stated.samples, stated.resolution) == (48, 16)
+        sampler.set_resolution_scale(2.0)
+    assert (usual.samples, usual.grid.resolution) == (384, 128) and usual.step_size(usual.samples) == pytest.approx(
+        before / 2
+    )
+    assert (stated.samples, stated.grid.resolution) == (48, 16)
     stated = OccupancySampler(CUBE, samples=100)
-    assert stated.samples == stated.picture_samples == 100 and usual.picture_samples == 4 * 128
+    assert stated.samples == stated.eval_samples == 100 and usual.eval_samples == 4 * 128
 
 
 def test_occupancy_refine_finer_cells_keep_maximum(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(occupancy, "RESOLUTION", 8)
     sampler = OccupancySampler(CUBE, samples=100)
-    sampler.thickness.copy_(torch.rand(8**3, generator=seeded()))
-    sampler.occupied = sampler.thickness > 0.5
-    sampler.reached.copy_(torch.arange(8**3))
-    before = {name: getattr(sampler, name).view(8, 8, 8) for name in ("thickness", "occupied", "reached")}
-    sampler.refine(1.5)
-    assert sampler.resolution == 12
+    sampler.grid.optical_depth.copy_(torch.rand(8**3, generator=seeded()))
+    sampler.grid.occupied = sampler.grid.optical_depth > 0.5
+    sampler.grid.last_visible.copy_(torch.arange(8**3))
+    before = {name: getattr(sampler.grid, name).view(8, 8, 8) for name in ("optical_depth", "occupied", "last_visible")}
+    sampler.set_resolution_scale(1.5)
+    assert sampler.grid.resolution == 12
     for name, old in before.items():
-        new = getattr(sampler, name).view(12, 12, 12)
+        new = getattr(sampler.grid, name).view(12, 12, 12)
         for x, y, z in ((0, 0, 0), (1, 5, 11), (4, 7, 10)):
             held = [(n * 8 // 12, ((n + 1) * 8 - 1) // 12) for n in (x, y, z)]
             expected = max(float(old[i, j, k]) for i in held[0] for j in held[1] for k in held[2])
             assert float(new[x, y, z]) == expected, name
-    monkeypatch.setattr(sampler, "stated", (None, None))
-    sampler.refine(3.0)
-    assert sampler.resolution == 24 and sampler.samples == 72
-    assert sampler.thickness.max() == pytest.approx(before["thickness"].max() * 100 / 72), "for a step as long as now"
+    sampler.given_samples = None
+    sampler.set_resolution_scale(3.0)
+    assert sampler.grid.resolution == 24 and sampler.samples == 72
+    assert sampler.grid.optical_depth.max() == pytest.approx(before["optical_depth"].max() * 36 / 72)
 
 
 def test_occupancy_state_of_any_stage_loads():
     early, late = OccupancySampler(CUBE), OccupancySampler(CUBE)
-    late.refine(1.25)
-    late.occupied = torch.rand(80**3) < 0.5
+    late.set_resolution_scale(1.25)
+    late.grid.occupied = torch.rand(80**3) < 0.5
     whole, least = OccupancySampler(CUBE), OccupancySampler(CUBE)
     whole.load_state_dict(late.state_dict())
     least.import_state(late.export_state())
     for loaded in (whole, least):
-        assert torch.equal(loaded.occupied, late.occupied) and loaded.samples == late.samples == 240
+        assert torch.equal(loaded.grid.occupied, late.grid.occupied) and loaded.samples == late.samples == 240
     whole.load_state_dict(early.state_dict())
-    assert whole.samples == 192 and len(whole.thickness) == 64**3
-    with pytest.raises(RuntimeError, match="cells"):
-        OccupancySampler(CUBE, resolution=16).import_state(late.export_state())
-    with pytest.raises(RuntimeError, match="size mismatch"):
-        OccupancySampler(CUBE, resolution=16).load_state_dict(late.state_dict())
+    assert whole.samples == 192 and len(whole.grid.optical_depth) == 64**3

@@ -5,7 +5,6 @@ import torch
 from torch import Generator
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import volume_weights
 from nerf_lightning.sampler import OccupancySampler, ProposalSampler, Samples, suited_sampler
 from nerf_lightning.sampler.proposal import interlevel_loss
@@ -42,7 +41,7 @@ def taught(sampler: ProposalSampler, steps: int) -> ProposalSampler:
         sampler.update(step, ball, generator)
         samples = sampler(some, ball, generator)
         weights = volume_weights(ball(samples.positions(some)), samples.dt, samples.ray, samples.offsets)
-        loss = sampler.loss(samples, weights)
+        loss = sampler.losses(samples, weights)["interlevel"]
         assert loss is not None
         optimizer.zero_grad()
         loss.backward()
@@ -79,7 +78,7 @@ def test_proposal_sampler_picture_is_the_same_in_parts():
     whole, again = sampler(some, ball), sampler(some, ball)
     parts = [sampler(some[first : first + 7], ball) for first in range(0, 40, 7)]
     assert torch.equal(whole.t, again.t) and torch.equal(whole.t, torch.cat([part.t for part in parts]))
-    assert whole.proposals is None and sampler.loss(whole, whole.t) is None
+    assert whole.proposals is None and sampler.losses(whole, whole.t) == {}
 
 
 def test_interlevel_loss_only_unexpected_weight_costs():
@@ -105,11 +104,6 @@ def test_proposal_sampler_state_export_renders_alike():
     assert torch.equal(sampler(some, ball).t, other(some, ball).t)
     with pytest.raises(RuntimeError, match="entries, not"):
         ProposalSampler(AROUND, finest=48).import_state(sampler.export_state())
-
-
-def test_proposal_sampler_final_rate_out_of_range_is_refused():
-    with pytest.raises(InputError, match="sampler.final"):
-        ProposalSampler(AROUND, final=1.5)
 
 
 def test_suited_sampler_unbounded_scene_takes_proposals():

@@ -21,6 +21,7 @@ from nerf_lightning.runs.compact import load_compact
 from nerf_lightning.sizing import search
 from nerf_lightning.sizing.ladder import read_ladder
 from nerf_lightning.synthetic.objects import PILE, make_scene
+from tests.helpers.growth import grow
 
 RUNGS = [
     {"density_components": 3, "colour_components": 3, "coarsest": 4, "finest": 4, "width": 8, "stages": 1},
@@ -167,7 +168,7 @@ def test_shipped_ladder_rungs_can_be_built_and_grow(name: str, tmp_path: Path):
         if isinstance(system.field, VoxelField):  # the whole box takes long
             system.field.prune(torch.zeros(4, 4, 4, dtype=torch.bool).index_fill(0, torch.tensor([1]), True))
         if not flat:
-            system.field.grow(1.0)
+            grow(system.field, 1.0)
         sizes.append(sum(parameter.numel() for parameter in system.parameters()))
     assert sizes == sorted(set(sizes))
     for options in ladder.samplers:

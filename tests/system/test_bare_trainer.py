@@ -44,7 +44,7 @@ def test_plain_trainer_same_steps_gives_same_weights(tmp_path: Path):
     system = build_system(cfg, frame_of(data), CPU)
     trainer = bare(STEPS)
     trainer.fit(system, data)
-    assert trainer.global_step == STEPS and system.progress == (STEPS - 1) / STEPS
+    assert trainer.global_step == STEPS and system.state.progress == (STEPS - 1) / STEPS
     found = system.state_dict()
     assert found.keys() == expected.keys()
     assert all(torch.equal(found[key], expected[key]) for key in found)
@@ -68,8 +68,10 @@ def test_proposals_and_corrections_have_own_learning_rates(tmp_path: Path):
     system, trainer = build_system(cfg, frame_of(data), CPU), bare(2)
     trainer.fit(system, data)
     assert isinstance(system, NeRF3D) and system.corrections is not None
-    rates = {parameter: group["lr"] for group in system.parameter_groups for parameter in group["params"]}
+    rates = {parameter: group["lr"] for group in trainer.optimizers[0].param_groups for parameter in group["params"]}
     assert rates.keys() == set(system.parameters())
     assert {rates[parameter] for parameter in system.field.parameters()} == {0.02}
     assert rates[system.sampler.grid.tables] == 0.02 * 0.01**0.5  # in the second of two steps
-    assert rates[system.corrections.motions] == system.corrections.groups[0]["lr"] * system.corrections.factors(0.5)[0]
+    assert rates[system.corrections.poses.motions] == (
+        system.corrections.rates["poses"] * system.corrections.lr_factors(0.5)["poses"]
+    )

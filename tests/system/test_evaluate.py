@@ -9,9 +9,9 @@ from nerf_lightning.dataset import Picture, PictureBatch, PixelDataModule, ViewB
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import Samples, UniformSampler
-from nerf_lightning.sampler.samples import RAY_SAMPLES
+from nerf_lightning.sampler.samples import SAMPLES_PER_RAY
 from nerf_lightning.system import NeRF2D, NeRF3D, constant
-from nerf_lightning.system.nerf3d import FOUND
+from nerf_lightning.system.nerf3d import SAMPLED_CHUNKS
 
 ADAM = functools.partial(torch.optim.Adam, lr=0.01)
 
@@ -85,7 +85,7 @@ def test_evaluate_view_any_chunk_gives_same_scores(chunk, slab: NeRF3D):
 
 
 def test_render_many_samples_a_ray_take_smaller_chunks(slab: NeRF3D, monkeypatch):
-    slab.chunk = slab.sampler.chunk = 80 * RAY_SAMPLES
+    slab.chunk = slab.sampler.chunk = 80 * SAMPLES_PER_RAY
     found, ask = [], slab.sampler.forward
 
     def asked(rays: Rays, *given) -> Samples:
@@ -97,7 +97,7 @@ def test_render_many_samples_a_ray_take_smaller_chunks(slab: NeRF3D, monkeypatch
     seen = slab.render(rays)
     assert len(seen.rgb) == len(rays)
     first, *others = (len(one.t) for one in found)
-    most = FOUND * slab.chunk
+    most = SAMPLED_CHUNKS * slab.chunk
     assert first > most >= max(others) > most - 200, "200 a ray: known from the second part on"
 
 

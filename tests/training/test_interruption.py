@@ -23,6 +23,7 @@ from nerf_lightning.runs.folder import load_run
 from nerf_lightning.runs.owner import LOCK, MARKER
 from nerf_lightning.system import System
 from nerf_lightning.training.train import train
+from tests.helpers.growth import grow
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=12", "model.width=8"]
 SMALL += ["callbacks.heldout.at=[0.5]", *(f"callbacks.{name}=null" for name in ("charts", "training_gif", "baselines"))]
@@ -177,5 +178,5 @@ def test_growing_field_counts_its_last_size():
     box = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
     field = TensoRFField(box, coarsest=4, finest=12, stages=3, size="fixed")
     expected, first = field.values_grown(), field.values
-    field.grow(1.0)
+    grow(field, 1.0)
     assert expected == field.values > 3 * first

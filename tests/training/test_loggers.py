@@ -26,7 +26,7 @@ def test_tensorboard_run_is_one_file_with_curves_config_and_short_hparams(inside
     (file,) = (tmp_path / "run").glob("events.out.tfevents.*")
     assert not (tmp_path / "run" / "hparams.yaml").exists()
     events = EventAccumulator(str(file)).Reload()
-    assert [event.step for event in events.Scalars("loss/rgb")] == [1, 2, 3]
+    assert [event.step for event in events.Scalars("loss/photometric")] == [1, 2, 3]
     last = events.Scalars("val/psnr")[-1]
     assert (last.step, last.value) == (3, pytest.approx(results["psnr"], abs=1e-3))
     dated = last.wall_time - events.Scalars("speed/train_seconds")[0].wall_time

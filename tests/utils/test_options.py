@@ -7,7 +7,7 @@ import pytest
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import HashGridField
-from nerf_lightning.utils.options import AtLeast, AtMost, check_options
+from nerf_lightning.utils.options import Above, AtLeast, AtMost, Below, check_options
 
 
 def target(
@@ -15,12 +15,21 @@ def target(
     steps: int = 1,
     colour: str | list[float] = "scene",
     share: Annotated[float, AtLeast(0), AtMost(1)] = 0.5,
+    decay: Annotated[float, Above(0), Below(1)] = 0.5,
 ) -> None:
     """Takes options of the usual kinds."""
 
 
 @pytest.mark.parametrize(
-    "good", [{"seconds": 3.4e38}, {"seconds": -3}, {"steps": 2**63 - 1}, {"colour": [0.5, 1, -1e-320]}, {"share": 1}]
+    "good",
+    [
+        {"seconds": 3.4e38},
+        {"seconds": -3},
+        {"steps": 2**63 - 1},
+        {"colour": [0.5, 1, -1e-320]},
+        {"share": 1},
+        {"decay": 0.999},
+    ],
 )
 def test_check_options_takes_finite_numbers_within_bounds(good: dict):
     check_options("group", target, good)
@@ -36,6 +45,8 @@ def test_check_options_takes_finite_numbers_within_bounds(good: dict):
         ({"steps": True}, "group.steps"),
         ({"steps": "many"}, "group.steps"),
         ({"share": 1.5}, "group.share: found 1.5, expected a number at least 0 and at most 1"),
+        ({"decay": 1.0}, "group.decay: found 1.0, expected a number above 0 and below 1"),
+        ({"decay": 0}, "group.decay"),
         ({"step": 1}, "group.step: found an unknown option.*did you mean steps?"),
     ],
 )

@@ -7,8 +7,6 @@ import numba
 import torch
 from numba.core.dispatcher import Dispatcher
 
-from nerf_lightning.kernels.cpu.apart import compile_apart
-
 # No fast maths. Numba optimises a function again for every other one it is linked into, and a process that compiles a kernel
 # runs another copy than one that loads it from the cache: where the optimiser may reorder or fuse, their last bits differ.
 # Vector code is written out instead: see `lanes`.
@@ -18,9 +16,7 @@ inner = partial(numba.njit, cache=True, error_model="numpy")
 
 def kernel(function: Callable) -> Dispatcher:
     """Decorates an entry point; its argument `workers` is the number of pieces its work is split into."""
-    dispatcher = inner(function, parallel=True)
-    dispatcher.compile = partial(compile_apart, dispatcher)
-    return dispatcher
+    return inner(function, parallel=True)
 
 
 def workers() -> int:

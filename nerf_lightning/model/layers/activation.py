@@ -1,13 +1,11 @@
 """From a network's raw output to a density."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-
-from nerf_lightning.errors import InputError
 
 
 def _at_least_single(x: Tensor) -> Tensor:
@@ -68,17 +66,9 @@ class SoftenableReLU(torch.nn.Module):
         self._soft = bool(self.soft)
 
 
-def density_activation(name: str) -> Callable[[Tensor], Tensor]:
-    """The map from raw output to density: "relu" (NeRF), "softplus" (Mip-NeRF, shifted by -1) or "exp" (truncated).
+Activation = Literal["relu", "softplus", "exp"]
 
-    Raises:
-        InputError: on any other name.
-    """
-    match name:
-        case "relu":
-            return SoftenableReLU()
-        case "softplus":
-            return shifted_softplus
-        case "exp":
-            return truncated_exp
-    raise InputError("model.density", "", repr(name), "relu, softplus or exp")
+
+def density_activation(name: Activation) -> Callable[[Tensor], Tensor]:
+    """The map from raw output to density: "relu" (NeRF), "softplus" (Mip-NeRF, shifted by -1) or "exp" (truncated)."""
+    return SoftenableReLU() if name == "relu" else {"softplus": shifted_softplus, "exp": truncated_exp}[name]

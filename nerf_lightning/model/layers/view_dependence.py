@@ -3,24 +3,14 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import spherical_harmonics
 
-HIGHEST = 3
-"""The highest degree of spherical harmonics available."""
 
-
-def harmonics_up_to(degree: int) -> int:
-    """Number of spherical harmonics up to a degree, including the constant one.
-
-    Raises:
-        InputError: outside 0 to 3.
-    """
-    if not 0 <= degree <= HIGHEST:
-        raise InputError("model.degree", "", str(degree), f"0 to {HIGHEST}")
+def num_sh_bases(degree: int) -> int:
+    """Number of spherical harmonics up to a degree, including the constant one."""
     return (degree + 1) ** 2
 
 
-def seen_from(directions: Float[Tensor, "N 3"], terms: int) -> Float[Tensor, "N terms"]:
-    """The first `terms` spherical harmonics of unit directions."""
-    return spherical_harmonics(directions)[:, :terms]
+def encode_directions(directions: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "N count"]:
+    """The first `count` spherical harmonics of unit directions."""
+    return spherical_harmonics(directions)[:, :count]

@@ -1,4 +1,4 @@
-"""Penalties on fog, floaters, walls right before the cameras, and colours that differ from every side."""
+"""Regularization losses on the rendering weights: fog, walls before the cameras, colours that differ from every side."""
 
 import torch
 from jaxtyping import Float
@@ -9,15 +9,15 @@ from nerf_lightning.sampler import Samples
 
 NEAR_POWER = 4
 """Power of the nearness that weight is penalised with: what stands at the box is hardly touched."""
-NEAR_UNTIL = 0.7
-"""Share of the training in which the penalty on nearness fades out: surfaces that it pushed back then find their place."""
-PLAIN_PRICE = 10.0
-"""What a view part costs by its size where photos are plain, in what it costs by its square everywhere."""
-TINY = 1e-3
-"""Size of a view part below which its price falls off."""
-SUITED_VIEW_WEIGHT = {False: 0.01, True: 0.001}
-"""Weight of the penalty on view parts, without and with a background. A subject that stands alone was often turned before
-the camera, so that its light did not turn with it; before a background, the direction also stands for a changing exposure."""
+NEAR_END = 0.7
+"""Share of the training in which the near loss fades out: surfaces that it pushed back then find their place."""
+TEXTURELESS_WEIGHT = 10.0
+"""What a view residual costs by its size where photos are textureless, in what it costs by its square everywhere."""
+RESIDUAL_EPS = 1e-3
+"""Size of a view residual below which its price falls off."""
+AUTO_VIEW_LOSS_WEIGHT = {False: 0.01, True: 0.001}
+"""Weight of the view loss, without and with a background. A subject that stands alone was often turned before the camera,
+so that its light did not turn with it; before a background, the direction also stands for a changing exposure."""
 
 
 def distortion_loss(weight: Float[Tensor, "N"], samples: Samples, scale: float) -> Float[Tensor, ""]:
@@ -56,11 +56,16 @@ def near_loss(weight: Float[Tensor, "N"], samples: Samples, scale: float) -> Flo
     return (weight * nearness**NEAR_POWER).sum() / (len(samples.offsets) - 1)
 
 
+def near_schedule(progress: float) -> float:
+    """Factor on the near loss after this share of the training: from 1 down to 0."""
+    return max(0.0, 1 - progress / NEAR_END)
+
+
 def view_loss(
     weight: Float[Tensor, "N"],
-    view_part: Float[Tensor, "N 3"],
+    view_residual: Float[Tensor, "N 3"],
     samples: Samples,
-    plain: Float[Tensor, "R"] | None = None,
+    texturelessness: Float[Tensor, "R"] | None = None,
 ) -> Float[Tensor, ""]:
     """Mean over rays of sum_i w_i (|v_i|^2 + 10 p |v_i|), where v is what the direction adds to the logits of the colour.
 
@@ -70,13 +75,13 @@ def view_loss(
 
     Args:
         weight: of the samples, see `volume_weights`; no gradient goes there.
-        view_part: see `Field.with_view_part`.
+        view_residual: see `FieldOutput`.
         samples: along R rays.
-        plain: p of each ray, see `RayBatch.plain`; None for 0.
+        texturelessness: p of each ray, see `RayBatch.plain`; None for 0.
     """
-    squares = view_part.square().sum(1)
+    squares = view_residual.square().sum(1)
     price = squares
-    if plain is not None:
-        size = (squares + TINY**2).sqrt() - TINY  # with a gradient where there is none
-        price = squares + PLAIN_PRICE * plain.index_select(0, samples.ray) * size
+    if texturelessness is not None:
+        size = (squares + RESIDUAL_EPS**2).sqrt() - RESIDUAL_EPS  # with a gradient where there is none
+        price = squares + TEXTURELESS_WEIGHT * texturelessness.index_select(0, samples.ray) * size
     return (weight.detach() * price).sum() / (len(samples.offsets) - 1)

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from nerf_lightning.kernels import volume_weights
-from nerf_lightning.renderer.penalties import distortion_loss, near_loss, view_loss
+from nerf_lightning.renderer.losses import distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
 
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from nerf_lightning.refine.poses import drifts, pixel_shifts, turned, whitening
+from nerf_lightning.refine.gauge import gauge_directions, pixel_shifts, precondition, rotate
 
 
 def cross(turns: Tensor) -> Tensor:
@@ -17,8 +17,8 @@ def test_turned_any_angle_matches_rotation_matrix():
     turns = torch.randn(6, 3).double() * torch.tensor([0, 1e-9, 1e-4, 1e-2, 0.5, 2.5]).double()[:, None]
     vectors = torch.randn(6, 3).double()
     expected = (torch.linalg.matrix_exp(cross(turns)) @ vectors[..., None]).squeeze(2)
-    torch.testing.assert_close(turned(vectors, turns), expected)
-    assert torch.autograd.gradcheck(turned, (vectors.requires_grad_(), turns.requires_grad_()))
+    torch.testing.assert_close(rotate(vectors, turns), expected)
+    assert torch.autograd.gradcheck(rotate, (vectors.requires_grad_(), turns.requires_grad_()))
 
 
 def test_pixel_shifts_match_moved_cameras():
@@ -35,7 +35,7 @@ def test_pixel_shifts_match_moved_cameras():
 def test_drifts_with_content_leave_views_unchanged():
     centres, place = 3 * torch.nn.functional.normalize(torch.randn(5, 3).double(), dim=1), torch.randn(3).double()
     centres, places = centres + place, place + 0.2 * torch.randn(50, 3).double()
-    found, shifts = drifts(centres, place), pixel_shifts(centres, torch.full((5,), 90.0).double(), places)
+    found, shifts = gauge_directions(centres, place), pixel_shifts(centres, torch.full((5,), 90.0).double(), places)
     axes = torch.eye(3).double().expand(50, 3, 3)
     turns = torch.linalg.cross(axes, (places - place)[:, :, None].expand(50, 3, 3), dim=1)
     content = torch.cat([axes, turns, (places - place)[:, :, None], axes], dim=2)
@@ -51,7 +51,7 @@ def test_whitening_motion_shifts_places_by_a_pixel():
     centres, places = 3 * torch.nn.functional.normalize(torch.randn(5, 3).double(), dim=1), torch.rand(500, 3).double()
     shifts = pixel_shifts(centres, torch.full((5,), 200.0).double(), places - 0.5)
     free, damped = (
-        (shifts @ whitening(shifts, damping)[:, None]).square().sum(2).mean(1).sqrt() for damping in (1e-9, 1.0)
+        (shifts @ precondition(shifts, damping)[:, None]).square().sum(2).mean(1).sqrt() for damping in (1e-9, 1.0)
     )
     torch.testing.assert_close(free, torch.ones(5, 6).double(), rtol=1e-3, atol=0)
     assert (damped < 1).all() and (damped > 0.01).all()

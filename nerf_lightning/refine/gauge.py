@@ -4,23 +4,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-TINY = 1e-3
+MIN_DISTANCE_SHARE = 1e-3
 """Share of the mean squared distance that is added to all, for cameras in the middle of the content."""
-TOLD = 1e-6
+MIN_OWN_SHARE = 1e-6
 """Vectors whose own part is smaller than this, as a share of their length, are made of others."""
-SMALL = 1e-6
+SERIES_ANGLE_SQUARED = 1e-6
 """Squared angle below which a series stands in for the factors of a turn, so that gradients exist at 0 too."""
 
 
-def turned(vectors: Float[Tensor, "R 3"], turns: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-    """Vectors, each turned about an axis (Rodrigues' formula).
+def rotate(vectors: Float[Tensor, "R 3"], turns: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+    """Vectors, each rotate about an axis (Rodrigues' formula).
 
     Args:
         vectors: of any length.
         turns: the axes' directions, as long as the angles are in radians.
     """
     square = turns.square().sum(1, keepdim=True)
-    small = square < SMALL
+    small = square < SERIES_ANGLE_SQUARED
     angle = torch.where(small, 1.0, square).sqrt()
     first = torch.where(small, 1 - square / 6, angle.sin() / angle)
     second = torch.where(small, 0.5 - square / 24, (1 - angle.cos()) / angle.square())
@@ -52,7 +52,7 @@ def pixel_shifts(
     return focals[:, None, None, None] * (axes - ray * ray.mT) @ torch.cat([turn, -axes], dim=3) / distance
 
 
-def drifts(centres: Float[Tensor, "V 3"], place: Float[Tensor, "3"]) -> Float[Tensor, "V 6 10"]:
+def gauge_directions(centres: Float[Tensor, "V 3"], place: Float[Tensor, "3"]) -> Float[Tensor, "V 6 10"]:
     """Motions of all cameras together that photos do not tell, or hardly: of cameras and content as a whole, and of the content
     alone, which far cameras follow by turning.
 
@@ -67,14 +67,14 @@ def drifts(centres: Float[Tensor, "V 3"], place: Float[Tensor, "3"]) -> Float[Te
     axes = torch.eye(3, dtype=centres.dtype, device=centres.device).expand(len(centres), 3, 3)
     none, away = torch.zeros_like(axes), (centres - place)[:, :, None]
     square = away.square().sum(1, keepdim=True)
-    square = (square + TINY * square.mean()).clamp_min(torch.finfo(square.dtype).tiny)
+    square = (square + MIN_DISTANCE_SHARE * square.mean()).clamp_min(torch.finfo(square.dtype).tiny)
     across = torch.linalg.cross(axes, away.expand_as(axes), dim=1)
     turns = torch.cat([none, axes, none[..., :1], across / square], dim=2)
     moves = torch.cat([axes, across, away, none], dim=2)
     return torch.cat([turns, moves], dim=1)
 
 
-def whitening(shifts: Float[Tensor, "V P 3 6"], damping: float) -> Float[Tensor, "V 6 6"]:
+def precondition(shifts: Float[Tensor, "V P 3 6"], damping: float) -> Float[Tensor, "V 6 6"]:
     """For each photo the matrix that turns a vector of unit length into a motion that shifts places by about a pixel.
 
     The inverse square root of the mean of J^T J, damped: Park et al. 2023, "CamP", section 4.
@@ -89,13 +89,13 @@ def whitening(shifts: Float[Tensor, "V P 3 6"], damping: float) -> Float[Tensor,
     return vectors @ torch.diag_embed(values.rsqrt()) @ vectors.mT
 
 
-def spanned(vectors: Float[Tensor, "N K"]) -> Float[Tensor, "N B"]:
+def orthonormal_basis(vectors: Float[Tensor, "N K"]) -> Float[Tensor, "N B"]:
     """An orthonormal basis of what some columns span."""
     lengths = vectors.norm(dim=0).clamp_min(torch.finfo(vectors.dtype).tiny)
     basis, sizes, _ = torch.linalg.svd(vectors / lengths, full_matrices=False)
-    return basis[:, sizes > TOLD]
+    return basis[:, sizes > MIN_OWN_SHARE]
 
 
-def without(vectors: Float[Tensor, "V K"], basis: Float[Tensor, "VK B"]) -> Float[Tensor, "V K"]:
+def project_out(vectors: Float[Tensor, "V K"], basis: Float[Tensor, "VK B"]) -> Float[Tensor, "V K"]:
     """What is left of vectors, taken as one long one, off an orthonormal basis."""
     return vectors - (basis * (basis * vectors.flatten()[:, None]).sum(0)).sum(1).view_as(vectors)

@@ -1,0 +1,46 @@
+"""The color behind a scene: rays that meet nothing show it."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from nerf_lightning.errors import InputError
+
+COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+SCENE_CHOICES = ("scene", "random", "suited")
+
+
+class Background(torch.nn.Module):
+    """One color, or in training a random one for each ray.
+
+    Args:
+        choice: see `VolumeRenderer`.
+        scene_color: what "scene" stands for.
+        has_alpha: whether the photos have alpha.
+
+    Raises:
+        InputError: for any other choice.
+    """
+
+    color: Tensor
+
+    def __init__(self, choice: str | list[float], scene_color: tuple[float, float, float], has_alpha: bool):
+        super().__init__()
+        self.is_random = choice == "random" or (choice == "suited" and has_alpha)
+        color: Sequence[float]
+        if isinstance(choice, str):
+            color = scene_color if choice in SCENE_CHOICES else COLORS.get(choice, ())
+        else:
+            color = choice
+        if len(color) != 3 or not all(0 <= c <= 1 for c in color):
+            expected = f"{', '.join([*SCENE_CHOICES, *COLORS])} or three numbers in [0, 1]"
+            raise InputError("renderer.background", "", repr(choice), expected)
+        self.register_buffer("color", torch.tensor(color), persistent=False)
+
+    def sample(self, count: int, generator: Generator | None = None) -> Float[Tensor, "R 3"]:
+        """The color behind each of `count` rays; random only in training, when a generator is given."""
+        if self.is_random and generator is not None:
+            return torch.rand(count, 3, generator=generator, device=self.color.device)
+        return self.color.expand(count, 3)

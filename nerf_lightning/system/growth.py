@@ -1,0 +1,76 @@
+"""Growth of the field during training: coarse grids find the shape sooner, fine ones hold the detail."""
+
+import copy
+from typing import TYPE_CHECKING
+
+import lightning as L
+import torch
+from lightning.pytorch.strategies import DDPStrategy
+
+from nerf_lightning.dataset import RayBatch, RayDataModule
+from nerf_lightning.system.system import total_loss
+from nerf_lightning.utils.seeding import Stream, step_generator
+
+if TYPE_CHECKING:
+    from nerf_lightning.system.nerf3d import NeRF3D
+
+
+def growth_progress(system: "NeRF3D", step: int) -> float:
+    """The share of the training that the field's stage is taken from: `progress`, but for few or many steps (see
+    `ResolutionSchedule.clamp_progress`), and slower while corrected cameras find their places."""
+    growth, progress = system.field.growth, system.state.progress
+    if growth is None:
+        return progress
+    if system.corrections is not None:
+        progress = system.corrections.delay_growth(progress, growth.end)
+    return growth.clamp_progress(progress, step, may_hurry=system.corrections is None)
+
+
+def next_stage(system: "NeRF3D", step: int) -> int | None:
+    """The stage that the field is to take at this step; None if it keeps the one it has."""
+    growth = system.field.growth
+    stage = 0 if growth is None else growth.stage_at(growth_progress(system, step))
+    return stage if stage > system.field.stage else None
+
+
+def follow_resolution(system: "NeRF3D", data: RayDataModule) -> None:
+    """Gives the sampler's steps, and the samples a step of the data, the field's present resolution."""
+    system.sampler.set_resolution_scale(system.field.resolution_scale)
+    data.finer = system.field.resolution_scale
+
+
+@torch.no_grad()
+def grow_field(system: "NeRF3D", data: RayDataModule, stage: int, optimizer: torch.optim.Optimizer) -> None:
+    """Upsamples the field; the optimiser forgets its state for what has another shape."""
+    for parameter in system.field.upsample(stage):
+        optimizer.state.pop(parameter, None)
+    follow_resolution(system, data)
+
+
+class GrowField(L.Callback):
+    """Upsamples a field that grows when its next stage is due."""
+
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: "NeRF3D", batch: RayBatch, batch_idx: int) -> None:
+        stage = next_stage(pl_module, trainer.global_step)
+        if stage is None:
+            return
+        if trainer.world_size > 1:  # each process has seen rays of its own, and all must grow alike
+            for buffer in pl_module.buffers():
+                torch.distributed.broadcast(buffer, 0)
+        grow_field(pl_module, pl_module.data, stage, trainer.optimizers[0])
+        if isinstance(trainer.strategy, DDPStrategy):  # it has allocated gradients of the old size
+            trainer.strategy.model = pl_module
+            trainer.strategy.configure_ddp()
+        if pl_module.backend is not None:
+            rehearse(pl_module, batch)
+
+
+def rehearse(system: "NeRF3D", batch: RayBatch) -> None:
+    """Runs a step on a copy with the clock stopped: compiling for a new size does not count as training."""
+    field, sampler = copy.deepcopy(system.field), copy.deepcopy(system.sampler)
+    options = system.make_optimizer, system.schedule, system.seed, system.chunk, system.corrections, system.backend
+    trial = type(system)(field, sampler, system.renderer, *options)
+    with system.state.clock.paused(), system.trainer.precision_plugin.train_step_context():
+        generator = step_generator(system.seed, Stream.STEP, system.global_step, system.device)
+        losses, _ = trial.compute_losses(batch, generator)
+        total_loss(losses).backward()
