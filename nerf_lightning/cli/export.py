@@ -150,8 +150,8 @@ def export_html(
     from nerf_lightning.runs.find import OUTPUTS
     from nerf_lightning.utils.device import the_device
 
-    options = {"cells": cells, "precision": precision, "loss_db": loss_db, "photos": photos}
-    build = partial(build_page, device=the_device(device), **options)
+    where = the_device(device)
+    build = partial(build_page, device=where, cells=cells, precision=precision, loss_db=loss_db, photos=photos)
     if all:
         folder = run or OUTPUTS
         target = _target(folder, output, "gallery.html", (".html",))
