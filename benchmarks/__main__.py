@@ -26,7 +26,7 @@ from nerf_lightning.utils.machine import describe_machine
 PARTS = {
     "methods": "trainings as users run them: seconds to a quality, and quality after seconds",
     "agreement": "kernels and short trainings on a device against plain PyTorch on the CPU",
-    "speed": "a training step: time, operations, memory, how it grows, what Lightning adds",
+    "speed": "a training step: time, operations, memory, what Lightning adds",
     "cameras": "what inexact cameras and light cost, and how much of it refine=auto brings back",
     "capture": "how near a synthetic capture with tags comes to the true cameras",
     "captures": "photos with a background: quality, fog and depth",

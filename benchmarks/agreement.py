@@ -152,14 +152,6 @@ def milliseconds(case: Case, device: torch.device, choice: str) -> float:
     return 1e3 * median(times[2:])
 
 
-def few_figures(number: float) -> str:
-    """Two figures and a power of ten."""
-    if not math.isfinite(number):
-        return str(number)
-    figures, power = f"{number:.1e}".split("e")
-    return f"{figures}e{int(power)}"
-
-
 def compare(case: Case, device: torch.device) -> Row:
     """A kernel on a device beside the reference on the CPU."""
     (values, gradients), (wanted, wanted_gradients) = (
@@ -169,11 +161,11 @@ def compare(case: Case, device: torch.device) -> Row:
     gradient, _ = compare_dense(gradients, wanted_gradients)
     found = []
     if not value <= MAX_DIFFERENCE:
-        found.append(f"value, {few_figures(value)} apart")
+        found.append(f"value, {value:.1e} apart")
     if not other <= MAX_OTHERS:
         found.append(f"value, {100 * other:.3g}% of entries are others")
     if not gradient <= MAX_DIFFERENCE:
-        found.append(f"gradient, {few_figures(gradient)} apart")
+        found.append(f"gradient, {gradient:.1e} apart")
     ours, plain = (milliseconds(case, device, choice) for choice in ("auto", "reference"))
     apart = {"value_apart": value, "entries_other": other, "gradient_apart": gradient if case.learns else None}
     times = {"fast_ms": ours, "reference_ms": plain, "times_faster": plain / ours}

@@ -17,10 +17,10 @@ from benchmarks.tables import Rows, medians
 from nerf_lightning.cameras import Cameras, in_other_frame
 from nerf_lightning.capture.poses.geometry import angle_between
 from nerf_lightning.dataset import Scene
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.runs.data import seen_by_corrected
 from nerf_lightning.runs.scene_file import load_scene as content_of
 from nerf_lightning.synthetic import corruptions
+from nerf_lightning.synthetic.bricks import bricks
 
 RECIPES = ("tensorf_medium", "voxels_medium", "hashgrid_medium")
 STEPS = 2500
@@ -42,28 +42,24 @@ def both(scene: Scene, seed: int) -> Scene:
     return light(poses(0.5, 0.01)(scene, seed), seed)
 
 
-def exact(scene: Scene, seed: int) -> Scene:
-    return scene
-
-
-def long_lens(scene: Scene, seed: int) -> Scene:
-    return corruptions.scale_focal_length(scene, seed, 1.03)
-
-
-def dark_corners(scene: Scene, seed: int) -> Scene:
-    return corruptions.add_vignetting(light(scene, seed), seed, 0.5)
-
-
 CONDITIONS: dict[str, tuple[int | None, Damage, list[str]]] = {
-    "exact": (None, exact, []),
+    "exact": (None, lambda scene, seed: scene, []),
     "0.5 degrees, 1 %": (None, poses(0.5, 0.01), []),
     "2 degrees, 3 %": (None, poses(2.0, 0.03), []),
     "5 degrees, 5 %": (None, poses(5.0, 0.05), []),
     "light": (None, light, []),
-    "light, dark corners": (None, dark_corners, ["refine.vignetting=true"]),
-    "focal length 3 % too long": (None, long_lens, ["refine.focal=true"]),
+    "light, dark corners": (
+        None,
+        lambda scene, seed: corruptions.add_vignetting(light(scene, seed), seed, 0.5),
+        ["refine.vignetting=true"],
+    ),
+    "focal length 3 % too long": (
+        None,
+        lambda scene, seed: corruptions.scale_focal_length(scene, seed, 1.03),
+        ["refine.focal=true"],
+    ),
     "both, 3 wrong": (None, lambda scene, seed: corruptions.swap_poses(both(scene, seed), seed, WRONG), []),
-    "exact, 12 photos": (FEW, exact, []),
+    "exact, 12 photos": (FEW, lambda scene, seed: scene, []),
     "both, 12 photos": (FEW, both, []),
 }
 """How many photos there are, None for all, what is done to them, and what is corrected besides."""

@@ -13,14 +13,7 @@ WAITS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "a
 INDEXED = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
 """Operations that look for the true entries of a mask where they are given one."""
 
-IDLE = (
-    "aten::detach",
-    "aten::_unsafe_view",
-    "aten::empty",
-    "aten::empty_like",
-    "aten::empty_strided",
-    "aten::new_empty",
-)
+IDLE = {f"aten::{name}" for name in ("detach", "_unsafe_view", "empty", "empty_like", "empty_strided", "new_empty")}
 """Operations, beside views, that launch nothing."""
 
 
@@ -48,8 +41,6 @@ class Count(TorchDispatchMode):
         super().__init__()
         self.names: Counter[str] = Counter()
         """Operations that work on a device."""
-        self.idle: Counter[str] = Counter()
-        """Those that the host does by itself: other ways of looking at a tensor, and memory to write into."""
         self.waits = 0
 
     @property
@@ -59,8 +50,8 @@ class Count(TorchDispatchMode):
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = function._schema.name
         kwargs = kwargs or {}
-        idle = function.is_view or name in IDLE
-        if any(isinstance(leaf, Tensor) for leaf in pytree.tree_leaves((args, kwargs))) or "device" in kwargs:
-            (self.idle if idle else self.names)[name] += 1
+        leaves = pytree.tree_leaves((args, kwargs))
+        if not function.is_view and name not in IDLE and ("device" in kwargs or any(map(torch.is_tensor, leaves))):
+            self.names[name] += 1
             self.waits += waits(name, args, kwargs)
         return function(*args, **kwargs)

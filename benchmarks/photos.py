@@ -2,17 +2,16 @@
 
 import argparse
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import replace
-from statistics import fmean, median
+from statistics import fmean
 
 import torch
 
 import nerf_lightning as nl
 from benchmarks.tables import Rows
 from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
-from nerf_lightning.dataset import Scene, Views, draw_rays
+from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.dataset.views import Runs
 from nerf_lightning.synthetic.objects import PILE, bound_bodies, make_scene, place_cameras, render_photos
 
@@ -22,7 +21,6 @@ GREY = (0.5, 0.5, 0.5)
 BOXED = 0.3
 """Share of the training photos that have boxes pasted on."""
 FISHEYE = Distortion(k1=-0.02, k2=0.004)
-ROUNDS, DRAWS, RAYS = 7, 200, 1024
 QUIET = ("callbacks.snapshots=null", "callbacks.orbit=null", "~logger", "callbacks.heldout=null")
 
 
@@ -82,14 +80,6 @@ def through_fisheye(views: int, phase: float) -> Views:
     return Views.of(render_photos(PILE, cameras, GREY), cameras)
 
 
-def batch_seconds(scene: Scene) -> float:
-    """Of drawing one batch."""
-    start = time.perf_counter()
-    for step in range(DRAWS):
-        draw_rays(scene.train, RAYS, torch.Generator().manual_seed(step))
-    return (time.perf_counter() - start) / DRAWS
-
-
 def measure(args: argparse.Namespace) -> Rows:
     """The table, a line a kind of photos."""
     plain = replace(make_scene(PILE, GREY, SIZE, VIEWS, HELD_OUT), bounds=bound_bodies(PILE))
@@ -102,10 +92,6 @@ def measure(args: argparse.Namespace) -> Rows:
         "boxes, masked": masks,
         "fisheye": fisheye,
     }
-    for scene in scenes.values():
-        batch_seconds(scene)  # caches
-    # In turn: other work on the machine comes and goes.
-    rounds = [{name: batch_seconds(scene) for name, scene in scenes.items()} for _ in range(ROUNDS)]
     rows: Rows = []
     for name, scene in scenes.items():
         found = []
@@ -115,13 +101,6 @@ def measure(args: argparse.Namespace) -> Rows:
             found.append(nl.train(scene, steps=STEPS, seed=seed, device="cpu", folder=folder, options=QUIET).psnr)
         held = scene.train
         runs = 0 if held.known is None else held.known.starts.nbytes + held.known.ends.nbytes
-        rows.append(
-            {
-                "photos": name,
-                "psnr": fmean(found),
-                "bytes/pixel": (held.nbytes + runs) / len(held.pixels),
-                "batch_ms": 1000 * median(one[name] for one in rounds),
-                "batch": median(one[name] / one["one size"] for one in rounds),
-            }
-        )
+        row = {"photos": name, "psnr": fmean(found), "bytes/pixel": (held.nbytes + runs) / len(held.pixels)}
+        rows.append(row)
     return rows

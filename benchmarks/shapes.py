@@ -18,10 +18,10 @@ from benchmarks.tables import Rows, named
 from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.run import capture_scene
 from nerf_lightning.capture.tags.layout import TagLayout
-from nerf_lightning.dataset.bricks.model import bulldozer
 from nerf_lightning.export.mesh import mesh_file, training_views
 from nerf_lightning.export.volume import volume_of
 from nerf_lightning.runs.open import SceneRun, open_scene_run
+from nerf_lightning.synthetic.solids import bulldozer
 from nerf_lightning.utils.device import the_device
 
 PHOTOS, VIEWS = 20, 40
@@ -39,7 +39,7 @@ def distance_to_bricks(points: np.ndarray) -> np.ndarray:
     at most the depth in the one that a point lies deepest in."""
     solids = bulldozer()
     least = np.full(len(points), np.inf)
-    for index in range(len(solids)):
+    for index in range(len(solids.centre)):
         local, half = (points - solids.centre[index]) @ solids.axes[index].T, solids.half[index]
         if solids.cylinder[index]:
             beyond = np.stack([np.hypot(local[:, 0], local[:, 1]) - half[0], np.abs(local[:, 2]) - half[2]], axis=1)

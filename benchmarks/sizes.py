@@ -13,7 +13,7 @@ from nerf_lightning.cli.rightsize import describe_scene, rightsize
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, save_npz
-from nerf_lightning.sizing.ladder import read_ladder
+from nerf_lightning.sizing.choose import read_ladder
 from nerf_lightning.sizing.search import train_in_full
 from nerf_lightning.synthetic.objects import Ball, Block, Body, make_scene
 

@@ -1,14 +1,13 @@
-"""What a training step costs on a device: time, operations, waits of the host and memory, and how its time grows."""
+"""What a training step costs on a device: time, operations, waits of the host and memory."""
 
 import argparse
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean, median, quantiles
+from typing import Any
 
+import lightning as L
 import torch
 from omegaconf import DictConfig
 
@@ -17,29 +16,26 @@ from benchmarks.count import Count
 from benchmarks.methods import METHODS
 from benchmarks.tables import Row, Rows, named
 from nerf_lightning.callbacks.results import peak_memory_bytes
-from nerf_lightning.config.build import build_data, build_system, frame_of
+from nerf_lightning.config.build import build_data, build_system, build_trainer, device_of, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.limits import limits_of
-from nerf_lightning.dataset import RayDataModule, Views
-from nerf_lightning.dataset.resize import resize_views
+from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.system.growth import follow_resolution, grow_field, next_stage
 from nerf_lightning.system.system import total_loss
 from nerf_lightning.training.train import prepare
 from nerf_lightning.utils.device import CPU, synchronize
 from nerf_lightning.utils.libraries import silence_lightning
-from nerf_lightning.utils.machine import cores
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 WARMUP, PERIODS = 320, 6
 """Steps before the first that counts, and how many periods of the sampler's updates are timed after it."""
-BLOCK, ROUNDS = 32, 10
-"""Steps in a row at one point of a table; how often each point has its turn."""
 PROGRESS = 0.5
 """The field has its full size from here on."""
-SAMPLES, VIEWS, SIDES = (8192, 16384, 32768, 65536), (10, 100, 1000), (50, 100, 200)
-DISTINCT = 10
-"""Photos that are repeated to make more of them: the content, and with it the work, stays the same."""
+BLOCK = 32
+"""Steps in a row of one kind: two rounds of the occupancy grid, short against a machine's moods."""
+BLOCKS, FIRST = 50, 10
+"""Blocks of each kind, and the first that counts."""
 
 
 def build(overrides: list[str], device: torch.device = CPU) -> tuple[DictConfig, RayDataModule, NeRF3D]:
@@ -141,85 +137,62 @@ def measure_methods(device: torch.device, experiment: str, overrides: list[str])
     return rows
 
 
-def block_ms(system: NeRF3D, data: RayDataModule, optimizer: torch.optim.Optimizer, first: int, steps: int) -> float:
-    """Milliseconds of a step, the mean over the later half of some: by then the number of rays has found its level."""
-    times = [take_step(system, data, optimizer, first + i, PROGRESS) for i in range(steps)]
-    return 1e3 * fmean(times[steps // 2 :])
+class Alternation(L.Callback):
+    """After each block of the Trainer's steps, takes as many without it: same field, same optimiser, same photos.
 
-
-def in_turn(points: list[Callable[[int], float]]) -> list[tuple[float, list[float]]]:
-    """Times of several points, block after block in turn: the median of each, and all of its rounds."""
-    rounds = [[point(turn) for point in points] for turn in range(ROUNDS)]
-    columns = [list(column) for column in zip(*rounds, strict=True)]
-    return [(median(column), column) for column in columns]
-
-
-def measure_growth(overrides: list[str]) -> Rows:
-    """Milliseconds of a step with samples a step, photos, and their size, all measured on one field in training.
-
-    `ratio` is that to the axis's first point, the median over rounds.
+    Of every block the last step is left out, because in the Trainer's it ends in this callback's own work.
     """
-    cfg, data, system = build(overrides)
-    optimizer, train = system.configure_optimizers(), data.scene.train
 
-    def variant(train: Views, samples: int | None) -> RayDataModule:
-        return RayDataModule(replace(data.scene, train=train), rays=data.rays, samples=samples, seed=cfg.seed)
+    def __init__(self, data: RayDataModule) -> None:
+        self.data = data
+        self.trainer_blocks: list[float] = []
+        """Mean seconds of a step, one entry a block."""
+        self.bare_blocks: list[float] = []
+        self._starts: list[float] = []
 
-    repeated = {n: train[torch.as_tensor(torch.arange(n) % DISTINCT)] for n in VIEWS}
-    points = [
-        *(("samples a step", n, variant(train, n)) for n in SAMPLES),
-        *(("photos", n, variant(views, data.samples)) for n, views in repeated.items()),
-        *(("pixels along a side", n, variant(resize_views(train, n), data.samples)) for n in SIDES),
-    ]
-    block_ms(system, data, optimizer, 0, WARMUP)
-    for _, _, other in points:
-        block_ms(system, other, optimizer, 0, BLOCK)
-
-    def run_block(other: RayDataModule, turn: int) -> float:
-        return block_ms(system, other, optimizer, BLOCK * turn, BLOCK)
-
-    found = in_turn([partial(run_block, other) for _, _, other in points])
-    first: dict[str, list[float]] = {}
-    rows: Rows = []
-    for (axis, value, _), (time_ms, column) in zip(points, found, strict=True):
-        start = first.setdefault(axis, column)
-        ratio = median(a / b for a, b in zip(column, start, strict=True))
-        rows.append({"axis": axis, "value": value, "step_ms": time_ms, "ratio": ratio})
-    return rows
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: NeRF3D, batch: Any, batch_idx: int) -> None:
+        step = trainer.global_step
+        if step and step % BLOCK == 0:
+            self.trainer_blocks.append((self._starts[-1] - self._starts[0]) / (BLOCK - 1))
+            optimizer = pl_module.optimizers(use_pl_optimizer=False)
+            assert isinstance(optimizer, torch.optim.Optimizer)
+            steps = range(step - BLOCK, step)
+            times = [take_step(pl_module, self.data, optimizer, past, pl_module.state.progress) for past in steps]
+            self.bare_blocks.append(fmean(times[:-1]))
+            self._starts = []
+        self._starts.append(time.perf_counter())
 
 
-def measure_threads(experiment: str, overrides: list[str]) -> Rows:
-    """Milliseconds of a step on 1, 2, 4, ... threads, as many as there are cores, measured in turn.
+def measure_overhead(overrides: list[str]) -> dict[str, float]:
+    """Milliseconds of a step, bare and under a Trainer with all callbacks and the logger, in alternating blocks of one run.
 
-    `efficiency` is the share of those threads that one thread's time explains, the median over rounds.
+    Measurements and pictures, whose time is no training time, are moved out of the way; the share is the median over pairs of
+    neighbouring blocks, with its quartiles.
     """
-    counts, before = [2**power for power in range(cores().bit_length())], torch.get_num_threads()
-    _, data, system = build([f"+experiment={experiment}", *overrides])
-    optimizer = system.configure_optimizers()
-    block_ms(system, data, optimizer, 0, WARMUP)
-
-    def run_block(count: int, turn: int) -> float:
-        torch.set_num_threads(count)
-        return block_ms(system, data, optimizer, WARMUP + BLOCK * turn, BLOCK)
-
-    found = in_turn([partial(run_block, count) for count in counts])
-    torch.set_num_threads(before)
-    rows: Rows = []
-    for count, (time_ms, column) in zip(counts, found, strict=True):
-        efficiency = median(one / (count * each) for one, each in zip(found[0][1], column, strict=True))
-        rows.append({"experiment": experiment, "threads": count, "step_ms": time_ms, "efficiency": efficiency})
-    return rows
+    steps = BLOCKS * BLOCK + 1
+    settings = [*overrides, f"budget.steps={steps}", "callbacks.heldout.at=[]", "callbacks.snapshots.steps=[]"]
+    cfg, data, system = build(settings)
+    own = RayDataModule(data.scene, data.rays, data.samples, cfg.seed)  # the Trainer has drawn its batch
+    follow_resolution(system, own)
+    with tempfile.TemporaryDirectory() as folder:
+        trainer, alternation = build_trainer(cfg, Path(folder), device_of(cfg)), Alternation(own)
+        trainer.callbacks.insert(0, alternation)  # type: ignore[attr-defined]
+        trainer.fit(system, data)
+    full, bare = alternation.trainer_blocks[FIRST:], alternation.bare_blocks[FIRST:]
+    lower, middle, upper = quantiles([100 * (a / b - 1) for a, b in zip(full, bare, strict=True)])
+    return {
+        "bare_ms": 1e3 * median(bare),
+        "trainer_ms": 1e3 * median(full),
+        "overhead_percent": middle,
+        "lower_quartile": lower,
+        "upper_quartile": upper,
+    }
 
 
 def measure(args: argparse.Namespace) -> Rows:
-    """The step of each method; on a CPU also how it grows, how threads share it, and what Lightning adds."""
-    from benchmarks.overhead import measure_overhead  # which takes steps from here
-
+    """The step of each method; on a CPU also what Lightning adds."""
     experiment = args.experiments[0]
     tables = {"steps": measure_methods(args.device, experiment, args.overrides)}
     if args.device == CPU:
-        given = [f"+experiment={experiment}", *args.overrides]
-        tables["growth"] = measure_growth(given)
-        tables["threads"] = [row for name in args.experiments for row in measure_threads(name, args.overrides)]
-        tables["overhead"] = [measure_overhead(given)]
+        tables["overhead"] = [measure_overhead([f"+experiment={experiment}", *args.overrides])]
     return named(tables)

@@ -18,10 +18,10 @@ from benchmarks.synthetic.video import FPS, place_cameras, with_blurs, write_vid
 from benchmarks.tables import Row, Rows
 from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.capture.poses.geometry import angle_between, inverse
-from nerf_lightning.dataset.bricks.trace import shadow
 from nerf_lightning.dataset.lens import Lens
 from nerf_lightning.dataset.placing.frames import frames_of
 from nerf_lightning.dataset.placing.place import place
+from nerf_lightning.synthetic.tracer import map_shadow
 
 LENS = Lens(480, 360, 420.0, 420.0, 242.0, 178.0, (-0.1, 0.02, 0.0, 0.0, 0.0))
 FLAWS = Flaws(blur=0.4, noise=2.0)
@@ -67,7 +67,7 @@ def moving(index: int) -> int:
 
 
 def _pictures(c2w: Float[np.ndarray, "N 4 4"], seed: int) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-    shadow()  # made once, before the threads ask for it
+    map_shadow()  # made once, before the threads ask for it
     layout = SHEETS["six tags"]
 
     def render(index: int) -> UInt8[np.ndarray, "H W 3"]:

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from benchmarks import __main__ as command
-from benchmarks import agreement, cameras, cases, overhead, photos, pictures, speed
+from benchmarks import agreement, cameras, cases, photos, pictures, speed
 from benchmarks.tables import differences
 from nerf_lightning import kernels
 from nerf_lightning.cameras import in_other_frame
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.device import CPU
 from tests.helpers.soft_ball import cameras_around_ball
 
@@ -62,9 +62,9 @@ def test_compare_kernels_right_ones_are_equal_and_wrong_ones_named(few_samples: 
     spoil(monkeypatch, "voxel_value", refuse)
     assert differences(agreement.compare_kernels(CPU)) == [
         "points (value, nan apart)",
-        "hash_interpolate (gradient, 3.0e-2 apart)",
-        "hash_interpolate_2d (gradient, 3.0e-2 apart)",
-        "spherical_harmonics (value, 1.0e-3 apart)",
+        "hash_interpolate (gradient, 3.0e-02 apart)",
+        "hash_interpolate_2d (gradient, 3.0e-02 apart)",
+        "spherical_harmonics (value, 1.0e-03 apart)",
         "voxel_value (failed: not on this device)",
     ]
 
@@ -72,13 +72,9 @@ def test_compare_kernels_right_ones_are_equal_and_wrong_ones_named(few_samples: 
 TINY = {
     cases: {"RAYS": 16, "SAMPLES": 64},
     agreement: {"ROUNDS": 1, "STEPS": 2, "SCENE": ("dataset=bricks", "dataset.size=16", "dataset.train_views=10")},
-    overhead: {"BLOCKS": 4, "FIRST": 1, "BLOCK": 3},
-    speed: {
-        "WARMUP": 2, "BLOCK": 2, "ROUNDS": 2, "PERIODS": 1, "SAMPLES": (64, 128), "VIEWS": (3,), "SIDES": (8,),
-        "METHODS": ("hashgrid",),
-    },
+    speed: {"WARMUP": 2, "PERIODS": 1, "METHODS": ("hashgrid",), "BLOCKS": 4, "FIRST": 1, "BLOCK": 3},
     cameras: {"STEPS": 2, "CONDITIONS": {"exact": cameras.CONDITIONS["exact"]}},
-    photos: {"SIZE": 16, "VIEWS": 6, "HELD_OUT": 2, "STEPS": 2, "ROUNDS": 1, "DRAWS": 2},
+    photos: {"SIZE": 16, "VIEWS": 6, "HELD_OUT": 2, "STEPS": 2},
     pictures: {"KINDS": ("clouds",), "FIELDS": ("siren",), "SIZE": 16, "LARGE": 16},
 }  # fmt: skip
 
@@ -103,8 +99,6 @@ def test_main_tiny_parts_write_table_and_json(tiny: None, tmp_path: Path, monkey
     assert len(report["short trainings"]) == 8 and all(row["psnr"] > 1 for row in report["short trainings"])
     (row,) = report["steps"]
     assert row["step_ms"] > 0 and row["operations"] > 20 and row["waits"] >= 1 and row["samples"] > row["rays"] > 0
-    assert [row["value"] for row in report["growth"]] == [64, 128, 3, 8]
-    assert report["threads"][0]["threads"] == report["threads"][0]["efficiency"] == 1
     assert report["overhead"][0]["bare_ms"] > 0
     assert report["methods"][0]["method"] == "smoke_3d"
     assert "bare_ms" in (tmp_path / "table.txt").read_text()

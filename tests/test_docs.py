@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from nerf_lightning.cli.app import main
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.export.photos import write_photos
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.signals import Interrupted
 from tests.helpers.command_line import BARE
 from tests.helpers.tag_views import SIZE

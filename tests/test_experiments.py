@@ -10,7 +10,7 @@ from nerf_lightning.config import conf_dir
 from nerf_lightning.config.build import build_data, build_system, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.system import total_loss
 from nerf_lightning.training.train import train

@@ -20,11 +20,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nerf_lightning.dataset import Views, open_scene
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
 from nerf_lightning.runs.compact import encode, load_compact
 from nerf_lightning.runs.folder import load_config, load_run, plain_config
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.parsing import read_json, read_npy, read_yaml
 from tests.helpers.colmap_files import write_scene
 
@@ -64,7 +64,7 @@ READERS: dict[str, tuple[str, str, Reader]] = {
 def whole(tmp_path_factory: pytest.TempPathFactory, small_run: Path, own_cache: None) -> Path:
     """A valid file of each kind."""
     folder = tmp_path_factory.mktemp("readers")
-    views: Views = bricks(size=8, train_views=5, val_views=1, cache="").train
+    views: Views = bricks(size=8, train_views=5, val_views=1).train
     for kind in ("npz", "transforms", "blender", "llff", "colmap", "text"):
         write_scene(kind, folder / kind, views)
     (folder / "figures.json").write_text(json.dumps({"psnr": 31.5, "curve": [[0.5, 10, 20.25]], "name": "ü"}))

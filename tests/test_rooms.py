@@ -10,6 +10,7 @@ ORDER = (
     ("kernels",),
     ("dataset", "model", "refine"),
     ("synthetic",),
+    ("sources",),
     ("sampler",),  # some have a small field of their own
     ("renderer",),
     ("system",),

@@ -15,8 +15,8 @@ from benchmarks.synthetic.tabletop import Tabletop
 from benchmarks.synthetic.viewpoints import object_cameras, sheet_cameras
 from nerf_lightning.capture.poses.geometry import normalised
 from nerf_lightning.capture.tags.layout import TagLayout
-from nerf_lightning.dataset.bricks.trace import shadow
 from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.synthetic.tracer import map_shadow
 
 BLOCK = 32
 """Side of the blocks in pixels that are traced at once: as many rays as stay in a core's cache."""
@@ -127,7 +127,7 @@ def write_capture(
         hide: in every N-th photo of the object, from the second on, the tags are hidden; None: in none.
     """
     _tangents(lens, samples)  # made once, before the threads ask for it, and so is the shadow
-    shadow()
+    map_shadow()
     seeds = iter(np.random.SeedSequence(seed).generate_state(2 + sheet_views + object_views).tolist())
     poses = {
         "calibration": sheet_cameras(layout, lens, sheet_views, next(seeds)),

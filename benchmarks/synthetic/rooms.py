@@ -14,8 +14,6 @@ from nerf_lightning.synthetic.objects import trace_rays
 from nerf_lightning.synthetic.rooms import Room, photograph_room, place_handheld
 
 WIDTH, HEIGHT, VIEWS = 240, 180, 56
-HIDDEN = 0.99
-"""A place is hidden where something stands nearer than this share of its distance."""
 
 
 def write_room(room: Room, folder: Path, seed: int = 0) -> None:
@@ -35,24 +33,9 @@ def write_room(room: Room, folder: Path, seed: int = 0) -> None:
 
 def true_view(room: Room, scene: Scene, view: int) -> tuple[Float[Tensor, "R"], Int[Tensor, "R"]]:
     """Distance of what the rays of a held-out view meet, scene's unit, and the body's number."""
-    return meet(room, scene, scene.val.cameras.view_rays(view))
-
-
-def photos_that_show(room: Room, scene: Scene, places: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
-    """How many training photos show places on surfaces, scene's unit."""
-    cameras, shown = scene.train.cameras, torch.zeros(len(places), dtype=torch.long)
-    for view in range(len(cameras)):
-        apart = places - cameras.centres[view]
-        far = apart.norm(dim=1)
-        met, _ = meet(room, scene, Rays(cameras.centres[view].expand_as(places), apart / far[:, None]))
-        shown += cameras.project(places, view)[2] & (met > HIDDEN * far)
-    return shown
-
-
-def meet(room: Room, scene: Scene, rays: Rays) -> tuple[Float[Tensor, "R"], Int[Tensor, "R"]]:
-    """Distance of what rays of a scene meet, its unit, and the body's number."""
-    scale = float(torch.linalg.det(scene.to_source[:3, :3])) ** (1 / 3)
-    turn, shift = scene.to_source[:3, :3].to(rays.origins), scene.to_source[:3, 3].to(rays.origins)
+    rays, to_source = scene.val.cameras.view_rays(view), scene.to_source
+    scale = float(torch.linalg.det(to_source[:3, :3])) ** (1 / 3)
+    turn, shift = to_source[:3, :3].to(rays.origins), to_source[:3, 3].to(rays.origins)
     there = Rays(rays.origins @ turn.mT + shift, rays.directions @ turn.mT / scale)
     _, distance, which = trace_rays(room.bodies, there)
     return distance / scale, which

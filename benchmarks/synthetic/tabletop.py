@@ -1,17 +1,15 @@
 """What synthetic photos show: a printed sheet of tags on a round table, and the built-in bulldozer standing there."""
 
-from dataclasses import fields
-
 import cv2
+import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nerf_lightning.capture.tags.detect import family
 from nerf_lightning.capture.tags.layout import TagLayout
-from nerf_lightning.dataset.bricks.model import bulldozer
-from nerf_lightning.dataset.bricks.shading import shade
-from nerf_lightning.dataset.bricks.solids import Solids
-from nerf_lightning.dataset.bricks.trace import nearest, shadow
+from nerf_lightning.kernels.cpu.solids import add_colour, dot, enter, is_lit, subtract, transform
+from nerf_lightning.synthetic.solids import Solids, bulldozer
+from nerf_lightning.synthetic.tracer import map_shadow
 
 INK, PAPER, WALL = 0.09, 0.90, 0.75
 """Shades of grey in sRGB."""
@@ -107,7 +105,7 @@ class Tabletop:
         # The lamp stands 56 degrees high: no shadow is longer than the bulldozer.
         near = np.flatnonzero(((points > self.box[0, :2] - LENGTH) & (points < self.box[1, :2] + LENGTH)).all(-1))
         own = (np.pad(points[near], ((0, 0), (0, 1))) - self.shift) / self.scale
-        out[near] = ~shadow()(np.full(len(near), -1), own)
+        out[near] = ~find_lit(map_shadow(), own)
         return out
 
     def _add_object(
@@ -120,14 +118,10 @@ class Tabletop:
         """Paints the bulldozer over whatever is farther away; `t` is the distance of that."""
         origin = (eye - self.shift) / self.scale
         some = _in_cone(bulldozer(), origin, directions)
-        if not len(some):
-            return
-        part = Solids(**{f.name: getattr(bulldozer(), f.name)[some] for f in fields(Solids)})
-        # Culled already: testing spheres ray by ray would take longer than it saves.
-        solid, distance = nearest(part, np.broadcast_to(origin, directions.shape), directions, cull=False)
+        part = Solids(*(values[some] for values in bulldozer()))
+        solid, distance = find_nearest(part, np.broadcast_to(origin, directions.shape), directions)
         hit = np.flatnonzero(self.scale * distance < t)
-        points = origin + distance[hit, None] * directions[hit]
-        out[hit] = shade(bulldozer(), some[solid[hit]], points, directions[hit], shadow())
+        out[hit] = shade_points(some[solid[hit]], origin + distance[hit, None] * directions[hit], directions[hit])
 
     def in_front(self, eye: Float[np.ndarray, "3"], points: Float[np.ndarray, "M 3"]) -> Bool[np.ndarray, "M"]:
         """Whether the box around the bulldozer lies between a viewer and points."""
@@ -156,3 +150,49 @@ def _in_cone(
     spheres = np.arcsin(np.clip(np.linalg.norm(solids.half, axis=-1) / distance, 0, 1))
     away = np.arccos(np.clip(offset @ axis / distance, -1, 1))
     return np.flatnonzero(away <= opening + spheres + 1e-6)
+
+
+def find_nearest(
+    solids: Solids, origins: Float[np.ndarray, "R 3"], directions: Float[np.ndarray, "R 3"]
+) -> tuple[Int[np.ndarray, "R"], Float[np.ndarray, "R"]]:
+    """The first solid each ray enters from outside (-1 for none), and where, in lengths of `directions` (inf for none)."""
+    solid, t = np.full(len(origins), -1), np.full(len(origins), np.inf)
+    _find_nearest(solids, solids.to_unit, np.array(origins, float), np.array(directions, float), solid, t)
+    return solid, t
+
+
+def shade_points(
+    solid: Int[np.ndarray, "N"], points: Float[np.ndarray, "N 3"], directions: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "N 3"]:
+    """sRGB in [0, 1] of points on the bulldozer's solids, seen along unit directions; its own frame."""
+    rgb = np.zeros((len(points), 3))
+    _shade_points(bulldozer().single(), map_shadow(), solid, points, directions, rgb)
+    return rgb
+
+
+compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@compiled
+def _find_nearest(solids, to_unit, origins, directions, solid, t):
+    for ray in range(len(t)):
+        d = directions[ray]
+        for k in range(len(solids.centre)):
+            offset, half = subtract(origins[ray], solids.centre[k]), solids.half[k]
+            # Whether the ray meets the sphere around the solid.
+            if dot(offset, offset) - dot(offset, d) ** 2 / dot(d, d) < 1.0001 * dot(half, half):
+                distance = enter(solids.cylinder[k], transform(to_unit[k], offset), transform(to_unit[k], d))
+                if distance < t[ray]:
+                    solid[ray], t[ray] = k, distance
+
+
+@compiled
+def _shade_points(solids, shadow, solid, points, directions, rgb):
+    for n in range(len(points)):
+        add_colour(solids, shadow, solid[n], points[n], directions[n], rgb[n])
+
+
+@compiled
+def find_lit(shadow, points):
+    """Which points [N, 3] that are on no solid the key light reaches."""
+    return np.array([is_lit(shadow, -1, points[n]) for n in range(len(points))])

@@ -33,14 +33,10 @@ class Budget(L.Callback):
     plateau, a field that is still growing jumps to its full size. One at full size cools down quickly: progress, and the
     learning rate with it, runs to the end.
 
-    With `alone`, a step on a CPU counts as long as its threads work on one that nothing disturbs: a run beside others does
-    about as many steps as one alone, however long its threads wait for a core.
-
     Args:
         steps: optimiser steps, or None.
         seconds: seconds of training, or None.
         patience: dB that 50 % more time must still gain; None spends the whole budget.
-        alone: whether seconds are those the machine would need without other work.
 
     Raises:
         InputError: where steps and seconds are None.
@@ -51,14 +47,12 @@ class Budget(L.Callback):
         steps: Count | None = None,
         seconds: Positive | None = None,
         patience: Positive | None = None,
-        alone: bool = False,
     ):
         if steps is None and seconds is None:
             raise InputError("budget", "", "neither steps nor seconds", "budget.steps=N or budget.seconds=S")
         self.steps = steps
         self.limit_seconds = seconds
         self.plateau = Plateau(patience) if patience is not None else None
-        self.alone = alone
         self.state = TrainingState()
         """The system's, from `setup` on."""
         self.stopped: dict[str, float] | None = None
@@ -128,13 +122,12 @@ class Budget(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         # A finished run that is resumed has nothing left to do.
         trainer.should_stop = self.shared_progress(trainer) >= 1.0
-        self.state.clock.start(pl_module.device, by_work=self.alone)
+        self.state.clock.start(pl_module.device)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         self.state.advance(self.shared_progress(trainer))
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        self.state.clock.count_step()
         self.state.advance(self.shared_progress(trainer))
         if self.plateau is not None and self.stopped is None and self.state.progress < 1.0:
             self._look_for_plateau(trainer, pl_module, self.plateau)
@@ -154,7 +147,7 @@ class Budget(L.Callback):
         flat = plateau.note(spent, quality)
         if not agreed(trainer, flat):
             return
-        growth = getattr(system.field, "growth", None)  # a picture's has none
+        growth = system.field.growth
         if growth is not None and self.state.progress < growth.end:
             reached = growth.end
             self._line = (spent, reached, (1 - reached) / (1 - spent))

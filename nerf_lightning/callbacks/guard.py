@@ -13,7 +13,7 @@ from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.loss_monitor import LossHistory, LossMonitor, TrainingFailure
 from nerf_lightning.model import SoftenableReLU
-from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.system import System
 from nerf_lightning.utils.options import AtLeast, Count
 from nerf_lightning.utils.seeding import Stream, step_generator
 
@@ -87,11 +87,10 @@ class Guard(L.Callback):
             self.monitor.plain_loss = float((truth - truth.mean(0)).square().mean())
         if self.attempts and self.monitor.is_healthy and all_finite(pl_module):
             self._good = copy_state(pl_module)  # of a resumed run
-        if isinstance(pl_module, NeRF3D):
-            if self.monitor.history.start_step:
-                pl_module.sampler.restart(self.monitor.history.start_step)
-            if self.attempts and trainer.global_step == 0 and trainer.world_size == 1:
-                self._cap_learning_rate(trainer, pl_module)
+        if self.monitor.history.start_step:
+            pl_module.set_first_step(self.monitor.history.start_step)
+        if self.attempts and trainer.global_step == 0 and trainer.world_size == 1:
+            self._cap_learning_rate(trainer, pl_module)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         scale = self.rate
@@ -184,7 +183,7 @@ class Guard(L.Callback):
         self.recoveries.append(Recovery(step, seconds, cause, action))
         print(f"guard: step {step}: {cause}; {action}", flush=True)
 
-    def _cap_learning_rate(self, trainer: L.Trainer, system: NeRF3D) -> None:
+    def _cap_learning_rate(self, trainer: L.Trainer, system: System) -> None:
         """Before the first step: lowers a rate that is known to be too high for the field."""
         optimizer = trainer.optimizers[0]
         asked, max_lr = optimizer.param_groups[0]["initial_lr"], system.field.max_lr
@@ -204,9 +203,7 @@ class Guard(L.Callback):
                 if reset := getattr(module, "reset_parameters", None):
                     reset()
         system.field.load_state_dict(fresh.state_dict())
-        system.on_fit_start()  # the sampler learns about the scene at the start
-        if isinstance(system, NeRF3D):
-            system.sampler.restart(step)
+        system.restart(step)
         relus = [module for module in system.modules() if isinstance(module, SoftenableReLU)]
         if relus and not self.softened and not diverged:
             self.softened = True

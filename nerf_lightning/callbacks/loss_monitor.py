@@ -10,10 +10,10 @@ LEARNED_RATIO = 0.85
 """A field whose error is above this share of that of one plain colour has not learned the scene."""
 STALL_RATIO, SLOW_RATIO = 0.98, 0.9
 """An error above this share of what it was some steps ago has not fallen: below that of a plain colour, and above it."""
-DIVERGED_RATIO, WORSE_RATIO = 4.0, 1.1
-"""Training diverges when the error is above the first times its lowest, or stays above the second ..."""
-HALF_LEARNED_RATIO = 0.3
-"""... while it is more than this share of that of one plain colour."""
+DIVERGED_RATIO, DIVERGED_CHECKS = 4.0, 3
+"""Training diverges when the error is above this many times its lowest, at so many checks in a row ..."""
+WORSE_RATIO, HALF_LEARNED_RATIO = 1.1, 0.3
+"""... or stays above the first times its lowest while it is more than the second share of that of one plain colour."""
 EMPTY_OPACITY, FULL_OPACITY = 1e-3, 0.999
 """Mean opacity of rays: below the first there is no density, above the second there is density everywhere."""
 
@@ -34,11 +34,9 @@ class LossHistory:
     start_step: int = 0
     ema_loss: float | None = None
     """The loss, averaged over the last steps; not finite once a loss was not."""
-    earlier: list[float] = field(default_factory=list)
+    checks: list[float] = field(default_factory=list)
     """The same, at the checks within the last `patience` steps."""
     lowest: float = math.inf
-    num_risen: int = 0
-    """Checks in a row at which the loss was far above its lowest."""
     num_dead: int = 0
     """Checks in a row at which no gradient came back."""
 
@@ -75,7 +73,8 @@ class LossMonitor:
     @property
     def is_healthy(self) -> bool:
         """Whether the field has learned something, and is not losing it: its weights are worth keeping."""
-        return self.has_learned and not self.history.num_risen
+        loss = self.history.ema_loss
+        return self.has_learned and loss is not None and loss <= DIVERGED_RATIO * self.history.lowest
 
     def add_loss(self, loss: float) -> None:
         """Adds a step's squared error."""
@@ -96,43 +95,38 @@ class LossMonitor:
         history, loss = self.history, self.history.ema_loss
         if loss is None:
             return None
-        divergence = self._divergence_cause(step, loss)
-        if cause := divergence or self._stall_cause(step, loss, opacity):
-            return TrainingFailure(cause, bool(divergence))
-        history.earlier = [*history.earlier, loss][-(self.patience // self.every + 1) :]
+        window = self.patience // self.every + 2
+        history.checks = [*history.checks, loss][-window:]
+        has_waited = len(history.checks) == window and step - history.start_step >= self.patience
+        if cause := self._divergence_cause(loss, has_waited):
+            return TrainingFailure(cause, True)
+        if cause := self._stall_cause(loss, has_waited, opacity):
+            return TrainingFailure(cause, False)
         history.lowest = min(history.lowest, loss)
         return None
 
-    def _has_waited(self, step: int) -> bool:
-        """Whether there have been enough checks to judge by."""
-        enough = len(self.history.earlier) > self.patience // self.every
-        return enough and step - self.history.start_step >= self.patience
-
-    def _divergence_cause(self, step: int, loss: float) -> str:
+    def _divergence_cause(self, loss: float, has_waited: bool) -> str:
         """How what was learned is being lost; "" if it is not."""
-        history = self.history
-        risen = history.lowest < LEARNED_RATIO * self.plain_loss and loss > DIVERGED_RATIO * history.lowest
-        # A short spike does not matter.
-        stays = bool(history.earlier) and loss > STALL_RATIO * history.earlier[-1]
-        history.num_risen = history.num_risen + 1 if risen and stays else 0
-        if history.num_risen >= 3:
-            return f"the loss rose to {loss / history.lowest:.0f} times its lowest"
-        least = min([*history.earlier[1:], loss])
-        if self._has_waited(step) and least > max(WORSE_RATIO * history.lowest, HALF_LEARNED_RATIO * self.plain_loss):
-            lowest = history.lowest / self.plain_loss
-            return f"the loss fell to {lowest:.2f} times that of one plain colour, and has stayed above that since"
+        checks, lowest = self.history.checks, self.history.lowest
+        recent = checks[-DIVERGED_CHECKS:]
+        has_risen = len(recent) == DIVERGED_CHECKS and min(recent) > DIVERGED_RATIO * lowest
+        # A short spike, which falls again, does not matter.
+        if lowest < LEARNED_RATIO * self.plain_loss and has_risen and loss > STALL_RATIO * recent[0]:
+            return f"the loss rose to {loss / lowest:.0f} times its lowest"
+        if has_waited and min(checks[1:]) > max(WORSE_RATIO * lowest, HALF_LEARNED_RATIO * self.plain_loss):
+            share = lowest / self.plain_loss
+            return f"the loss fell to {share:.2f} times that of one plain colour, and has stayed above that since"
         return ""
 
-    def _stall_cause(self, step: int, loss: float, opacity: float | None) -> str:
+    def _stall_cause(self, loss: float, has_waited: bool, opacity: float | None) -> str:
         """Why nothing is being learned; "" if something is, or training has only just begun."""
         if self.has_learned or not self.plain_loss:
             return ""  # a scene of one colour is learned as soon as its colour is
+        checks = self.history.checks
         if self.history.num_dead < 2:  # without a gradient, waiting does not help
-            if not self._has_waited(step):
-                return ""
-            falling = all(after < before for before, after in pairwise([*self.history.earlier, loss]))
-            enough = SLOW_RATIO if loss > self.plain_loss and not falling else STALL_RATIO
-            if loss < enough * self.history.earlier[0]:
+            is_falling = all(after < before for before, after in pairwise(checks))
+            enough = SLOW_RATIO if loss > self.plain_loss and not is_falling else STALL_RATIO
+            if not has_waited or loss < enough * checks[0]:
                 return ""
         stuck = f"the loss stands at {loss / self.plain_loss:.2f} times that of one plain colour"
         if opacity is not None and opacity < EMPTY_OPACITY:

@@ -28,7 +28,7 @@ def check_page(
         title=scene.name,
         facts=describe_scene(scene),
         doubts=doubts,
-        photos=[(photo, data_url(photo.small, ".jpg")) for photo in worst_first],
+        photos=[(photo, data_url(photo.small, "jpeg")) for photo in worst_first],
         bad=sum(bool(photo.troubles) for photo in photos),
-        map=data_url(pixels_of(camera_map(poses, scene, {})), ".png"),
+        map=data_url(pixels_of(camera_map(poses, scene, {})), "png"),
     )

@@ -34,7 +34,7 @@ def compare(
     Raises:
         InputError: for a folder that is not there or holds no run, and for references that cannot be read.
     """
-    from nerf_lightning.comparison.references import PUBLISHED, read_references
+    from nerf_lightning.comparison.points import PUBLISHED, read_references
     from nerf_lightning.comparison.report import write_comparison
     from nerf_lightning.runs.find import OUTPUTS
     from nerf_lightning.runs.index import find_runs

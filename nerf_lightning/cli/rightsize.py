@@ -51,8 +51,7 @@ def rightsize(
     from nerf_lightning.cli.train import translate_error
     from nerf_lightning.config.compose import composed
     from nerf_lightning.runs.owner import owned
-    from nerf_lightning.sizing.choose import Target
-    from nerf_lightning.sizing.ladder import read_ladder
+    from nerf_lightning.sizing.choose import Target, read_ladder
     from nerf_lightning.sizing.report import REPORT, explain, write_report
     from nerf_lightning.sizing.search import begin, search
     from nerf_lightning.utils.files import output_path

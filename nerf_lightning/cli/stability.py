@@ -22,7 +22,7 @@ def stability(
 ) -> dict[str, Any]:
     """Train methods on small scenes made to be hard, and say which broke down.
 
-    Leaves heatmap.png, heatmap_2d.png, worst.png, stability.md and stability.json. The same command continues where it stopped.
+    Leaves heatmap.png, heatmap_2d.png, worst.png and stability.json. The same command continues where it stopped.
 
     Args:
         suite: quick: a few conditions, a quarter of an hour; full: all of them, in an hour or two.
@@ -33,7 +33,7 @@ def stability(
         output: Folder for all of it.
 
     Returns:
-        What stability.json holds: `suite`, `cells` (an outcome for each training) and `rescues`.
+        What stability.json holds: `suite`, `summary` in sentences, and `cells` (an outcome for each training).
 
     Raises:
         InputError: where a method is not known, or another process writes into the folder.

@@ -1,13 +1,16 @@
 """Runs of one configuration, over their seeds, as one point: a row of a table."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from nerf_lightning.errors import InputError
 from nerf_lightning.runs.index import Run, flat
 from nerf_lightning.utils.machine import crowding
+from nerf_lightning.utils.parsing import read_yaml
 
 COSTS = {"train_seconds": "training time, s", "render_seconds": "rendering time, s per view", "bytes": "size"}
 """Columns against which PSNR is charted."""
@@ -16,6 +19,10 @@ IGNORED_OPTIONS = ("callbacks", "logger", "resume", "name", "method", "recipe", 
 IGNORED_NAMES = ("seed", "path", "folder", "url", "download", "accelerator")
 """Last parts of options that differ between runs of one configuration, or belong to the conditions."""
 BACKGROUNDS = {"[0.0, 0.0, 0.0]": "black background", "[1.0, 1.0, 1.0]": "white background"}
+
+PUBLISHED = Path(__file__).with_name("published.yaml")
+"""Published figures, to stand beside one's own: never measured here, and always drawn as such."""
+FORMAT = "publications as in published.yaml: source, hardware, scene, conditions, methods: {NAME: [dB, seconds]}"
 
 
 class Conditions(NamedTuple):
@@ -145,3 +152,22 @@ def typical_run(point: Any) -> Run:
 
 def format_bytes(size: float) -> str:
     return f"{size / 1e6:.3g} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"
+
+
+def read_references(file: Path) -> pd.DataFrame:
+    """Reads a YAML file of publications: a row for each method, with name, psnr, seconds (of training), scene and origin.
+
+    Raises:
+        InputError: where it cannot be read, or an entry lacks something or has an impossible value.
+    """
+    publications, rows = read_yaml(file, FORMAT), []
+    try:
+        for entry in publications.values():
+            origin = f"{entry['conditions']}; {entry['hardware']}; {entry['source']}"
+            for name, (psnr, seconds) in entry["methods"].items():
+                if not (0 < psnr < np.inf and 0 < seconds < np.inf):
+                    raise ValueError(f"{name}: {psnr} dB, {seconds} s")
+                rows.append((str(name), psnr, seconds, str(entry["scene"]), origin))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(file, "", f"{type(error).__name__}: {error}", FORMAT) from error
+    return pd.DataFrame(rows, columns=["name", "psnr", "seconds", "scene", "origin"])

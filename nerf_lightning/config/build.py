@@ -20,13 +20,14 @@ from nerf_lightning.callbacks import Budget, Results
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.config.literal import escape
-from nerf_lightning.dataset import PixelDataModule, RayDataModule, from_photos
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.dataset.size import AUTO, auto_resize
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import Sampler
+from nerf_lightning.sources import from_photos
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND
 from nerf_lightning.utils.device import CPU, the_device
@@ -142,7 +143,7 @@ def with_photos(cfg: DictConfig, path: str | Path) -> DictConfig:
     moved = copy.deepcopy(cfg)
     if "path" not in inspect.signature(target_of(cfg, "dataset")).parameters:
         shared = {key: value for key, value in cfg.dataset.items() if key in inspect.signature(from_photos).parameters}
-        moved.dataset = {"_target_": "nerf_lightning.dataset.from_photos", **shared}
+        moved.dataset = {"_target_": "nerf_lightning.sources.from_photos", **shared}
     OmegaConf.update(moved, "dataset.path", escape(str(path)), force_add=True)
     return moved
 

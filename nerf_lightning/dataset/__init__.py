@@ -9,7 +9,6 @@ from nerf_lightning.dataset.pixels import Picture, PictureBatch, PixelBatch, Pix
 from nerf_lightning.dataset.rays import RayBatch, RayDataModule, ViewBatch, draw_rays
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.shots import Reading
-from nerf_lightning.dataset.sources import from_bricks, from_download, from_photos, from_picture
 from nerf_lightning.dataset.views import Views
 
 __all__ = [
@@ -22,10 +21,6 @@ __all__ = [
     "Reading",
     "RayDataModule",
     "ViewBatch",
-    "from_bricks",
-    "from_download",
-    "from_photos",
-    "from_picture",
     "Scene",
     "Views",
     "builtin_picture",

@@ -7,14 +7,15 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Shaped
 
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.views import Views
 
-GRID = 48
-"""Voxels along each axis of the carving grid."""
+Masks = Sequence[Bool[np.ndarray, "_ _"]]
+GRID, COARSE_GRID = 48, 40
+"""Voxels along each axis of the grid that is carved, and of the one that tells whether silhouettes fit each other."""
 MAX_VIEWS = 32
 ALPHA_FLOOR = 0.02
 COLOUR_FLOOR = 3
@@ -99,7 +100,7 @@ def visible_cube(cameras: Cameras) -> Float[np.ndarray, "2 3"]:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class VoxelView:
     """The voxels of a grid, N in all, as one view sees them."""
 
     inside: Bool[np.ndarray, "N"]
@@ -110,25 +111,21 @@ class Sighting:
     reach: int
     """Half a voxel's diagonal, pixels: any part of a voxel may be content, or show some."""
 
-    def grown(self, mask: Shaped[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    def dilate(self, mask: Shaped[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
         """A mask wider by the reach."""
-        return cv2.dilate(mask.astype(np.uint8), np.ones((2 * self.reach + 1, 2 * self.reach + 1), np.uint8))
-
-    def found_in(self, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "N"]:
-        """Which voxels have a part inside a mask."""
-        return self.inside & (self.grown(mask)[self.row, self.column] > 0)
+        kernel = np.ones((2 * self.reach + 1, 2 * self.reach + 1), np.uint8)
+        return cv2.dilate(mask.astype(np.uint8), kernel) > 0
 
 
-def voxel_centres(aabb: Float[np.ndarray, "2 3"], count: int) -> Float[np.ndarray, "3 count"]:
-    """Coordinates of the middles of `count` voxels along each axis of a box."""
-    voxel = (aabb[1] - aabb[0]) / count
-    return aabb[0][:, None] + (np.arange(count) + 0.5) * voxel[:, None]
+def make_grid(aabb: Float[np.ndarray, "2 3"], count: int) -> Float[np.ndarray, "N 3"]:
+    """The centres of count^3 voxels in a box."""
+    steps = aabb[0][:, None] + (np.arange(count) + 0.5) * ((aabb[1] - aabb[0]) / count)[:, None]
+    return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def sightings(aabb: Float[np.ndarray, "2 3"], count: int, cameras: Cameras) -> Iterator[Sighting]:
+def view_voxels(aabb: Float[np.ndarray, "2 3"], count: int, cameras: Cameras) -> Iterator[VoxelView]:
     """A box of count^3 voxels, in the order of their indices, as each camera sees it."""
-    places = np.stack(np.meshgrid(*voxel_centres(aabb, count), indexing="ij"), axis=-1).reshape(-1, 3)
-    points = torch.from_numpy(places).float()
+    points = torch.from_numpy(make_grid(aabb, count)).float()
     diagonal = np.linalg.norm((aabb[1] - aabb[0]) / count)
     for view in range(len(cameras)):
         pixels, depth, seen = cameras.project(points, view)
@@ -136,28 +133,35 @@ def sightings(aabb: Float[np.ndarray, "2 3"], count: int, cameras: Cameras) -> I
         column, row = np.where(inside, pixels.T.numpy(), 0).astype(np.int32)
         nearness = float(depth[seen].median()) if inside.any() else np.inf
         focal = float(cameras.K[view, 0, 0])
-        yield Sighting(inside, column, row, int(min(np.ceil(0.5 * diagonal * focal / nearness), cameras.longest)))
+        yield VoxelView(inside, column, row, int(min(np.ceil(0.5 * diagonal * focal / nearness), cameras.longest)))
 
 
-def visual_hull(
-    masks: Sequence[Bool[np.ndarray, "_ _"]], sightings: Iterable[Sighting], least: float
-) -> Bool[np.ndarray, "N"]:
+def visual_hull(masks: Masks, voxels: Iterable[VoxelView], least: float) -> Bool[np.ndarray, "N"]:
     """Which voxels at least `least` views see, and nearly all of these find in their silhouettes."""
     seen: Any = 0
     found: Any = 0
-    for mask, sighting in zip(masks, sightings, strict=True):
-        seen = seen + sighting.inside
-        found = found + sighting.found_in(mask)
+    for mask, view in zip(masks, voxels, strict=True):
+        seen = seen + view.inside
+        found = found + (view.inside & view.dilate(mask)[view.row, view.column])
     return (seen >= least) & (found >= AGREEMENT * seen)
 
 
-def _carve(
-    aabb: Float[np.ndarray, "2 3"], masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Cameras
-) -> Float[np.ndarray, "2 3"] | None:
+def hull_coverage(masks: Masks, cameras: Cameras, bounds: Bounds) -> float:
+    """Share of the silhouettes that their visual hull within the bounds covers, in [0, 1]."""
+    voxels = list(view_voxels(bounds.aabb.double().numpy(), COARSE_GRID, cameras))
+    hull = visual_hull(masks, voxels, least=1)
+    covered = []
+    for mask, view in zip(masks, voxels, strict=True):
+        shown = np.zeros(mask.shape, np.uint8)
+        kept = hull & view.inside
+        shown[view.row[kept], view.column[kept]] = 1
+        if mask.any():
+            covered.append(float(view.dilate(shown)[mask].mean()))
+    return float(np.mean(covered)) if covered else 1.0
+
+
+def _carve(aabb: Float[np.ndarray, "2 3"], masks: Masks, cameras: Cameras) -> Float[np.ndarray, "2 3"] | None:
     """The box of the voxels inside (nearly) all silhouettes, one voxel wider; None when there are none."""
     voxel = (aabb[1] - aabb[0]) / GRID
-    centres = np.stack(np.meshgrid(*voxel_centres(aabb, GRID), indexing="ij"), axis=-1).reshape(-1, 3)
-    kept = centres[visual_hull(masks, sightings(aabb, GRID, cameras), least=0.5 * len(masks))]
-    if len(kept) == 0:
-        return None
-    return np.stack([kept.min(0) - 1.5 * voxel, kept.max(0) + 1.5 * voxel])
+    kept = make_grid(aabb, GRID)[visual_hull(masks, view_voxels(aabb, GRID, cameras), least=0.5 * len(masks))]
+    return np.stack([kept.min(0) - 1.5 * voxel, kept.max(0) + 1.5 * voxel]) if len(kept) else None

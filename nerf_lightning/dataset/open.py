@@ -47,9 +47,9 @@ def open_scene(
     if near is None and far is None:
         return scene
     bounds = scene.bounds
-    near = bounds.near if near is None else checks.number(place, "near", near)
-    far = bounds.far if far is None else checks.number(place, "far", far)
-    checks.near_far(place, near, far)
+    near = bounds.near if near is None else checks.parse_number(place, "near", near)
+    far = bounds.far if far is None else checks.parse_number(place, "far", far)
+    checks.check_near_far(place, near, far)
     return replace(scene, bounds=replace(bounds, near=near, far=far))
 
 

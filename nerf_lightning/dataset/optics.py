@@ -16,8 +16,6 @@ FOLDED = 1e-3
 """How far, in flat coordinates, an undistorted place may come to lie from where it was seen."""
 SPOTS, RETURNED = 24, 1.0
 """Pixels along each side whose rays are tried, and how far from a pixel its ray may appear."""
-FITTED = 1e-5
-"""Likewise for a lens of another kind that is replaced by a polynomial."""
 
 
 @dataclass(frozen=True)
@@ -99,27 +97,3 @@ def equirectangular(width: int, height: int) -> Optics:
         cy=height / 2,
         projection=Projection.EQUIRECTANGULAR,
     )
-
-
-def field_of_view_lens(
-    width: int, height: int, fx: float, fy: float, cx: float, cy: float, omega: float
-) -> Optics | None:
-    """The lens of Devernay and Faugeras (2001), eq. 13, as a fisheye with a polynomial; None where none is near enough.
-
-    Args:
-        omega: the lens's field of view, radians: r = atan(2 tan(theta) tan(omega / 2)) / omega.
-    """
-    if not 1e-3 < omega < math.pi - 1e-3:
-        return None
-    slope = 2 * math.tan(omega / 2) / omega
-    rim = float(np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy))
-    if rim * omega >= math.pi / 2:
-        return None
-    theta = np.linspace(1e-3, math.atan(math.tan(rim * omega) / (2 * math.tan(omega / 2))), 256)
-    wanted = np.arctan(2 * np.tan(theta) * math.tan(omega / 2)) / (omega * slope)
-    powers = theta[:, None] ** np.array([3, 5, 7, 9])
-    k, *_ = np.linalg.lstsq(powers, wanted - theta, rcond=None)
-    if np.abs(theta + powers @ k - wanted).max() > FITTED:
-        return None
-    k1, k2, k3, k4 = map(float, k)
-    return Optics(width, height, fx * slope, fy * slope, cx, cy, Distortion(k1, k2, k3, k4), Projection.FISHEYE)

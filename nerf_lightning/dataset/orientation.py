@@ -1,6 +1,7 @@
 """Which way photos are turned: as their pixels are stored, or as their EXIF data say."""
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 from nerf_lightning.dataset.formats.decode import image_header
@@ -10,60 +11,45 @@ log = logging.getLogger(__name__)
 
 MAX_ROUNDING_PX = 1.5
 """By how much a side may differ from that of the same photo at another size: sides are rounded to whole pixels."""
+Size = tuple[int, int]
+"""Width and height in pixels."""
 
 
-class OrientationChooser:
-    """Chooses for each photo whether its camera is about the stored pixels or about the photo as EXIF turns it.
+def choose_orientations(
+    where: object, photos: Sequence[Path], stated: Sequence[Size | None], orientation: str
+) -> list[bool]:
+    """Chooses for each photo whether its camera is about the photo as EXIF turns it, instead of the pixels as stored.
 
     `auto` takes the stored pixels where they have the shape that the file states for the camera, or where it states none; else
-    the turned photo where that has the shape.
+    the turned photo where that has the shape. A line says what was taken.
 
     Args:
-        orientation: "auto", "stored" or "exif".
-    """
-
-    def __init__(self, orientation: str):
-        self.orientation = orientation
-        self.turned: list[Path] = []
-        self.ambiguous: list[Path] = []
-
-    def choose(self, photo: Path, stated: tuple[float, float] | None) -> tuple[int, int, bool]:
-        """Returns width and height of a photo in its camera's orientation, and whether that is EXIF's.
-
-        Args:
-            photo: the file.
-            stated: width and height of its camera, of this size or another.
-
-        Raises:
-            InputError: see `image_header`.
-        """
-        width, height, _ = image_header(photo)
+        where: the scene's file, for messages.
+        photos: their files.
+        stated: sizes of their cameras, of this size or another.
+        orientation: "auto", "stored" or "exif"."""
+    turned, ambiguous = [], []
+    for photo, size in zip(photos, stated, strict=True):
+        stored, upright = (image_header(photo, turn)[:2] for turn in (False, True))
         header = read_header(photo)
-        if header is None or header.orientation == 1:
-            return width, height, False
-        turned = image_header(photo, upright=True)[:2]
-        fits = stated is None or has_shape((width, height), stated)
-        use_exif = self.orientation == "exif" or (
-            self.orientation == "auto" and not fits and stated is not None and has_shape(turned, stated)
+        if header is None or header.orientation == 1 or orientation == "stored":
+            continue
+        fits_stored, fits_upright = (size is None or has_shape(shape, size) for shape in (stored, upright))
+        if orientation == "exif" or (fits_upright and not fits_stored):
+            turned.append(photo)
+        elif fits_upright:
+            ambiguous.append(photo)
+    if turned:
+        text = "%s: %d photos are turned as their EXIF orientation says, %s first: so they fit their cameras"
+        log.warning(text, where, len(turned), turned[0].name)
+    if ambiguous:
+        text = (
+            "%s: %d photos have an EXIF orientation, %s first; their cameras are taken to be about the pixels as stored"
+            " (dataset.orientation=exif: about the turned photos)"
         )
-        if use_exif:
-            self.turned.append(photo)
-            return *turned, True
-        if self.orientation == "auto" and (stated is None or has_shape(turned, stated)):
-            self.ambiguous.append(photo)
-        return width, height, False
-
-    def report(self, where: object) -> None:
-        """Says once how photos with an EXIF orientation were taken."""
-        if self.turned:
-            text = "%s: %d photos are turned as their EXIF orientation says, %s first: so they fit their cameras"
-            log.warning(text, where, len(self.turned), self.turned[0].name)
-        if self.ambiguous:
-            text = (
-                "%s: %d photos have an EXIF orientation, %s first; their cameras are taken to be about the pixels as stored"
-                " (dataset.orientation=exif: about the turned photos)"
-            )
-            log.warning(text, where, len(self.ambiguous), self.ambiguous[0].name)
+        log.warning(text, where, len(ambiguous), ambiguous[0].name)
+    chosen = set(turned)
+    return [photo in chosen for photo in photos]
 
 
 def has_shape(size: tuple[float, float], stated: tuple[float, float]) -> bool:

@@ -25,7 +25,7 @@ from nerf_lightning.cameras import (
 from nerf_lightning.dataset.extent import estimate_bounds
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.kind import apply_alpha, check_visible, decide_kind
-from nerf_lightning.dataset.matches import match_points
+from nerf_lightning.dataset.matching.triangulate import match_points
 from nerf_lightning.dataset.region import Region, find_region
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import Reading, Shot, read_shots
@@ -91,7 +91,7 @@ class Hints:
 
 def split_shots(source: Path, count: int, holdout: int) -> Split:
     """Every `holdout`-th photo is held out."""
-    checks.split_size(source, "train split", count - len(range(0, count, holdout)))
+    checks.check_split_size(source, "train split", count - len(range(0, count, holdout)))
     return Split([i for i in range(count) if i % holdout], list(range(0, count, holdout)))
 
 
@@ -118,8 +118,8 @@ def build_scene(
     """
     if split is None:
         split = split_shots(source, len(shots), reading.holdout)
-    checks.split_size(source, "train split", len(split.train))
-    checks.split_size(source, "val split", len(split.val))
+    checks.check_split_size(source, "train split", len(split.train))
+    checks.check_split_size(source, "val split", len(split.val))
     # Part after part, so that none of them needs a copy of its pixels.
     parts = (split.train, split.val, split.test)
     shots = [shots[i] for part in parts for i in part]
@@ -256,7 +256,7 @@ def select_known(views: Views, val: list[int], shots: Sequence[Shot]) -> list[in
     kept = [view for view in val if bool(views.mask_of(view).any())]
     if lost := [shots[view].name for view in val if view not in kept]:
         log.warning("%d held-out photos are masked entirely, %s first: left out", len(lost), lost[0])
-    checks.split_size(shots[0].photo.parent, "val split", len(kept))
+    checks.check_split_size(shots[0].photo.parent, "val split", len(kept))
     return kept
 
 

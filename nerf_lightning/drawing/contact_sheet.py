@@ -57,8 +57,9 @@ def contact_sheet(
 
     sheet = Image.new("RGB", (width, tops[-1]), "white")
     draw = ImageDraw.Draw(sheet)
+    small, large = (ImageFont.truetype(findfont(FONT), size) for size in (text_px, 3 * text_px // 2))
     for n, words in enumerate(title):
-        draw.text((GAP, GAP // 2 + n * (3 * line // 2)), words, "black", _font(3 * text_px // 2))
+        draw.text((GAP, GAP // 2 + n * (3 * line // 2)), words, "black", large)
     for i, (image, text) in enumerate(zip(scaled, texts, strict=True)):
         left, top = GAP + i % columns * (cell + GAP), tops[i // columns]
         right, bottom = left + image.shape[1], top + image.shape[0]
@@ -66,7 +67,7 @@ def contact_sheet(
         if i in flagged:
             draw.rectangle((left - 4, top - 4, right + 3, bottom + 3), outline=VERMILLION, width=4)
         for n, words in enumerate(text):
-            draw.text((left, bottom + 5 + n * line), words, VERMILLION if i in flagged else "black", _font(text_px))
+            draw.text((left, bottom + 5 + n * line), words, VERMILLION if i in flagged else "black", small)
     return np.array(sheet)
 
 
@@ -84,7 +85,3 @@ def wrap(text: str, width: int, text_px: int) -> list[str]:
     """Lines of at most about `width` pixels; line ends in the text stay."""
     letters = max(1, int(width / (LETTER_WIDTH * text_px)))
     return [line for part in text.splitlines() for line in textwrap.wrap(readable(part), letters)]
-
-
-def _font(text_px: int) -> ImageFont.FreeTypeFont:
-    return ImageFont.truetype(findfont(FONT), text_px)

@@ -9,8 +9,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.drawing.depth import colorize_depth, depth_limits
-from nerf_lightning.drawing.panels import to_bytes
+from nerf_lightning.drawing.panels import colorize_depth, depth_limits, to_bytes
 from nerf_lightning.renderer import RenderOutput
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.system.metrics import mse_to_psnr

@@ -14,16 +14,11 @@ from PIL import Image
 from torch import Tensor
 
 from nerf_lightning.dataset.resize import area_resize, fit_size
-from nerf_lightning.drawing.depth import colorize_depth, depth_limits
 from nerf_lightning.system import ViewResult
 from nerf_lightning.utils.files import atomic
 
 SMALLEST_SIDE = 160
 """Panels below this height are magnified (whole multiples, hard edges), so that the caption stays readable."""
-
-QUALITY = 90
-"""Of a WebP, out of 100."""
-
 WIDEST = 2048
 """Pixels across of a chart's picture."""
 PANEL_PX = 1024
@@ -33,6 +28,21 @@ PANEL_PX = 1024
 def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[ndarray, "*shape"]:
     """[0, 1] -> bytes, rounded, on the CPU."""
     return image.clamp(0, 1).mul_(255).round_().byte().cpu().numpy()
+
+
+def depth_limits(depths: Float[ndarray, "*shape"]) -> tuple[float, float]:
+    """The 2nd and the 98th percentile of depths; 0 and 1 where there are none."""
+    if not depths.size:
+        return 0.0, 1.0
+    low, high = np.percentile(depths, [2, 98]).tolist()
+    return low, max(high, low + 1e-6)
+
+
+def colorize_depth(depth: Float[ndarray, "*shape"], low: float, high: float) -> UInt8[ndarray, "*shape 3"]:
+    """Depths on a perceptually uniform scale (inferno): bright at `low` and nearer, dark at `high` and farther."""
+    nearness = 1 - (depth - low) / max(high - low, 1e-9)
+    grey = (nearness.clip(0, 1) * 255).astype(np.uint8).reshape(-1, 1)
+    return np.ascontiguousarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[..., ::-1]).reshape(*depth.shape, 3)
 
 
 def panel(images: list[UInt8[ndarray, "H W 3"]], caption: str) -> UInt8[ndarray, "H2 W2 3"]:
@@ -92,14 +102,11 @@ def write_animation(path: Path, frames: Iterable[UInt8[ndarray, "H W C"]], secon
         seconds: that each is shown.
     """
     images = map(Image.fromarray, frames)
-    next(images).save(path, save_all=True, append_images=images, duration=1000 * seconds, loop=0, quality=QUALITY)
-
-
-MEDIA = {".jpg": "image/jpeg", ".png": "image/png", ".webp": "image/webp"}
+    next(images).save(path, save_all=True, append_images=images, duration=1000 * seconds, loop=0, quality=90)
 
 
 def data_url(image: UInt8[ndarray, "H W 3"], kind: str) -> str:
-    """A picture as text: a .jpg with loss, a .png or .webp without."""
-    options: dict[str, Any] = {"lossless": True} if kind == ".webp" else {}
-    packed = imageio.imwrite("<bytes>", image, extension=kind, **options)
-    return f"data:{MEDIA[kind]};base64,{base64.b64encode(packed).decode()}"
+    """An image as text: "jpeg" with loss, "png" or "webp" without."""
+    options: dict[str, Any] = {"lossless": True} if kind == "webp" else {}
+    packed = imageio.imwrite("<bytes>", image, extension=f".{kind}", **options)
+    return f"data:image/{kind};base64,{base64.b64encode(packed).decode()}"

@@ -10,8 +10,6 @@ from nerf_lightning.drawing.panels import averaged
 
 BANDS = 64
 """Rings into which the frequencies up to one cycle in two pixels are gathered."""
-TOGETHER = 1 << 20
-"""Frequencies that are gathered at a time."""
 
 
 def brightness(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
@@ -33,17 +31,10 @@ def by_frequency(
 ) -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B"]]:
     """Root mean square over rings of equal frequency: their middles in cycles a pixel, and the sizes (nan for empty rings)."""
     down, across = (np.fft.fftshift(np.fft.fftfreq(n)) for n in spectrum.shape)
-    count, power = np.zeros(bands + 1), np.zeros(bands + 1)
-    rows = max(1, TOGETHER // len(across))
-    for start in range(0, len(down), rows):
-        part = slice(start, start + rows)
-        radius = np.hypot(down[part, None], across)
-        # The last ring ends with 0.5 itself; the corners beyond go into one of their own.
-        ring = np.where(radius <= 0.5, np.minimum((radius / 0.5 * bands).astype(int), bands - 1), bands).ravel()
-        count += np.bincount(ring, minlength=bands + 1)
-        power += np.bincount(ring, (spectrum[part] ** 2).ravel(), minlength=bands + 1)
+    radius = np.hypot(down[:, None], across)  # the corners beyond 0.5 are left out
+    count, power = (np.histogram(radius, bands, (0, 0.5), weights=weights)[0] for weights in (None, spectrum**2))
     with np.errstate(invalid="ignore", divide="ignore"):
-        return (np.arange(bands) + 0.5) * 0.5 / bands, np.sqrt(power[:bands] / count[:bands])
+        return (np.arange(bands) + 0.5) * 0.5 / bands, np.sqrt(power / count)
 
 
 def spectrum_chart(target: Float[np.ndarray, "H W 3"], result: Float[np.ndarray, "H W 3"], title: str) -> Figure:

@@ -140,7 +140,7 @@ def field_page(
 
 def picture_page(picture: UInt8[np.ndarray, "H W 3"], name: str, facts: Sequence[tuple[str, str]]) -> str:
     """The page of an image's field: what the field renders, without loss, and facts about it."""
-    image = data_url(picture, ".webp")
+    image = data_url(picture, "webp")
     return render_page(WEB / "picture.html", [STYLE], IMAGE_SCRIPTS, title=name, facts=facts, image=image)
 
 

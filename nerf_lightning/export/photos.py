@@ -8,7 +8,7 @@ import numpy as np
 
 from nerf_lightning.cameras import Distortion, Projection, in_other_frame
 from nerf_lightning.dataset import Scene, Views
-from nerf_lightning.dataset.formats.conventions import opengl_to_opencv
+from nerf_lightning.dataset.formats.frames import opengl_to_opencv
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.progress import tracked

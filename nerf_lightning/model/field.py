@@ -32,6 +32,10 @@ class FieldOutput(NamedTuple):
 class AnyField(torch.nn.Module):
     """What fields in two and in three dimensions have in common."""
 
+    max_lr: float = math.inf
+    """Adam's learning rate above which training diverges, as the stability suite measured it; infinite if unknown."""
+    growth: ResolutionSchedule | None = None
+    """Of a field that is upsampled during training."""
     sizing: str = ""
     """One line on how the field's size follows from the data; "" if it does not."""
 
@@ -75,10 +79,6 @@ class Field(InBounds, AnyField):
     metres and the same scene in millimetres train alike. A field that grows has a `growth` and defines `stage` and `upsample`.
     """
 
-    max_lr: float = math.inf
-    """Adam's learning rate above which training diverges, as the stability suite measured it; infinite if unknown."""
-    growth: ResolutionSchedule | None = None
-    """Of a field that is upsampled during training."""
     stage: int = 0
     """Of `growth`."""
 

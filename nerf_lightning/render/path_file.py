@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras, in_other_frame
-from nerf_lightning.dataset.formats.conventions import opengl_to_opencv
+from nerf_lightning.dataset.formats.frames import opengl_to_opencv
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.scene_file import read_cameras
 from nerf_lightning.utils.parsing import read_json

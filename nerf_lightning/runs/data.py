@@ -18,7 +18,7 @@ from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Sce
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.size import AUTO
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.scene_file import frame_from, numbers
+from nerf_lightning.runs.scene_file import frame_from
 
 SAME_FRAME = 1e-5
 """Frames that differ less, in entries of the similarity between them, are one: in the unit of the run's own."""
@@ -61,11 +61,10 @@ def seen_by_corrected(scene: Scene, content: Mapping[str, Any]) -> Scene:
     if "corrected" not in content:
         return scene
     cameras = scene.train.cameras
-    poses = numbers("scene.json", "corrected", content["corrected"])
-    if poses.shape != (len(cameras), 4, 4):
+    poses = checks.check_poses("scene.json", "corrected[{}]", content["corrected"])
+    if len(poses) != len(cameras):
         expected, todo = f"{len(cameras)} poses, one of each training photo", "have photos been added or removed?"
-        raise InputError("scene.json", "corrected", f"shape {poses.shape}", expected, todo)
-    poses = checks.rigid_poses("scene.json", "corrected[{}]", poses)
+        raise InputError("scene.json", "corrected", f"{len(poses)} poses", expected, todo)
     c2w = torch.from_numpy(poses).float()
     factor = content.get("focal_factor")
     if factor is not None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras
@@ -87,31 +86,19 @@ def frame_from(scene: Mapping[str, Any], where: object) -> tuple[Frame, Cameras 
     """
     try:
         if "aabb" not in scene:
-            return PictureFrame(*checks.view_size(where, "resolution", *scene["resolution"])), None, None
+            return PictureFrame(*checks.check_view_size(where, "resolution", *scene["resolution"])), None, None
         near, far, pixel = (
-            None if scene[key] is None else checks.number(where, key, scene[key]) for key in ("near", "far", "pixel")
+            None if scene[key] is None else checks.parse_number(where, key, scene[key])
+            for key in ("near", "far", "pixel")
         )
-        checks.near_far(where, near, far)
-        aabb = torch.from_numpy(checks.box(where, "aabb", numbers(where, "aabb", scene["aabb"]))).float()
-        colour = checks.numeric(where, "background", numbers(where, "background", scene["background"]), "3")
-        red, green, blue = colour.tolist()
-        to_source = checks.similarity(where, "to_source", numbers(where, "to_source", scene["to_source"]))
+        checks.check_near_far(where, near, far)
+        aabb = torch.from_numpy(checks.check_box(where, "aabb", scene["aabb"])).float()
+        red, green, blue = checks.parse_array(where, "background", scene["background"], 3).tolist()
+        to_source = checks.check_similarity(where, "to_source", scene["to_source"])
         frame = SceneFrame(Bounds(aabb, bool(scene["unbounded"]), near, far, pixel), (red, green, blue))
         return frame, read_cameras(where, "orbit.", scene["orbit"]), torch.from_numpy(to_source)
     except (LookupError, TypeError) as error:
         raise InputError(where, "", f"{type(error).__name__}: {error}", WHOLE) from error
-
-
-def numbers(where: object, key: str, value: Any) -> Float[np.ndarray, "..."]:
-    """Lists of numbers as an array.
-
-    Raises:
-        InputError: where they hold anything else, or rows of several lengths.
-    """
-    try:
-        return np.array(value, dtype=np.float64)
-    except (ArithmeticError, TypeError, ValueError) as error:
-        raise InputError(where, key, repr(value)[:60], "numbers, in rows of one length") from error
 
 
 def read_cameras(where: object, key: str, views: Mapping[str, Any]) -> Cameras:
@@ -121,13 +108,13 @@ def read_cameras(where: object, key: str, views: Mapping[str, Any]) -> Cameras:
         InputError: for poses that are no rotations, intrinsics that cannot be, and no view at all.
         LookupError: for a missing key.
     """
-    width, height = checks.view_size(where, key, views["width"], views["height"])
-    c2w = checks.rigid_poses(where, f"{key}c2w[{{}}]", numbers(where, f"{key}c2w", views["c2w"]))
-    K = numbers(where, f"{key}K", views["K"])
+    width, height = checks.check_view_size(where, key, views["width"], views["height"])
+    c2w = checks.check_poses(where, f"{key}c2w[{{}}]", views["c2w"])
+    K = checks.parse_floats(where, f"{key}K", views["K"])
     if not len(c2w) or K.shape not in ((3, 3), (len(c2w), 3, 3)):
         found = f"shape {K.shape} for {len(c2w)} views"
         raise InputError(where, f"{key}K", found, "shape (V, 3, 3), of at least one view")
     K = np.stack(
-        [checks.intrinsics(where, f"{key}K", one, width, height) for one in np.broadcast_to(K, (len(c2w), 3, 3))]
+        [checks.check_intrinsics(where, f"{key}K", one, width, height) for one in np.broadcast_to(K, (len(c2w), 3, 3))]
     )
     return Cameras.of_size(torch.from_numpy(K).float(), torch.from_numpy(c2w).float(), width, height)

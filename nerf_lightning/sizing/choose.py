@@ -1,9 +1,16 @@
-"""Decisions of the search, on figures alone: when to stop growing, what to train in full, and which rung is enough."""
+"""What there is to choose from, and decisions on figures alone: when to stop growing, what to train in full, what is enough."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from nerf_lightning.config import conf_dir
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.parsing import read_yaml
+
+Options = dict[str, Any]
 GAIN_SHARE = 3.0
 """A rung is worth its bytes where it gains a `GAIN_SHARE`th of what the choice may be below the best, for twice the bytes."""
 MAX_IDLE = 2
@@ -12,6 +19,35 @@ FULL_GAIN_DB = 1.0
 """What a full training is assumed to gain over a rung's shorter one: 2 to 15 were measured, in runs of 10 to 140 s."""
 TOLERANCE_DB = 0.5
 """By which an expectation may be wrong."""
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """What there is to choose from."""
+
+    rungs: list[Options]
+    """Options of the model, smallest first."""
+    samplers: list[Options]
+    """Options of the sampler, coarsest first; none for images."""
+
+
+def read_ladder(name: str) -> Ladder:
+    """Reads a ladder: one of conf/ladders by name, or a YAML file of one's own.
+
+    Raises:
+        InputError: where there is none of that name, or it holds something else.
+    """
+    known = sorted(file.stem for file in (conf_dir() / "ladders").glob("*.yaml"))
+    path = conf_dir() / "ladders" / f"{name}.yaml" if name in known else user_path(name)
+    if not path.is_file():
+        raise InputError("rightsize", "ladder", name, f"one of {', '.join(known)}, or a YAML file with `rungs`")
+    content = read_yaml(path, "a ladder in YAML")
+    lists = content if isinstance(content, dict) else {}
+    for key, least in (("rungs", 2), ("samplers", 0)):
+        found = lists.setdefault(key, [])
+        if not isinstance(found, list) or len(found) < least or not all(isinstance(one, dict) for one in found):
+            raise InputError(path, key, repr(found), f"a list of {least} or more mappings of options")
+    return Ladder(lists["rungs"], lists["samplers"])
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,16 @@ from nerf_lightning.runs.folder import load_run, plain_config
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.runs.owner import is_empty
 from nerf_lightning.runs.scene_file import scene_content
-from nerf_lightning.sizing.choose import Measured, Target, choose_final, choose_first, choose_second, stop_growing
-from nerf_lightning.sizing.ladder import Ladder, Options
+from nerf_lightning.sizing.choose import (
+    Ladder,
+    Measured,
+    Options,
+    Target,
+    choose_final,
+    choose_first,
+    choose_second,
+    stop_growing,
+)
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.job import find_progress
 from nerf_lightning.training.train import prepare, train, warm_up
@@ -236,10 +244,9 @@ def find_sampler(cfg: DictConfig, data: Data, system: System, samplers: Sequence
 
 
 def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Data, folder: Path) -> Measured:
-    """Trains a run of its own, with the whole budget, as if nothing else ran beside it. One that is finished is kept, one that
+    """Trains a run of its own, with the whole budget. One that is finished is kept, one that
     was interrupted continues."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
-    whole = set_options(whole, "budget", {"alone": True})
     print(f"{folder}: {', '.join(f'{key}={value}' for key, value in model.items())}, in full", flush=True)
     done, checkpoint = find_progress(read_run(folder), whole)
     if done is None:

@@ -1,5 +1,6 @@
-"""The files of a suite: stability.json, a table in Markdown, heat maps, and the worst renders."""
+"""The files of a suite: stability.json, heat maps, and the worst renders."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -13,9 +14,10 @@ from matplotlib.patches import Rectangle
 from nerf_lightning.drawing.contact_sheet import contact_sheet
 from nerf_lightning.drawing.ink import BLUE, DPI, GREY, VERMILLION, pixels_of
 from nerf_lightning.drawing.panels import write_png
+from nerf_lightning.stability.conditions import METHODS
 from nerf_lightning.stability.trial import Outcome, trial_folder
-from nerf_lightning.stability.verdict import RESCUED_DB, Verdict, find_rescues, is_rescued, judge
-from nerf_lightning.utils.files import atomic, write_json
+from nerf_lightning.stability.verdict import RESCUED_DB, Verdict, find_rescues, judge
+from nerf_lightning.utils.files import write_json
 
 SCALE_DB = Normalize(8.0, 40.0, clip=True)
 """Ends of the colours."""
@@ -24,34 +26,33 @@ MAX_WORST = 30
 
 def write_report(outcomes: Sequence[Outcome], suite: str, root: Path) -> dict[str, Any]:
     """Writes all files into the suite's folder, prints a summary, and returns what stability.json holds."""
-    verdicts, rescues = judge(outcomes), find_rescues(outcomes)
-    lines = summarize(verdicts, rescues)
+    verdicts = judge(outcomes)
+    lines = summarize(verdicts, find_rescues(outcomes))
     for name, flat in (("heatmap.png", False), ("heatmap_2d.png", True)):
         part = [one for one in verdicts if one.condition.flat == flat]
         if part:
             write_png(root / name, pixels_of(draw_heatmap(part, suite)))
     write_worst(verdicts, root)
-    with atomic(root / "stability.md") as temporary:
-        temporary.write_text("\n".join([format_table(verdicts), *lines]) + "\n", encoding="utf-8")
-    content = {"suite": suite, "cells": [asdict(one) for one in outcomes], "rescues": rescues}
+    content = {"suite": suite, "summary": lines, "cells": [asdict(one) for one in outcomes]}
     write_json(root / "stability.json", content)
-    for one in verdicts:
-        if one.failed and not one.must_fail:
-            first = one.failed[0]
-            print(
-                f"{one.condition.name}, {one.method}: {one.describe()[-1]} ({one.condition.check});"
-                f" seed {first.seed}: {first.status}: {first.diagnosis}"
-            )
+    for verdict in verdicts:
+        if verdict.failed and not must_fail(verdict):
+            name, first = f"{verdict.condition.name}, {verdict.method}", verdict.failed[0]
+            words = f"{verdict.describe()[-1]} ({verdict.condition.check})"
+            print(f"{name}: {words}; seed {first.seed}: {first.status}: {first.diagnosis}")
     print("\n".join(lines))
-    print(f"{len(outcomes)} trials: {root}/heatmap.png, worst.png, stability.md, stability.json")
+    print(f"{len(outcomes)} trials: {root}/heatmap.png, worst.png, stability.json")
     return content
 
 
-def summarize(verdicts: Sequence[Verdict], rescues: Sequence[dict]) -> list[str]:
+def must_fail(verdict: Verdict) -> bool:
+    return verdict.condition.control or METHODS[verdict.method].guarded is not None
+
+
+def summarize(verdicts: Sequence[Verdict], rescues: Sequence[bool]) -> list[str]:
     """The result in sentences."""
-    shipped = [one for one in verdicts if one.shipped]
-    controls = [one for one in verdicts if one.must_fail]
-    lines = []
+    shipped = [one for one in verdicts if not one.condition.control and not METHODS[one.method].control]
+    controls, lines = [one for one in verdicts if must_fail(one)], []
     if shipped:
         lost, tried = sum(len(one.failed) for one in shipped), sum(len(one.outcomes) for one in shipped)
         lines.append(f"shipped recipes: {lost} of {tried} trials failed")
@@ -60,23 +61,9 @@ def summarize(verdicts: Sequence[Verdict], rescues: Sequence[dict]) -> list[str]
         listed = "; ".join(failing) or "none, so this suite proves nothing"
         lines.append(f"controls that failed, as they should: {listed}")
     if rescues:
-        back = sum(map(is_rescued, rescues))
-        lines.append(f"guard: {back} of {len(rescues)} broken control runs brought back to within {RESCUED_DB:g} dB")
+        number = f"{sum(rescues)} of {len(rescues)} broken control runs"
+        lines.append(f"guard: {number} brought back to within {RESCUED_DB:g} dB")
     return lines
-
-
-def format_table(verdicts: Sequence[Verdict]) -> str:
-    """Markdown: a row for each condition, a column for each method."""
-    methods = list(dict.fromkeys(one.method for one in verdicts))
-    lines = [f"| condition | must be | {' | '.join(methods)} |", "|---" * (len(methods) + 2) + "|"]
-    for condition in {one.condition.name: one.condition for one in verdicts}.values():
-        cells = dict.fromkeys(methods, "")
-        for one in verdicts:
-            if one.condition is condition:
-                recovered = sum(outcome.recoveries > 0 for outcome in one.outcomes)
-                cells[one.method] = ", ".join([*one.describe(), *([f"{recovered} recovered"] if recovered else [])])
-        lines.append(f"| {condition.name} | {condition.check} | {' | '.join(cells.values())} |")
-    return "\n".join(lines) + "\n"
 
 
 def draw_heatmap(verdicts: Sequence[Verdict], suite: str) -> Figure:
@@ -87,15 +74,14 @@ def draw_heatmap(verdicts: Sequence[Verdict], suite: str) -> Figure:
     axes = figure.subplots()
     blues = LinearSegmentedColormap.from_list("blues", ["white", BLUE])
     cells = {(one.condition.name, one.method): one for one in verdicts}
-    for row, condition in enumerate(conditions):
-        for column, method in enumerate(methods):
-            one = cells.get((condition, method))
-            shade = 0.0 if one is None or one.worst is None else float(SCALE_DB(one.worst))
-            colour = "#eeeeee" if one is None else VERMILLION if one.failed else blues(shade) if shade else "#d8d8d8"
-            ink = GREY if one is None else "white" if one.failed or shade > 0.6 else "black"
-            axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
-            words = "–" if one is None else ", ".join(one.describe())
-            axes.text(column, row, words, ha="center", va="center", fontsize=8.5, color=ink)
+    for (row, condition), (column, method) in itertools.product(enumerate(conditions), enumerate(methods)):
+        one = cells.get((condition, method))
+        shade = 0.0 if one is None or one.worst is None else float(SCALE_DB(one.worst))
+        colour = "#eeeeee" if one is None else VERMILLION if one.failed else blues(shade) if shade else "#d8d8d8"
+        ink = GREY if one is None else "white" if one.failed or shade > 0.6 else "black"
+        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
+        words = "–" if one is None else ", ".join(one.describe())
+        axes.text(column, row, words, ha="center", va="center", fontsize=8.5, color=ink)
     axes.set(xlim=(-0.5, len(methods) - 0.5), ylim=(len(conditions) - 0.5, -0.5))
     axes.set_xticks(range(len(methods)), methods, fontsize=9)
     axes.xaxis.tick_top()

@@ -21,7 +21,6 @@ class Outcome:
     condition: str
     method: str
     seed: int
-    guard: bool
     psnr: float | None
     """dB on held-out views; of an image, at `UPSCALE` times the pixels it was trained on along each side."""
     status: str
@@ -94,7 +93,7 @@ def run_trial(trial: Trial, root: Path) -> Outcome:
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "log.txt").open("w", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
         found = train_trial(trial, folder)
-    outcome = Outcome(trial.condition, trial.method, trial.seed, method.guarded is None, **found)
+    outcome = Outcome(trial.condition, trial.method, trial.seed, **found)
     write_json(folder / "trial.json", {"identity": identity, "outcome": asdict(outcome)})
     return outcome
 

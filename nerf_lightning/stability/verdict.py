@@ -28,15 +28,6 @@ class Verdict:
         known = [one.psnr for one in self.outcomes if one.psnr is not None]
         return min(known) if len(known) == len(self.outcomes) else None
 
-    @property
-    def must_fail(self) -> bool:
-        return self.condition.control or METHODS[self.method].guarded is not None
-
-    @property
-    def shipped(self) -> bool:
-        """Whether it is a recipe as it is shipped, which must not fail."""
-        return not self.condition.control and not METHODS[self.method].control
-
     def describe(self) -> list[str]:
         """Figure and failures in words."""
         refused = all(one.status == "refused" for one in self.outcomes)
@@ -53,10 +44,10 @@ def judge(outcomes: Sequence[Outcome]) -> list[Verdict]:
     found = []
     for condition in CONDITIONS.values():
         for method in dict.fromkeys(one.method for one in outcomes):
-            seeds = tuple(one for one in outcomes if (one.condition, one.method) == (condition.name, method))
+            seeds = select(outcomes, condition.name, method)
             failed = [one for one in seeds if not passes(one, condition, clean_psnr(outcomes, method, one.seed))]
             if seeds:
-                found.append(Verdict(condition, method, seeds, tuple(failed)))
+                found.append(Verdict(condition, method, tuple(seeds), tuple(failed)))
     return found
 
 
@@ -69,34 +60,33 @@ def passes(outcome: Outcome, condition: Condition, clean: float | None) -> bool:
     return condition.max_loss_db is None or clean is None or outcome.psnr >= clean - condition.max_loss_db
 
 
-def find_rescues(outcomes: Sequence[Outcome]) -> list[dict[str, str | int | float | None]]:
-    """The guarded twin of each control run that broke down without the guard, and what it should reach.
+def find_rescues(outcomes: Sequence[Outcome]) -> list[bool]:
+    """For each control run that broke down without the guard, whether its guarded twin came near an undisturbed run.
 
-    That is `undisturbed`, the median dB of the seeds that did not break down under the same condition, or of the clean runs
-    where all did.
+    That is the median of the seeds that did not break down under the same condition, or of the clean runs where all did.
     """
     found = []
     for lost in outcomes:
-        twins = [one for one in outcomes if (one.condition, one.seed) == (lost.condition, lost.seed)]
-        twin = next((one for one in twins if one.method == METHODS[lost.method].guarded), None)
-        if twin is None or lost.status not in ("collapsed", "failed"):
-            continue
-        alike = [one for one in outcomes if one.condition == lost.condition and one.method == lost.method]
-        reference = median_psnr(alike) or clean_psnr(outcomes, lost.method)
-        rescue = {key: getattr(twin, key) for key in ("condition", "method", "seed", "psnr")}
-        found.append({**rescue, "undisturbed": reference})
+        guarded = METHODS[lost.method].guarded
+        twins = select(outcomes, lost.condition, guarded, lost.seed) if guarded is not None else []
+        if twins and lost.status in ("collapsed", "failed"):
+            undisturbed = median_psnr(select(outcomes, lost.condition, lost.method)) or clean_psnr(
+                outcomes, lost.method
+            )
+            psnr = twins[0].psnr
+            found.append(psnr is not None and undisturbed is not None and psnr >= undisturbed - RESCUED_DB)
     return found
 
 
-def is_rescued(rescue: dict) -> bool:
-    """Whether the guarded run came near an undisturbed one."""
-    psnr, reference = rescue["psnr"], rescue["undisturbed"]
-    return psnr is not None and reference is not None and psnr >= reference - RESCUED_DB
+def select(outcomes: Sequence[Outcome], condition: str, method: str, seed: int | None = None) -> list[Outcome]:
+    """Outcomes of one condition and one method, of all seeds or of one."""
+    found = [one for one in outcomes if (one.condition, one.method) == (condition, method)]
+    return found if seed is None else [one for one in found if one.seed == seed]
 
 
 def clean_psnr(outcomes: Sequence[Outcome], method: str, seed: int | None = None) -> float | None:
     """dB of the same seed's clean run, as seeds differ; the median of all seeds if there is none."""
-    clean = [one for one in outcomes if one.method == method and one.condition in CLEAN]
+    clean = [one for name in CLEAN for one in select(outcomes, name, method)]
     return median_psnr([one for one in clean if one.seed == seed]) or median_psnr(clean)
 
 

@@ -131,9 +131,14 @@ def place_cameras(count: int, size: int, phase: float = 0.0, distance: float = D
     ring = (1 - z**2).sqrt()
     eye = distance * torch.stack([ring * azimuth.cos(), ring * azimuth.sin(), z], dim=1)
     c2w = look_at(eye, torch.zeros(3).double(), torch.tensor([0.0, 0.0, 1.0]).double()).float()
-    focal = 0.5 * size / math.tan(0.5 * FIELD_OF_VIEW_RAD)
-    K = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-    return Cameras.of_size(K.repeat(count, 1, 1), c2w, size, size)
+    return make_cameras(c2w, size, size, FIELD_OF_VIEW_RAD)
+
+
+def make_cameras(c2w: Float[Tensor, "V 4 4"], width: int, height: int, field_of_view_rad: float) -> Cameras:
+    """Pinhole cameras of one horizontal field of view."""
+    focal = 0.5 * width / math.tan(0.5 * field_of_view_rad)
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Cameras.of_size(K.repeat(len(c2w), 1, 1), c2w, width, height)
 
 
 def bound_bodies(bodies: Sequence[Body]) -> Bounds:

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras, look_at
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.synthetic.objects import Ball, Block, Body, render_photos
+from nerf_lightning.synthetic.objects import Ball, Block, Body, make_cameras, render_photos
 
 FIELD_OF_VIEW_RAD = 1.0
 """Horizontal."""
@@ -75,9 +75,7 @@ def place_handheld(count: int, width: int, height: int, seed: int) -> Cameras:
     eyes = torch.stack([tall.cos() * turn.cos(), tall.cos() * turn.sin(), tall.sin()], dim=1) + shake()
     up = torch.tensor([0.0, 0.0, 1.0]).double() + shake()
     c2w = torch.stack([look_at(*it) for it in zip(eyes[:, None], shake(), up, strict=True)])[:, 0].float()
-    focal = 0.5 * width / math.tan(0.5 * FIELD_OF_VIEW_RAD)
-    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    return Cameras.of_size(K.repeat(count, 1, 1), c2w, width, height)
+    return make_cameras(c2w, width, height, FIELD_OF_VIEW_RAD)
 
 
 def photograph_room(room: Room, cameras: Cameras) -> Views:

@@ -14,7 +14,7 @@ from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import RenderOutput, VolumeRenderer, over
-from nerf_lightning.sampler import CHUNK, Sampler, split
+from nerf_lightning.sampler import CHUNK, Sampler, Samples, split
 from nerf_lightning.system.compiled import part
 from nerf_lightning.system.growth import GrowField, follow_resolution
 from nerf_lightning.system.state import TrainingState
@@ -89,6 +89,15 @@ class NeRF3D(System):
         self.data.plain = self.renderer.uses_texture
         follow_resolution(self, self.data)
 
+    def set_first_step(self, step: int) -> None:
+        self.sampler.restart(step)
+
+    def restart(self, step: int) -> None:
+        self.set_first_step(step)
+        self.sampler.mark_invisible_cells(self.data.scene.train.cameras)
+        follow_resolution(self, self.data)
+        self.data.start_again()  # the errors were those of the failed attempt
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if self.corrections is not None:
             checkpoint["corrections"] = self.corrections.trial_state()
@@ -125,9 +134,7 @@ class NeRF3D(System):
         squares = (rgb - truth).square().mean(1)
         losses = {
             "photometric": (squares if batch.weights is None else squares * batch.weights).mean(),
-            **self.field.losses(),
-            **self.renderer.losses(output, samples, self.state.progress, batch.plain),
-            **self.sampler.losses(samples, output.weights),
+            **self.regularize(output, samples, batch),
         }
         stats = StepStats(
             losses["photometric"].detach(),
@@ -139,6 +146,14 @@ class NeRF3D(System):
             {name: loss.detach() for name, loss in losses.items()},
         )
         return losses, stats
+
+    def regularize(self, output: RenderOutput, samples: Samples, batch: RayBatch) -> dict[str, Float[Tensor, ""]]:
+        """The other losses by name: of the field, the rendering weights, and what the sampler learns from."""
+        return {
+            **self.field.losses(),
+            **self.renderer.losses(output, samples, self.state.progress, batch.plain),
+            **self.sampler.losses(samples, output.weights),
+        }
 
     def adapt_num_rays(self) -> None:
         """Tells the data how many samples the last step took."""

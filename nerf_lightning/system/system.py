@@ -154,6 +154,12 @@ class System(L.LightningModule):
             self.state.advance(max(self.state.progress, self.global_step / self.trainer.max_steps))
         self.set_learning_rates(self.trainer.optimizers[0], self.global_step)
 
+    def set_first_step(self, step: int) -> None:
+        """Called where training goes on that started again at a step."""
+
+    def restart(self, step: int) -> None:
+        """Called when training starts again at a step, with a fresh field."""
+
     def truth(self, batch: Any) -> Float[Tensor, "N 3"]:
         """The colours that a batch should have in evaluation."""
         raise TypeError(f"{type(self).__name__} must define truth(batch)")

@@ -58,7 +58,7 @@ class SweepReport(Callback):
             print(f"job {config.hydra.job.num + 1} of {self.jobs}", flush=True)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        from nerf_lightning.comparison.references import PUBLISHED, read_references
+        from nerf_lightning.comparison.points import PUBLISHED, read_references
         from nerf_lightning.comparison.report import write_comparison
 
         root = Path(config.hydra.sweep.dir)

@@ -53,12 +53,6 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
     return {"processor": processor(), "cores": cores(), "accelerator": accelerator(device)}
 
 
-def work_clocks(threads: int) -> tuple[float, float]:
-    """Seconds worked by the thread that calls, and by this process for each of its threads: whichever went on further tells how
-    long work took, without the time spent waiting for a core."""
-    return time.thread_time(), time.process_time() / threads
-
-
 def crowding(results: Mapping[str, Any]) -> float | None:
     """Share of a run's threads taken by other work, which used more than the cores the run left free; None if unknown."""
     try:

@@ -15,7 +15,7 @@ from nerf_lightning.callbacks.picture.baselines import (
     words,
 )
 from nerf_lightning.dataset.picture import builtin_picture
-from nerf_lightning.dataset.sources import from_picture
+from nerf_lightning.sources import from_picture
 
 
 @pytest.fixture(scope="module")

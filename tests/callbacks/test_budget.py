@@ -1,7 +1,4 @@
-import time
-
 import pytest
-import torch
 
 from nerf_lightning.callbacks import Budget
 from nerf_lightning.errors import InputError
@@ -108,38 +105,3 @@ def test_budget_resumed_continues_where_it_stopped(clock, system, trainer_with):
 def test_budget_without_limit_is_refused():
     with pytest.raises(InputError, match="budget"):
         Budget()
-
-
-def test_budget_alone_counts_undisturbed_work(clock, system, trainer_with, monkeypatch):
-    worked = {"thread": 50.0, "process": 500.0}
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    monkeypatch.setattr(time, "thread_time", lambda: worked["thread"])
-    monkeypatch.setattr(time, "process_time", lambda: worked["process"])
-    plain, alone = Budget(seconds=100), Budget(seconds=100, alone=True)
-    for budget in (plain, alone):
-        budget.on_train_start(trainer_with(budget), system)
-
-    def step(wall: float, thread: float, process: float) -> None:
-        clock.wait(wall)
-        worked["thread"] += thread
-        worked["process"] += process
-        for budget in (plain, alone):
-            budget.on_train_batch_end(trainer_with(budget), system, None, None, 0)
-
-    step(0.1, 0.1, 0.2)
-    step(0.1, 0.0, 0.2)
-    assert plain.seconds == pytest.approx(0.2) and alone.seconds == pytest.approx(0.2), "other threads did all the work"
-    for _ in range(10):
-        step(0.3, 0.12, 0.24)
-    assert plain.seconds == pytest.approx(3.2)
-    assert alone.seconds == pytest.approx(12 * 0.1), "waits for a core do not count, nor what they do to the caches"
-    with alone.paused():
-        clock.wait(50)
-        worked["thread"] += 50
-    for _ in range(20):
-        step(0.2, 0.2, 0.4)
-    step(0.2, 0.2, 0.4)
-    before = alone.seconds
-    step(0.2, 0.2, 0.4)
-    assert alone.seconds == pytest.approx(before + 0.2), "steps that grow count in full before long"
-    assert alone.progress(0) == alone.seconds / 100

@@ -13,9 +13,9 @@ from nerf_lightning.callbacks import Enlarge
 from nerf_lightning.callbacks.picture.baselines import quality_of
 from nerf_lightning.dataset import Picture, PixelDataModule
 from nerf_lightning.dataset.picture import builtin_picture
-from nerf_lightning.dataset.sources import from_picture
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import PictureField
+from nerf_lightning.sources import from_picture
 from nerf_lightning.system import NeRF2D, constant
 
 

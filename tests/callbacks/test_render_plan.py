@@ -17,8 +17,8 @@ from nerf_lightning.callbacks.render_plan import RenderPlan, allot
 from nerf_lightning.cameras import Rays
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Views
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.renderer import RenderOutput
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.system import NeRF3D, StepStats
 from nerf_lightning.training.train import train
 
@@ -76,7 +76,7 @@ def simulated(clock: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Ca
 
     def run(side: int, pixel_seconds: float, fog: float) -> Told:
         """Args: of held-out photos; of a pixel, and how many times that at first."""
-        small = bricks(size=16, train_views=6, val_views=8, cache="")
+        small = bricks(size=16, train_views=6, val_views=8)
         cameras = small.val.cameras.resized((side, side))
         photos = torch.zeros(8 * side * side, 3, dtype=torch.uint8)
         scene = replace(small, val=Views(photos, cameras), orbit=small.orbit.resized((side, side)))

@@ -15,10 +15,10 @@ import yaml
 from nerf_lightning.config import conf_dir
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Scene, save_npz
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.scene import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.owner import owned
+from nerf_lightning.synthetic.bricks import bricks
 from tests.helpers.command_line import BARE, popen
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -76,7 +76,7 @@ def test_train_checks_options_before_photos_are_read(inside, monkeypatch: pytest
 
 
 def test_photos_without_alpha_refuse_another_background(inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    scene = bricks(size=16, train_views=4, val_views=1, cache="")
+    scene = bricks(size=16, train_views=4, val_views=1)
     flat = [Views.of(v.images[..., :3].contiguous(), v.cameras) for v in (scene.train, scene.val)]
     save_npz(Scene("flat", "made", *flat, scene.orbit, scene.bounds), tmp_path / "flat.npz")
     code, _, err = inside("dataset=photos", "dataset.path=flat.npz", "renderer.background=white")

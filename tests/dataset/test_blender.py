@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.dataset import Reading, Scene, load_blender, load_npz
+from nerf_lightning.dataset import Reading, load_blender, load_npz
 from nerf_lightning.dataset.resize import area_resize
 
 ANGLE = 2 * float(np.arctan(0.5 * 8 / 10))  # focal 10 at 8 pixels width
@@ -85,13 +85,6 @@ def test_load_blender_splits_follow_the_files(folder: Path):
     assert (len(scene.train), len(scene.val)) == (1, 1)
 
 
-def test_load_blender_several_sizes_keep_the_angle(folder: Path):
-    imageio.imwrite(folder / "train" / "r_1.png", np.full((12, 16, 4), 7, np.uint8))
-    cameras = load_blender(folder).train.cameras
-    assert cameras.sizes.tolist() == [[8, 6], [16, 12]]
-    assert cameras.K[:, 0, 0].tolist() == [10, 20], "the angle of view is the same"
-
-
 def test_area_resize_alpha_leaves_no_dark_rim():
     """White under alpha 1, black under alpha 0: every pixel with any alpha must stay white."""
     x, y = np.meshgrid(np.arange(50), np.arange(50))
@@ -102,17 +95,6 @@ def test_area_resize_alpha_leaves_no_dark_rim():
     assert partial.sum() > 20
     assert (small[partial][:, :3] == 255).all()
     assert abs(small[..., 3].mean() - image[..., 3].mean()) < 1
-
-
-def test_area_resize_commutes_with_compositing(ball: Scene):
-    rgba = ball.train.images[0].numpy()
-
-    def over_white(image: np.ndarray) -> np.ndarray:
-        alpha = image[..., 3:] / 255
-        return np.rint(image[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
-
-    a, b = over_white(area_resize(rgba, 24, 20)), area_resize(over_white(rgba), 24, 20)
-    assert np.abs(a.astype(int) - b).max() <= 1
 
 
 @pytest.mark.real_data

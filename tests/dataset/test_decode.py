@@ -1,5 +1,7 @@
 """Decoding: JPEG at reduced scale, legal oddities, files cut short, headers."""
 
+import importlib.util
+import sys
 import zlib
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import pytest
 from PIL import Image
 
 from nerf_lightning.dataset.formats.decode import draft_scale, image_header, read_pixels
+from nerf_lightning.dataset.placing.lenses import Shot, shot
 from nerf_lightning.dataset.resize import area_resize
 from nerf_lightning.errors import InputError
 from tests.helpers.exif_tags import tags
@@ -74,24 +77,21 @@ def test_read_pixels_fill_bytes_are_skipped(tmp_path: Path):
     assert np.array_equal(read_pixels(path), before)
 
 
-@pytest.mark.parametrize("size", [None, (32, 16)])
-def test_read_pixels_truncated_jpeg_raises(size: tuple[int, int] | None, tmp_path: Path):
+def test_read_pixels_truncated_jpeg_raises(tmp_path: Path):
     path = save(tmp_path / "a.jpg", photo(64, 32))
     data = path.read_bytes()
-    for kept in np.linspace(3, len(data) - 3, 40).astype(int):
+    for kept in np.linspace(3, len(data) - 3, 10).astype(int):
         path.write_bytes(data[:kept])
         with pytest.raises(InputError, match="cut short or changed") as caught:
-            read_pixels(path, size=size)
+            read_pixels(path, size=(32, 16))
         assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("mode", ["L", "CMYK"])
 def test_read_pixels_grey_and_cmyk_become_rgb(mode: str, tmp_path: Path):
-    Image.fromarray(photo(32, 16)).convert(mode).save(tmp_path / "a.jpg", quality=95)
-    whole, reduced = read_pixels(tmp_path / "a.jpg"), read_pixels(tmp_path / "a.jpg", size=(16, 8))
-    expected = Image.fromarray(photo(32, 16)).convert(mode).convert("RGB")
-    assert np.abs(whole.astype(int) - np.asarray(expected)).mean() < 4
-    assert np.abs(reduced.astype(int) - area_resize(whole, 16, 8)).mean() < 4
+    picture = Image.fromarray(photo(32, 16)).convert(mode)
+    picture.save(tmp_path / "a.jpg", quality=95)
+    assert np.abs(read_pixels(tmp_path / "a.jpg").astype(int) - np.asarray(picture.convert("RGB"))).mean() < 4
 
 
 @pytest.mark.parametrize("data", [b"GIF89a" + bytes(100), PNG_WITHOUT_ROWS], ids=["gif", "png"])
@@ -102,3 +102,40 @@ def test_read_pixels_of_no_image_prints_nothing_of_opencv(
     with pytest.raises(InputError, match="no image"):
         read_pixels(tmp_path / "a.jpg")
     assert capfd.readouterr() == ("", "")
+
+
+installed = pytest.mark.skipif(importlib.util.find_spec("pillow_heif") is None, reason="pillow-heif is not installed")
+
+
+def write_heic(file: Path) -> np.ndarray:
+    """A smooth picture with a tag that would turn it, of which a HEIC reader has no need."""
+    import pillow_heif
+
+    picture = np.linspace(0, 255, 48 * 64 * 3).reshape(48, 64, 3).astype(np.uint8)
+    exif = tags(6, "Apple", focal_35mm=26)
+    pillow_heif.from_pillow(Image.fromarray(picture)).save(file, exif=exif, quality=90)
+    return picture
+
+
+@installed
+def test_read_pixels_heic_is_upright(tmp_path: Path):
+    picture = write_heic(tmp_path / "a.HEIC")
+    for upright in (True, False):
+        found = read_pixels(tmp_path / "a.HEIC", upright)
+        np.testing.assert_allclose(found.astype(int), np.rot90(picture, -1), atol=12)
+    assert shot(tmp_path / "a.HEIC", 48, 64) == Shot(48, 64, "Apple", focal_35mm=26.0)
+
+
+@installed
+def test_read_pixels_truncated_heic_raises(tmp_path: Path):
+    write_heic(tmp_path / "a.heic")
+    (tmp_path / "a.heic").write_bytes((tmp_path / "a.heic").read_bytes()[:-20])
+    with pytest.raises(InputError, match="found an unreadable image .*, expected a whole HEIC photo; copy it again"):
+        read_pixels(tmp_path / "a.heic")
+
+
+def test_read_pixels_heic_without_package_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x1cftypheic" + bytes(100))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(InputError, match=r"no such package, .* HEIC photos; pip install 'nerf_lightning\[heic\]'"):
+        read_pixels(tmp_path / "a.heic")

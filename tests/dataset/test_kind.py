@@ -92,3 +92,36 @@ def test_open_scene_stated_box_rules(ball: Scene, tmp_path: Path):
     save_npz(replace(ball, bounds=replace(ball.bounds, unbounded=True)), tmp_path / "s.npz")
     scene = open_scene(str(tmp_path / "s.npz"))
     assert scene.bounds.unbounded and torch.equal(scene.bounds.aabb, ball.bounds.aabb) and "box" in scene.kind
+
+
+@pytest.mark.parametrize("format", ["npz", "blender", "transforms"])
+def test_open_scene_options_reach_every_format(format: str, ball_views: Views, tmp_path: Path):
+    path = write_scene(format, tmp_path / "s", ball_views)
+    if format == "transforms":
+        path = (path / "transforms.json").rename(path / "Other.json")
+    scene = open_scene(str(path), reading=Reading(resize=24), name="mine", near=0.5, far=2.0)
+    assert scene.name == "mine" and scene.resolution == (24, 20)
+    assert scene.train.images.shape[1:3] == scene.val.images.shape[1:3] == (20, 24)
+    assert (scene.orbit.width, scene.orbit.height) == (24, 20)
+    K = torch.tensor([[30.0, 0, 12], [0, 30, 10], [0, 0, 1]])
+    torch.testing.assert_close(scene.val.cameras.K[0], K)
+    torch.testing.assert_close(scene.orbit.K[0], K)
+    assert (scene.bounds.near, scene.bounds.far) == (0.5, 2.0)
+
+
+WRONG = {
+    "nothing": (lambda folder: folder / "absent", "found nothing there"),
+    "empty folder": (lambda folder: (folder / "empty", (folder / "empty").mkdir())[0], "found an empty folder"),
+    "other folder": (lambda folder: ((folder / "some").mkdir(), folder)[1], "found a folder with some"),
+    "other file": (lambda folder: (folder / "a.txt", (folder / "a.txt").write_text(""))[0], "found a .txt file"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_open_scene_unknown_path_raises(kind: str, tmp_path: Path):
+    make, words = WRONG[kind]
+    path = make(tmp_path)
+    with pytest.raises(InputError, match=words) as caught:
+        open_scene(str(path))
+    line = str(caught.value)
+    assert str(path) in line and ", expected " in line and "\n" not in line

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nerf_lightning.dataset.formats.names import ImageFinder
+from nerf_lightning.dataset.formats.names import find_images
 from nerf_lightning.errors import InputError
 
 
@@ -16,8 +16,8 @@ def make_files(root: Path, *names: str) -> Path:
     return root
 
 
-def find(root: Path, name: str) -> Path | None:
-    return ImageFinder(root).find(name, "file", "key")
+def find(root: Path, *names: str) -> list[Path | None]:
+    return find_images(root, names, "file")
 
 
 FOUND = {
@@ -37,30 +37,26 @@ FOUND = {
 }
 
 
-@pytest.mark.parametrize("case", FOUND)
-def test_image_finder_name_means_the_one_file(case: str, tmp_path: Path):
+def test_find_images_name_means_the_one_file(tmp_path: Path):
     cafe = unicodedata.normalize("NFD", "images/café.png")
     others = ("images/._a.png", "images/.DS_Store", "masks/a.png", "images_4/a.png", "images/10.png")
     root = make_files(tmp_path, "images/a.png", "images/b  c.png", cafe, *others)
-    name, expected = FOUND[case]
-    assert find(root, name) == (None if expected is None else root / expected)
+    for case, (name, expected) in FOUND.items():
+        assert find(root, name) == [None if expected is None else root / expected], case
 
 
-def test_image_finder_folders_decide(tmp_path: Path):
+def test_find_images_folders_decide(tmp_path: Path):
     root = make_files(tmp_path, "images/front/0.png", "images/back/0.png")
-    assert find(root, "/data/Front/0.PNG") == root / "images/front/0.png"
-    with pytest.raises(
-        InputError, match=r"file: key: found '0\.jpg', which may mean 2 files: images/back/0\.png, images/front"
-    ):
+    assert find(root, "/data/Front/0.PNG") == [root / "images/front/0.png"]
+    with pytest.raises(InputError, match=r"'0\.jpg', which may mean 2 files: images/back/0\.png, images/front"):
         find(root, "0.jpg")
 
 
-def test_image_finder_file_has_one_name(tmp_path: Path):
+def test_find_images_file_has_one_name(tmp_path: Path):
     """Test poses whose photos are not there must not take the training photos of the same numbers."""
-    finder = ImageFinder(make_files(tmp_path, "images_train/1.png"))
-    assert finder.find("images_train/1.png", "train", "") == tmp_path / "images_train/1.png"
-    assert finder.find("images_test/1.png", "test", "") is None
-    moved = ImageFinder(tmp_path)
-    assert moved.find("images_test/1.png", "test", "") == tmp_path / "images_train/1.png"
-    with pytest.raises(InputError, match="'images_test/1.png' and 'images_train/1.png', of which only"):
-        moved.find("images_train/1.png", "train", "")
+    root = make_files(tmp_path, "train/1.png")
+    file = root / "train/1.png"
+    assert find(root, "test/1.png", "train/1.png") == [None, file]
+    assert find(root, "/data/test/1.png", "/data/train/1.png") == [None, file]
+    with pytest.raises(InputError, match="'a/1.png' and 'b/1.png', of which only"):
+        find(root, "a/1.png", "b/1.png")

@@ -7,7 +7,7 @@ import torch
 
 from nerf_lightning.dataset import pixel_grid
 from nerf_lightning.dataset.picture import builtin_picture
-from nerf_lightning.dataset.sources import from_picture
+from nerf_lightning.sources import from_picture
 
 
 def board(height: int, width: int) -> torch.Tensor:

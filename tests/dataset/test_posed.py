@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf_lightning.cameras import Cameras, orbit_around
 from nerf_lightning.dataset import Reading, Views, open_scene
-from nerf_lightning.dataset.formats.exif import stated_exposure
+from nerf_lightning.dataset.formats.header import stated_exposure
 from nerf_lightning.dataset.posed import normalize_poses
 from nerf_lightning.dataset.region import find_region
 from tests.helpers.colmap_files import photos, write_transforms

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.cameras import Cameras, Layout, spiral_like
+from nerf_lightning.cameras import Cameras, Layout
 from nerf_lightning.dataset import Reading, Scene, Views, open_scene
 from nerf_lightning.dataset.region import PAN_DEPTH, find_region
 from tests.helpers.camera_paths import CENTRE, RADIUS, forward, pan, ring, walk
@@ -136,20 +136,13 @@ def test_find_region_georeferenced_is_the_same():
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_open_scene_pan_orbit_turns_on_the_spot(noise: float, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_open_scene_pan_unknown_depth_warns(noise: float, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     with caplog.at_level(logging.WARNING):
         scene = open_scene(str(folder_of(tmp_path, pan(noise))))
     assert ("how far away" in caplog.text) == (noise > 0)
     assert scene.bounds.unbounded and scene.bounds.near is None
     assert float((scene.to_source[:3, 3].double() - CENTRE).norm()) < 0.05
-    orbit = scene.orbit
-    for path in (orbit, spiral_like(orbit, 90)):
-        R = path.c2w[:, :3, :3]
-        torch.testing.assert_close(R @ R.mT, torch.eye(3).expand_as(R), atol=1e-5, rtol=0)
-        assert float((path.centres - orbit.centres[0]).abs().max()) == 0
-    turn = torch.atan2(orbit.c2w[:, 1, 2], orbit.c2w[:, 0, 2])
-    steps = torch.remainder(turn.roll(-1) - turn + math.pi, 2 * math.pi) - math.pi
-    torch.testing.assert_close(steps.abs(), torch.full_like(steps, 2 * math.pi / 60), atol=1e-3, rtol=0)
+    assert float((scene.orbit.centres - scene.orbit.centres[0]).abs().max()) == 0, "it turns on the spot"
 
 
 def test_open_scene_colmap_points_are_in_the_scenes_frame(tmp_path: Path):

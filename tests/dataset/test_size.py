@@ -14,13 +14,13 @@ from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, Views, open_scene, save_npz
 from nerf_lightning.dataset import size as size_module
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.dataset.shots import Reading, Shot, read_shots
 from nerf_lightning.dataset.size import AutoResize, auto_resize, choose_resize, find_reduced
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.scene_file import load_scene, save_scene
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.device import CPU
 from tests.helpers.colmap_files import write_scene
 
@@ -114,7 +114,7 @@ def test_read_shots_reduced_jpeg_is_averaged(tmp_path: Path):
 
 def test_data_again_keeps_the_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Whatever its budget, the threads and the memory are by then."""
-    save_npz(bricks(size=48, train_views=4, val_views=2, cache=""), tmp_path / "scene.npz")
+    save_npz(bricks(size=48, train_views=4, val_views=2), tmp_path / "scene.npz")
     monkeypatch.setattr(size_module, "MIN_LONGEST_PX", 16)
     monkeypatch.setattr(size_module, "LONGEST_PX", 400)
     options = ["dataset=photos", f"dataset.path={tmp_path / 'scene.npz'}", "budget.steps=1", "threads=2"]

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from nerf_lightning.dataset import Picture, PixelDataModule, RayDataModule
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset, thin
+from nerf_lightning.synthetic.bricks import bricks
 
 
 def test_pixel_subset_strips_are_spread():
@@ -32,7 +32,7 @@ def test_thin_leaves_at_most_so_many(pixels: int, most: int, stride: int):
 
 @pytest.mark.parametrize("subset", [PixelSubset(stride=3), PixelSubset(rows=0.5)])
 def test_held_out_subset_is_of_the_whole_view(subset: PixelSubset):
-    scene = bricks(size=64, train_views=2, val_views=2, cache="")
+    scene = bricks(size=64, train_views=2, val_views=2)
     data = RayDataModule(scene)
     whole, some = data.held_out(1), data.held_out(1, subset)
     rows, columns = subset.grid(64, 64)

@@ -128,14 +128,6 @@ def test_load_transforms_lens_per_frame_is_read(tmp_path: Path):
     assert dot_error(scene) < 0.05
 
 
-def test_load_transforms_angle_of_view_gives_focal(capture: Path):
-    intrinsics = {"camera_angle_x": 2 * np.arctan(0.5 * W / 140)}
-    content = json.loads((capture / "transforms.json").read_text())
-    (capture / "transforms.json").write_text(json.dumps({**intrinsics, "frames": content["frames"]}))
-    K = load_transforms(capture).train.cameras.K[0]
-    torch.testing.assert_close(K, torch.tensor([[140.0, 0, W / 2], [0, 140, H / 2], [0, 0, 1]]))
-
-
 def change(capture: Path, edit: Callable[[dict], object]) -> None:
     path = capture / "transforms.json"
     content = json.loads(path.read_text())

@@ -1,7 +1,6 @@
 import numpy as np
-import pytest
 
-from nerf_lightning.drawing.contact_sheet import GAP, contact_sheet, fit_into, wrap
+from nerf_lightning.drawing.contact_sheet import GAP, contact_sheet, wrap
 from nerf_lightning.drawing.ink import VERMILLION, rgb
 
 
@@ -40,13 +39,6 @@ def test_contact_sheet_without_width_keeps_sizes_and_heading_comes_first():
     assert [int(where(sheet, level).sum()) for level in (40, 80)] == [600, 500]
     titled = contact_sheet(images, ["", ""], columns=1, heading="title")
     assert titled.shape[0] > sheet.shape[0] and titled[: titled.shape[0] - sheet.shape[0]].min() < 100
-
-
-@pytest.mark.parametrize(
-    ("shape", "fitted"), [((400, 300), (150, 112)), ((300, 400), (150, 200)), ((3, 4), (150, 200))]
-)
-def test_fit_into_keeps_the_aspect(shape: tuple[int, int], fitted: tuple[int, int]):
-    assert fit_into(flat(*shape, 7), 200, 150).shape == (*fitted, 3)
 
 
 def test_wrap_breaks_long_words_and_keeps_line_ends():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.drawing.depth import colorize_depth, depth_limits
 from nerf_lightning.drawing.frame import Style, colours, error_picture
+from nerf_lightning.drawing.panels import colorize_depth
 from nerf_lightning.renderer import RenderOutput
 
 RED = torch.tensor([1.0, 0.0, 0.0])
@@ -44,13 +44,6 @@ def test_colorize_depth_near_is_bright_and_what_is_beyond_stays_there():
     brightness = colorize_depth(np.array([0.0, 1.0, 1.5, 2.0, 9.0]), 1.0, 2.0).astype(int).sum(1)
     assert brightness[0] == brightness[1] > brightness[2] > brightness[3] == brightness[4]
     assert colorize_depth(np.full((4, 5), 1.5), 1.0, 2.0)[0, 0].tolist() == [186, 54, 85], "inferno's middle glows red"
-
-
-def test_depth_limits_are_percentiles():
-    assert depth_limits(np.linspace(0, 100, 101)) == (2.0, 98.0)
-    assert depth_limits(np.empty(0)) == (0.0, 1.0)
-    low, high = depth_limits(np.full(9, 3.0))
-    assert low == 3.0 < high
 
 
 def test_error_picture_is_magnified_and_told_in_decibels():

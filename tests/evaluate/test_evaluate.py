@@ -15,10 +15,10 @@ import torch
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.evaluate import perceptual
 from nerf_lightning.evaluate.metrics import DIGITS, format_table, to_json
 from nerf_lightning.evaluate.perceptual import perceptual_distance
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.device import CPU
 
@@ -52,7 +52,7 @@ def test_every_view_is_judged_as_the_run_was(run: Path, capsys: pytest.CaptureFi
 
 
 def test_other_photos_of_the_same_thing(run: Path, tmp_path: Path):
-    save_npz(bricks(size=24, train_views=4, val_views=3, cache=""), tmp_path / "other.npz")
+    save_npz(bricks(size=24, train_views=4, val_views=3), tmp_path / "other.npz")
     found = evaluated(run, photos=tmp_path / "other.npz")
     assert len(found["views"]) == 3 and found["scene"]["resolution"] == [24, 24]
 

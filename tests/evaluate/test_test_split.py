@@ -10,8 +10,8 @@ from nerf_lightning.callbacks.render_plan import RenderPlan
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, Scene
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.training.train import train
 
 OPTIONS = ["+experiment=smoke_3d", "budget.steps=3", "callbacks.orbit=null", "callbacks.snapshots=null", "~logger"]
@@ -19,8 +19,8 @@ OPTIONS = ["+experiment=smoke_3d", "budget.steps=3", "callbacks.orbit=null", "ca
 
 @pytest.fixture
 def scene() -> Scene:
-    small = bricks(size=16, train_views=6, val_views=5, cache="")
-    return replace(small, val=bricks(size=16, train_views=6, val_views=2, cache="").val, test=small.val)
+    small = bricks(size=16, train_views=6, val_views=5)
+    return replace(small, val=bricks(size=16, train_views=6, val_views=2).val, test=small.val)
 
 
 def results(folder: Path) -> dict:

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerf_lightning.dataset import Views
-from nerf_lightning.dataset.formats.colmap_cameras import MODELS, NUMBERS
+from nerf_lightning.dataset.formats.colmap_model import MODELS
 
 Camera = tuple[str, int, int, tuple[float, ...]]
 """Model, width, height and parameters."""
@@ -30,7 +30,7 @@ def cameras_of(views: Views, model: str = "PINHOLE", more: tuple[float, ...] = (
     cameras: dict[int, Camera] = {}
     for i, K in enumerate(views.cameras.K.double().numpy()):
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-        one = MODELS[NUMBERS[model]][1] - len(more) == 3
+        one = len(MODELS[model][1].split()) - len(more) == 3
         cameras[i + 1] = (model, *views.cameras.size(i), ((fx, cx, cy) if one else (fx, fy, cx, cy)) + more)
     return cameras
 
@@ -64,7 +64,7 @@ def write_colmap(
         (folder / "points3D.txt").write_text("\n".join(places) + "\n")
         return
     packed = [
-        struct.pack("<iiQQ", n, NUMBERS[m], w, h) + struct.pack(f"<{len(p)}d", *p)
+        struct.pack("<iiQQ", n, MODELS[m][0], w, h) + struct.pack(f"<{len(p)}d", *p)
         for n, (m, w, h, p) in cameras.items()
     ]
     (folder / "cameras.bin").write_bytes(struct.pack("<Q", len(packed)) + b"".join(packed))

@@ -12,7 +12,6 @@ import nerf_lightning as nl
 from nerf_lightning.cameras import Cameras, Rays, in_other_frame
 from nerf_lightning.cli.export import export_transforms
 from nerf_lightning.config.compose import composed
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
@@ -25,6 +24,7 @@ from nerf_lightning.runs.folder import load_config
 from nerf_lightning.runs.scene_file import load_scene
 from nerf_lightning.sampler import Samples, UniformSampler
 from nerf_lightning.synthetic import corruptions
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.system import aligned
 from nerf_lightning.training.train import train
 from tests.helpers.soft_ball import BOX, cameras_around_ball, soft_ball

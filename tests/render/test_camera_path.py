@@ -9,10 +9,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerf_lightning.cameras import Cameras, orbit_around, resample_path
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.camera_path import build_path
 from nerf_lightning.render.path_file import read_path
+from nerf_lightning.synthetic.bricks import bricks
 
 UP = torch.tensor([0.0, 0.6, 0.8])
 CENTRE = torch.tensor([1.0, -2.0, 0.5])
@@ -46,7 +46,7 @@ def test_resample_path_open_keeps_its_ends_and_fewer_are_spread():
     [("orbit", None, 6), ("orbit", 9, 9), ("spiral", None, 120), ("test", None, 2), ("train", 3, 3)],
 )
 def test_build_path_words(path: str, frames: int | None, count: int):
-    scene = bricks(size=16, train_views=4, val_views=2, orbit_views=6, cache="")
+    scene = bricks(size=16, train_views=4, val_views=2, orbit_views=6)
     route = build_path(path, frames, scene.orbit, scene, torch.eye(4))
     assert len(route.cameras) == len(route.views) == count
     if path == "train":

@@ -10,11 +10,11 @@ import torch
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import Views, save_npz
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, save_config
 from nerf_lightning.runs.scene_file import load_scene, save_scene
+from nerf_lightning.synthetic.bricks import bricks
 from tests.helpers.colmap_files import cameras_of, photos, write_colmap
 
 URL = "http://stranger.example/published.npz"
@@ -46,7 +46,7 @@ def again(run: Path, photos: str | None = None) -> Any:
 def published(tmp_path: Path) -> Path:
     path = tmp_path / "data" / "published.npz"
     path.parent.mkdir()
-    save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), path)
+    save_npz(bricks(size=16, train_views=4, val_views=2), path)
     return path
 
 
@@ -64,7 +64,7 @@ def test_downloaded_scene_is_found_from_any_folder(published: Path, tmp_path: Pa
 def test_built_in_scene_is_not_replaced_by_a_download(tmp_path: Path):
     run = a_run(tmp_path / "run", f"dataset.folder={tmp_path}")
     assert again(run).name == "bricks", "and the network is not asked"
-    save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), tmp_path / "published.npz")
+    save_npz(bricks(size=16, train_views=4, val_views=2), tmp_path / "published.npz")
     with pytest.raises(
         InputError, match="found the scene 'published', expected 'bricks', which the run was trained on"
     ):
@@ -75,7 +75,7 @@ def test_built_in_scene_is_not_replaced_by_a_download(tmp_path: Path):
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (5e5, 5.4112e6, 300.0)], ids=["local", "georeferenced"])
 def test_other_photos_are_placed_in_the_frame_of_the_run(shift: tuple[float, float, float], tmp_path: Path):
     """Half of a capture has another middle and another scale than all of it; its cameras still stand where they stood."""
-    whole = bricks(size=16, train_views=12, val_views=2, cache="")
+    whole = bricks(size=16, train_views=12, val_views=2)
     views: Views = whole.train
 
     def capture(name: str, chosen: list[int]) -> str:

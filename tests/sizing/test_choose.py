@@ -2,14 +2,7 @@
 
 import pytest
 
-from nerf_lightning.sizing.choose import (
-    Measured,
-    Target,
-    choose_final,
-    choose_first,
-    choose_second,
-    stop_growing,
-)
+from nerf_lightning.sizing.choose import Measured, Target, choose_final, choose_first, choose_second, stop_growing
 
 NEAR = Target(within_db=0.3)
 
@@ -31,7 +24,6 @@ def test_stop_growing_weighs_gain_against_bytes_and_noise(gain: float, times: fl
 @pytest.mark.parametrize(
     ("psnrs", "target", "noise", "stops"),
     [
-        ((20,), NEAR, 0.0, False),
         ((20, 22, 24), NEAR, 0.0, False),
         ((20, 22, 22.05), NEAR, 0.0, False),  # one may be chance
         ((20, 22, 22.05, 22.1), NEAR, 0.0, True),
@@ -64,10 +56,8 @@ def test_choose_first_is_smallest_that_seems_enough(psnrs: tuple, target: Target
         ((20, 27.8, 27.9, 28.0), NEAR, 1, 30.0, 3),  # beside the best
         ((20, 25, 28), NEAR, 2, 30.0, None),  # the best itself
         ((25, 26, 27), Target(psnr=28), 2, 28.6, 1),  # 27.6 are expected, which may be wrong by half a dB
-        ((25, 26, 27), Target(psnr=28), 2, 28.4, None),  # 27.4 are expected
         ((25, 26, 27), Target(psnr=28), 2, 27.0, 3),
         ((25, 26, 27, 27), Target(psnr=28), 3, 27.0, None),  # there is no larger one
-        ((25, 26, 27), Target(psnr=28), 0, 28.0, None),  # nor a smaller one
         # Bricks, 1500 steps: 32.2 are expected of rung 4, of the next smaller one 30.7.
         ((21.2, 23.4, 25.4, 27.4, 28.9, 29.7, 30.2), Target(psnr=31), 6, 33.5, 4),
     ],
@@ -83,7 +73,6 @@ def test_choose_second_is_neighbour_that_may_change_the_choice(
     [
         ({1: 30.0, 3: 30.2}, NEAR, (1, True)),
         ({1: 30.0, 3: 31.0}, NEAR, (3, True)),
-        ({2: 28.5, 1: 27.0}, Target(psnr=28), (2, True)),
         ({2: 28.5, 1: 28.0}, Target(psnr=28), (1, True)),
         ({2: 27.0, 3: 27.5}, Target(psnr=28), (3, False)),
     ],

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.dataset.bricks.scene import bricks
+from nerf_lightning.synthetic.bricks import bricks
 
 SMALL = (
     *("dataset.rays=64", "dataset.samples=null", "budget.steps=2", "callbacks.throughput=null"),
@@ -24,7 +24,7 @@ SMALL = (
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_a_moved_run_goes_on_and_is_measured(source: list[str], kept: str, inside, tmp_path: Path):
-    save_npz(bricks(size=16, train_views=4, val_views=2, cache=""), tmp_path / "published.npz")
+    save_npz(bricks(size=16, train_views=4, val_views=2), tmp_path / "published.npz")
     code, _, err = inside(*source, *SMALL)
     assert code == 0, err
     (tmp_path / "run").rename(tmp_path / "moved")

@@ -1,24 +1,44 @@
-"""COLMAP's files: cameras, images and points3D, binary or text.
+"""COLMAP's files: cameras (https://colmap.github.io/cameras.html), images and points3D, binary or text.
 
 Read here, because pycolmap ends the process over a damaged file, and is not needed for anything else in training.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from nerf_lightning.cameras import Distortion, Projection
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.formats.colmap_cameras import MODELS, NUMBERS, optics_of
 from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.parsing import read_content
 
 FILES = ("cameras", "images", "points3D")
+MODELS = {
+    "SIMPLE_PINHOLE": (0, "f cx cy"),
+    "PINHOLE": (1, "fx fy cx cy"),
+    "SIMPLE_RADIAL": (2, "f cx cy k1"),
+    "RADIAL": (3, "f cx cy k1 k2"),
+    "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4"),
+    "FULL_OPENCV": (6, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
+    "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1"),
+    "RADIAL_FISHEYE": (9, "f cx cy k1 k2"),
+    "THIN_PRISM_FISHEYE": (10, "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s2"),
+    "SIMPLE_FISHEYE": (14, "f cx cy"),
+    "FISHEYE": (15, "fx fy cx cy"),
+}
+"""Number and parameters of each camera model that is read; `k`, `p`, `d`, `s` as in `cameras.Distortion`."""
+MODEL_NAMES = {number: name for name, (number, _) in MODELS.items()}
+Row = tuple[Any, ...]
+MAX_NORM_ERROR = 1e-2
+"""Of a pose's quaternion."""
 
 
 @dataclass(frozen=True)
@@ -26,78 +46,85 @@ class Image:
     """One placed photo."""
 
     name: str
-    camera: int
+    optics: Optics
     c2w: Float[np.ndarray, "4 4"]
     """Camera to world, OpenCV frame, the model's unit."""
 
 
-@dataclass(frozen=True)
-class Model:
-    """A sparse model."""
-
-    cameras: dict[int, Optics]
-    images: list[Image]
-    points: Float[np.ndarray, "P 3"]
-    """Empty where the model has no points3D file."""
-
-
-def holds_model(folder: Path) -> bool:
-    """Whether there are cameras and images of a model, both binary or both text."""
-    return any(all((folder / f"{name}{end}").is_file() for name in FILES[:2]) for end in (".bin", ".txt"))
+def find_files(folder: Path) -> list[Path]:
+    """Cameras, images and points of a model, the binary ones where there are both; none without the first two."""
+    for ending in (".bin", ".txt"):
+        files = [folder / f"{name}{ending}" for name in FILES]
+        if files[0].is_file() and files[1].is_file():
+            return files
+    return []
 
 
-def count_images(folder: Path) -> int:
-    """How many photos a model has, without reading it all."""
-    path = folder / "images.bin"
-    if path.is_file():
-        with path.open("rb") as file:
-            head = file.read(8)
-        return struct.unpack("<Q", head)[0] if len(head) == 8 else 0
-    return sum(1 for _ in _image_lines(folder / "images.txt"))
-
-
-def read_model(folder: Path) -> Model:
-    """Reads a sparse model; the binary files where there are both.
+def read_model(folder: Path) -> tuple[list[Image], Float[np.ndarray, "P 3"]]:
+    """Reads a sparse model, the binary files where there are both: its photos, and its points, if it has any.
 
     Raises:
-        InputError: damaged files, or a camera model that is not known here.
+        InputError: damaged files, no photo, or a camera model that is not known here.
     """
-    binary = all((folder / f"{name}.bin").is_file() for name in FILES[:2])
-    cameras_of, images_of, points_of = (
-        (_cameras_bin, _images_bin, _points_bin) if binary else (_cameras_txt, _images_txt, _points_txt)
-    )
-    cameras_file, images_file, points_file = (folder / f"{name}{'.bin' if binary else '.txt'}" for name in FILES)
-    cameras: dict[int, Optics] = {}
-    images: list[Image] = []
-    path = cameras_file
+    files = find_files(folder)
+    parsers = BINARY if files[0].suffix == ".bin" else TEXT
+    found = [_read_all(file, parse) if file.is_file() else [] for file, parse in zip(files, parsers, strict=True)]
+    optics = {number: make_optics(files[0], f"camera {number}", *camera) for number, *camera in found[0]}
+    if not found[1]:
+        raise InputError(files[1], "", "0 photos", "at least one placed photo")
+    names, cameras, poses = zip(*found[1], strict=True)
+    for name, camera in zip(names, cameras, strict=True):
+        if camera not in optics:
+            expected = "a camera of the model's cameras file"
+            raise InputError(files[1], name, f"camera {camera}, which is not there", expected)
+    if len({*names}) < len(names):
+        raise InputError(files[1], "", "two photos of one name", "a name of its own for each")
+    c2w = invert_poses(files[1], names, np.array(poses, np.float64))
+    images = [Image(name, optics[camera], pose) for name, camera, pose in zip(names, cameras, c2w, strict=True)]
+    points = np.array(found[2], np.float64).reshape(-1, 3)
+    return images, points[(np.abs(points) <= checks.FARTHEST).all(1)]
+
+
+def _read_all(path: Path, parse: Callable[[Path], Iterable[Row]]) -> list[Row]:
     try:
-        for number, model, width, height, parameters in cameras_of(path):
-            key = f"camera {number}"
-            cameras[number] = optics_of(path, key, model, width, height, tuple(parameters))
-        path = images_file
-        for name, camera, pose in images_of(path):
-            images.append(Image(name, camera, _pose(path, name, np.array(pose))))
-        path = points_file
-        points = np.array(list(points_of(path)) if path.is_file() else [], np.float64).reshape(-1, 3)
-    except (struct.error, ValueError, OverflowError, IndexError) as error:
+        return list(parse(path))
+    except (struct.error, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(path, "", f"a damaged file ({error})", "a whole COLMAP file", "copy it again") from error
-    return Model(cameras, images, points[(np.abs(points) <= checks.FARTHEST).all(1)])
 
 
-def _pose(path: Path, name: str, numbers: Float[np.ndarray, "7"]) -> Float[np.ndarray, "4 4"]:
-    """Camera to world, from the world-to-camera pose: a quaternion (w, x, y, z) and a translation."""
-    w, x, y, z = numbers[:4]
-    if (
-        not (np.abs(numbers[4:]) <= checks.FARTHEST).all()
-        or not abs(np.linalg.norm(numbers[:4].clip(-9, 9)) - 1) < 1e-2
+def make_optics(where: object, key: str, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Optics:
+    """A camera in COLMAP's terms."""
+    names = parameter_names(where, key, model)
+    if len(names) != len(parameters):
+        raise InputError(where, key, f"{len(parameters)} parameters", f"{len(names)} of {model}: {' '.join(names)}")
+    named = dict(zip(names, parameters, strict=True))
+    focal = named.pop("f", 0.0)
+    fx, fy, cx, cy = (named.pop(name, focal) for name in ("fx", "fy", "cx", "cy"))
+    projection = Projection.FISHEYE if "FISHEYE" in model else Projection.PERSPECTIVE
+    return checks.check_optics(where, key, Optics(width, height, fx, fy, cx, cy, Distortion(**named), projection))
+
+
+def parameter_names(where: object, key: str, model: str) -> list[str]:
+    if model not in MODELS:
+        raise InputError(where, key, f"camera model {model}", f"one of {', '.join(MODELS)}")
+    return MODELS[model][1].split()
+
+
+@np.errstate(all="ignore")
+def invert_poses(path: Path, names: Iterable[str], poses: Float[np.ndarray, "V 7"]) -> Float[np.ndarray, "V 4 4"]:
+    """Camera to world, from world-to-camera poses: quaternions (w, x, y, z) and translations."""
+    is_unit = np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1) < MAX_NORM_ERROR
+    for name, pose, is_right in zip(
+        names, poses, is_unit & (np.abs(poses[:, 4:]) <= checks.FARTHEST).all(1), strict=True
     ):
-        expected = f"a unit quaternion and a translation of at most {checks.FARTHEST:g}"
-        raise InputError(path, name, f"the pose {numbers.tolist()}", expected)
-    c2w = np.eye(4)
-    c2w[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
-    c2w[:3, 3] = -c2w[:3, :3] @ numbers[4:]
+        if not is_right:
+            expected = f"a unit quaternion and a translation of at most {checks.FARTHEST:g}"
+            raise InputError(path, name, f"the pose {pose.tolist()}", expected)
+    c2w = np.tile(np.eye(4), (len(poses), 1, 1))
+    c2w[:, :3, :3] = Rotation.from_quat(poses[:, [1, 2, 3, 0]]).as_matrix().transpose(0, 2, 1)
+    c2w[:, :3, 3] = -(c2w[:, :3, :3] @ poses[:, 4:, None])[..., 0]
     return c2w
 
 
@@ -108,16 +135,19 @@ class Bytes:
         self.content = read_content(path)
         self.at = 0
 
-    def take(self, form: str) -> tuple:
+    def take(self, form: str) -> tuple[Any, ...]:
         """The next numbers, in struct's notation, little-endian."""
         found = struct.unpack_from("<" + form, self.content, self.at)
-        self.skip(struct.calcsize("<" + form))
+        self.at += struct.calcsize("<" + form)
         return found
 
-    def skip(self, size: int) -> None:
-        self.at += size
-        if self.at > len(self.content):
-            raise struct.error(f"{len(self.content)} bytes where at least {self.at} are needed")
+    def records(self) -> range:
+        """As many as the next number says."""
+        return range(self.take("Q")[0])
+
+    def skip_records(self, size: int) -> None:
+        count = len(self.records())
+        self.at += count * size
 
     def text(self) -> str:
         """A name that ends with a zero byte."""
@@ -126,78 +156,55 @@ class Bytes:
         return self.content[start:end].decode()
 
 
-Camera = tuple[int, str, int, int, tuple[float, ...]]
-"""Number, model, width, height and parameters."""
-Placed = tuple[str, int, tuple[float, ...]]
-"""A photo's name, the number of its camera, its quaternion and translation."""
-
-
-def _cameras_bin(path: Path) -> Iterator[Camera]:
+def _cameras_bin(path: Path) -> Iterator[Row]:
+    """Number, model, width, height and parameters of each camera."""
     file = Bytes(path)
-    for _ in range(file.take("Q")[0]):
+    for _ in file.records():
         number, model, width, height = file.take("iiQQ")
-        if model not in MODELS:
-            raise InputError(path, f"camera {number}", f"model number {model}", f"one of {', '.join(NUMBERS)}")
-        name, count = MODELS[model]
-        yield number, name, width, height, file.take(f"{count}d")
+        name = MODEL_NAMES.get(model, f"number {model}")
+        yield number, name, width, height, file.take(f"{len(parameter_names(path, f'camera {number}', name))}d")
 
 
-def _images_bin(path: Path) -> Iterator[Placed]:
+def _images_bin(path: Path) -> Iterator[Row]:
+    """Name, number of the camera, and quaternion and translation of each photo."""
     file = Bytes(path)
-    for _ in range(file.take("Q")[0]):
+    for _ in file.records():
         _, *pose, camera = file.take("i7di")
-        name = file.text()
-        file.skip(24 * file.take("Q")[0])  # x, y and the point of each feature
-        yield name, camera, tuple(pose)
+        yield file.text(), camera, tuple(pose)
+        file.skip_records(24)  # x, y and the point of each feature
 
 
-def _points_bin(path: Path) -> Iterator[tuple[float, ...]]:
+def _points_bin(path: Path) -> Iterator[Row]:
     file = Bytes(path)
-    for _ in range(file.take("Q")[0]):
+    for _ in file.records():
         yield file.take("Q3d3Bd")[1:4]
-        file.skip(8 * file.take("Q")[0])  # the images that see it
+        file.skip_records(8)  # the images that see it
 
 
-def _lines(path: Path, splits: int = -1) -> Iterator[list[str]]:
-    """The words of each line but comments, the rest of a line after that many splits whole; empty lines too."""
-    try:
-        text = read_content(path).decode()
-    except UnicodeDecodeError as error:
-        raise InputError(path, "", f"no text ({error})", "COLMAP's text format") from error
-    for line in text.splitlines():
-        if not line.startswith("#"):
-            yield line.split(None, splits)
+def _lines(path: Path) -> Iterator[str]:
+    """All lines but comments, empty ones too."""
+    return (line for line in read_content(path).decode().splitlines() if not line.startswith("#"))
 
 
-def _image_lines(path: Path) -> Iterator[list[str]]:
-    """Every second line: those between hold the features, and may be empty."""
-    lines = _lines(path, splits=9)  # names may contain spaces
-    for words in lines:
-        if words:
-            yield words
-            next(lines, None)
-
-
-def _cameras_txt(path: Path) -> Iterator[Camera]:
-    for words in filter(None, _lines(path)):
-        number, name, width, height, *parameters = words
-        if name not in NUMBERS:
-            raise InputError(path, f"camera {number}", repr(name), f"one of {', '.join(NUMBERS)}")
-        count = MODELS[NUMBERS[name]][1]
-        if len(parameters) != count:
-            raise InputError(path, f"camera {number}", f"{len(parameters)} parameters", f"{count} of {name}")
+def _cameras_txt(path: Path) -> Iterator[Row]:
+    for number, name, width, height, *parameters in filter(None, map(str.split, _lines(path))):
         yield int(number), name, int(width), int(height), tuple(map(float, parameters))
 
 
-def _images_txt(path: Path) -> Iterator[Placed]:
-    for words in _image_lines(path):
-        _, *pose, camera, name = words
+def _images_txt(path: Path) -> Iterator[Row]:
+    lines = _lines(path)
+    for line in filter(str.strip, lines):
+        next(lines, None)  # every second line holds the features, and may be empty
+        _, *pose, camera, name = line.split(None, 9)  # names may contain spaces
         if len(pose) != 7:
-            raise ValueError(" ".join(words)[:60])
+            raise ValueError(line[:60])
         yield name.rstrip(), int(camera), tuple(map(float, pose))
 
 
-def _points_txt(path: Path) -> Iterator[tuple[float, ...]]:
-    for words in filter(None, _lines(path)):
-        _, x, y, z = words[:4]
+def _points_txt(path: Path) -> Iterator[Row]:
+    for _, x, y, z, *_ in filter(None, map(str.split, _lines(path))):
         yield float(x), float(y), float(z)
+
+
+BINARY = (_cameras_bin, _images_bin, _points_bin)
+TEXT = (_cameras_txt, _images_txt, _points_txt)

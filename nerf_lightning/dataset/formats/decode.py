@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt8
-from PIL.Image import Transpose
 from PIL.JpegImagePlugin import JpegImageFile
 
 from nerf_lightning.dataset.formats.header import DAMAGED, JPEG, QUARTER_TURNS, read_header
@@ -23,21 +22,13 @@ from nerf_lightning.utils.parsing import existing_file
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # `read_pixels` says what is wrong with a file
 
 THREADS = 4
-TURNS = {
-    2: Transpose.FLIP_LEFT_RIGHT,
-    3: Transpose.ROTATE_180,
-    4: Transpose.FLIP_TOP_BOTTOM,
-    5: Transpose.TRANSPOSE,
-    6: Transpose.ROTATE_270,
-    7: Transpose.TRANSVERSE,
-    8: Transpose.ROTATE_90,
-}
-"""What makes a photo upright, by its EXIF orientation."""
 DRAFT_SCALES = (8, 4, 2)
 """Factors by which libjpeg reduces while it decodes."""
 OVERSAMPLING = 2
 """Least ratio of a reduced JPEG's sides to those it is averaged to, where they differ: its low-pass filter is sharper than
 an average, and shows only where little is averaged afterwards (43 dB against the average of the whole photo, else above 50)."""
+CONVERSIONS = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
+"""From OpenCV's channels, by their count."""
 PNG = b"\x89PNG"
 HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 """Brands after `ftyp` in photos of phones (ISO 23008-12); the last two stand for any codec."""
@@ -57,23 +48,32 @@ def read_pixels(path: Path, upright: bool = False, size: tuple[int, int] | None 
         InputError: missing, truncated, not an image, or of floating-point pixels; HEIC without the package that reads it.
     """
     existing_file(path)
+    header = read_header(path)
+    orientation = header.orientation if upright and header is not None and not header.alpha else 1
     try:
         data = path.read_bytes()
         if data.startswith(JPEG):
-            return _decode_jpeg(path, data, upright, size)
+            wanted = size[::-1] if size is not None and orientation in QUARTER_TURNS else size
+            return turn_upright(_decode_jpeg(path, data, wanted), orientation)
         if data.startswith(PNG):
             _check_png(path, data)
         # UNCHANGED keeps alpha and 16 bits, and leaves the EXIF rotation alone.
         raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-        if raw is not None and upright and (raw.ndim == 2 or raw.shape[2] < 4):
-            raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     except (cv2.error, OSError) as error:
         raise InputError(path, "", f"an unreadable image ({error})", "a PNG, JPEG or TIFF") from error
     if raw is None and data[8:12] in HEIC:
         return _heic(path, data)
     if raw is None:
         raise InputError(path, "", f"{len(data)} bytes that are no image", "a PNG, JPEG or TIFF", "copy it again")
-    return _rgb8(path, raw)
+    return turn_upright(_rgb8(path, raw), orientation)
+
+
+def turn_upright(image: UInt8[np.ndarray, "H W C"], orientation: int) -> UInt8[np.ndarray, "h w C"]:
+    """A photo as its EXIF orientation says."""
+    image = image.transpose(1, 0, 2) if orientation in QUARTER_TURNS else image
+    image = image[:, ::-1] if orientation in (2, 3, 6, 7) else image
+    image = image[::-1] if orientation in (3, 4, 7, 8) else image
+    return np.ascontiguousarray(image)
 
 
 def image_header(path: Path, upright: bool = False) -> tuple[int, int, bool]:
@@ -95,10 +95,7 @@ def image_header(path: Path, upright: bool = False) -> tuple[int, int, bool]:
     return header.width, header.height, header.alpha
 
 
-def _decode_jpeg(path: Path, data: bytes, upright: bool, size: tuple[int, int] | None) -> UInt8[np.ndarray, "H W 3"]:
-    header = read_header(path)
-    orientation = header.orientation if upright and header is not None else 1
-    wanted = size[::-1] if size is not None and orientation in QUARTER_TURNS else size
+def _decode_jpeg(path: Path, data: bytes, wanted: tuple[int, int] | None) -> UInt8[np.ndarray, "H W 3"]:
     try:
         with JpegImageFile(BytesIO(data)) as image:
             width, height = image.size
@@ -106,9 +103,7 @@ def _decode_jpeg(path: Path, data: bytes, upright: bool, size: tuple[int, int] |
             check_memory(path, "", f"{width}x{height} pixels", 3 * width * height // factor**2)
             image.draft(image.mode, (width // factor, height // factor))
             image.load()
-            straight = image if image.mode == "RGB" else image.convert("RGB")
-            turn = TURNS.get(orientation)
-            return np.array(straight if turn is None else straight.transpose(turn))
+            return np.array(image if image.mode == "RGB" else image.convert("RGB"))
     except DAMAGED as error:
         found = f"an image that was cut short or changed ({error})"
         raise InputError(path, "", found, "a whole JPEG", "copy it again") from error
@@ -130,17 +125,9 @@ def _rgb8(path: Path, raw: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "H W 
     if raw.dtype != np.uint8:
         raise InputError(path, "", f"{raw.dtype} pixels", "8 or 16 bits a channel")
     raw = raw.reshape(*raw.shape[:2], -1)
-    match raw.shape[2]:
-        case 1:
-            return cv2.cvtColor(raw, cv2.COLOR_GRAY2RGB)
-        case 2:
-            return raw[..., [0, 0, 0, 1]]
-        case 3:
-            return cv2.cvtColor(raw, cv2.COLOR_BGR2RGB)
-        case 4:
-            return cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA)
-        case channels:
-            raise InputError(path, "", f"{channels} channels", "1 to 4")
+    if (channels := raw.shape[2]) not in CONVERSIONS:
+        raise InputError(path, "", f"{channels} channels", "1, 3 or 4")
+    return cv2.cvtColor(raw, CONVERSIONS[channels])
 
 
 def _heic(path: Path, data: bytes) -> UInt8[np.ndarray, "H W C"]:
@@ -157,15 +144,11 @@ def _heic(path: Path, data: bytes) -> UInt8[np.ndarray, "H W C"]:
 def _check_png(path: Path, data: bytes) -> None:
     """Compares the checksums of all chunks, up to the last: some OpenCV versions fill the rest with grey and only warn."""
     at, name = 8, b""
-    while at + 12 <= len(data) and name != b"IEND":
+    while name != b"IEND":
         end = at + 8 + int.from_bytes(data[at : at + 4], "big")
         name = data[at + 4 : at + 8]
-        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            break
+        if len(name) < 4 or zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise InputError(path, "", "an image that was cut short or changed", "a whole PNG", "copy it again")
         at = end + 4
-    else:
-        if name == b"IEND":
-            width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
-            check_memory(path, "", f"{width}x{height} pixels", 3 * width * height)
-            return
-    raise InputError(path, "", "an image that was cut short or changed", "a whole PNG", "copy it again")
+    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+    check_memory(path, "", f"{width}x{height} pixels", 3 * width * height)

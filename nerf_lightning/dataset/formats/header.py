@@ -1,6 +1,7 @@
 """What an image file says before its pixels: size, alpha and EXIF tags, read once a file."""
 
 import importlib.util
+import math
 import struct
 import warnings
 from collections.abc import Mapping
@@ -15,8 +16,8 @@ from PIL.JpegImagePlugin import JpegImageFile
 MAX_HEADERS = 4096
 """Files whose headers are kept in memory."""
 JPEG = b"\xff\xd8"
-ORIENTATION, DETAILS = 0x0112, 0x8769
-"""Numbers of EXIF tags: how the camera was held, and those about how a photo was taken."""
+ORIENTATION, DETAILS, EXPOSURE, APERTURE, SPEED = 0x0112, 0x8769, 0x829A, 0x829D, 0x8827
+"""Numbers of EXIF tags: how the camera was held, those about how a photo was taken, seconds, f-number and ISO speed."""
 QUARTER_TURNS = (5, 6, 7, 8)
 """Orientations of photos that lie on their side."""
 DAMAGED = (OSError, ValueError, SyntaxError, KeyError, TypeError, OverflowError, ZeroDivisionError, struct.error)
@@ -66,15 +67,28 @@ def _read_header(path: Path, size: int, mtime_ns: int) -> Header | None:
             # Image.open refuses photos of 200 megapixels as bombs.
             with JpegImageFile(file) if jpeg else Image.open(file) as image:
                 alpha = "A" in image.getbands() or "transparency" in image.info
-                return Header(*image.size, alpha, _tags(image))
+                return Header(*image.size, alpha, _read_tags(image))
     except (*DAMAGED, Image.DecompressionBombError):
         return None
 
 
-def _tags(image: Image.Image) -> dict[int, Any]:
+def _read_tags(image: Image.Image) -> dict[int, Any]:
     try:
         exif = image.getexif()
         tags = {**exif, **exif.get_ifd(DETAILS)}
         return {tag: value for tag, value in tags.items() if not isinstance(value, bytes)}
     except DAMAGED:
         return {}
+
+
+def stated_exposure(path: Path) -> float | None:
+    """Light that a photo gathered, by its tags: seconds times ISO speed over the squared f-number; None if they do not say."""
+    header = read_header(path)
+    tags = {} if header is None else header.tags
+    try:
+        speed = tags[SPEED]
+        first = speed[0] if isinstance(speed, tuple) else speed  # of two kinds of sensitivity
+        found = float(tags[EXPOSURE]) * float(first) / float(tags[APERTURE]) ** 2
+    except (*DAMAGED, IndexError):
+        return None
+    return found if 0 < found < math.inf else None

@@ -1,14 +1,15 @@
 """Resolves the file names that scene files contain to the files on this disk."""
 
+import itertools
 import logging
 import os
 import re
 import unicodedata
-from collections.abc import Iterator
-from functools import cached_property
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.text import join_truncated
 
 log = logging.getLogger(__name__)
 
@@ -38,110 +39,96 @@ def split_name(name: str) -> tuple[str, ...]:
     return tuple(part for part in parts if part not in ("/", "//", ".") and not part.endswith(":"))
 
 
-def fold_part(part: str) -> str:
-    """A part of a path under Unicode (NFC) and case folding."""
-    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", part).casefold())
-
-
 def fold_name(name: str) -> tuple[str, ...]:
-    """The folded parts of a path, the last without an image's extension."""
-    parts = [fold_part(part) for part in split_name(name)]
-    if parts and PurePosixPath(parts[-1]).suffix in IMAGE_SUFFIXES:
-        parts[-1] = parts[-1].removesuffix(PurePosixPath(parts[-1]).suffix)
-    return tuple(parts)
+    """The parts of a path under Unicode (NFC) and case folding, the last without an image's extension."""
+    parts = split_name(unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold()))
+    if parts and (suffix := PurePosixPath(parts[-1]).suffix) in IMAGE_SUFFIXES:
+        return (*parts[:-1], parts[-1].removesuffix(suffix))
+    return parts
 
 
-class ImageFinder:
-    """Finds the image files that a scene file names.
+def exact_file(root: Path, name: str) -> Path | None:
+    """The file at a path relative to a folder, whose extension may be missing, as Blender exports leave it."""
+    for suffix in ("", *IMAGE_SUFFIXES, *(suffix.upper() for suffix in IMAGE_SUFFIXES)):
+        try:
+            if (candidate := root / (name + suffix)).is_file():
+                return candidate
+        except (OSError, ValueError):  # a name too long, or with a zero byte
+            return None
+    return None
 
-    A name means the exact path relative to `root`, perhaps without its extension, as Blender exports leave it; or else the one
-    file below `root` whose name, and as many of its folders as possible, are the same under Unicode and case folding, with any
-    separators and apart from the extension. Reduced copies, masks and depth maps count only where nothing else has the name.
+
+def find_images(root: Path, names: Sequence[str], where: object) -> list[Path | None]:
+    """The image files that a scene file names; None where there is none.
+
+    A name means the file at that path relative to `root`; or else the one file below `root`, meant by no other name, whose
+    base name, and as many of its folders as possible, are the same under Unicode and case folding, with any separators and
+    apart from the extension. Reduced copies, masks and depth maps count only where nothing else has the name. A line says
+    which names were substituted.
 
     Args:
         root: folder that names are relative to.
+        names: as the file has them.
+        where: the file, for messages.
+
+    Raises:
+        InputError: several files may be meant, or one by two names.
     """
+    found = {name: exact_file(root, name) for name in names}
+    inexact = [name for name, file in found.items() if file is None]
+    free: dict[str, list[Path]] = {}
+    for file in walk_images(root) if inexact else ():
+        if file not in found.values():
+            free.setdefault(fold_name(file.name)[-1], []).append(file)
+    owners: dict[Path, tuple[int, str]] = {}
+    for name in inexact:
+        if (closest := _find_closest(root, name, free, where)) is not None:
+            file, length = closest
+            longest, owner = owners.get(file, (0, name))
+            if length == longest:
+                found_text = f"{owner!r} and {name!r}, of which only {file.relative_to(root)} is there"
+                raise InputError(where, "", found_text, "a photo for each", "is the folder of photos complete?")
+            if length > longest:
+                owners[file] = length, name
+    found |= {name: file for file, (_, name) in owners.items()}
+    moved = {name: file for file, (_, name) in owners.items() if root / Path(*split_name(name)) != file}
+    for name, file in list(moved.items())[:1]:
+        text = "%s: %d names are not those of the files on disk; taken by their base names, such as %s for %r"
+        log.warning(text, where, len(moved), file.relative_to(root).as_posix(), name)
+    return [found[name] for name in names]
 
-    def __init__(self, root: Path):
-        self.root = root
-        self.owners: dict[Path, str] = {}
-        """Files that were found, and the name that led there first."""
-        self.substituted: dict[str, Path] = {}
-        """Names that are not the path of the file they mean, and that file."""
 
-    def find(self, name: str, where: object, key: str) -> Path | None:
-        """The file of a name, or None where there is none. A file that another name has led to is not taken for this one.
+def _find_closest(root: Path, name: str, free: Mapping[str, list[Path]], where: object) -> tuple[Path, int] | None:
+    """The file whose folded path shares most parts with a name, from the last on, and how many."""
+    wanted = fold_name(name)
+    found = free.get(wanted[-1], []) if wanted else []
+    folders = {file: file.relative_to(root).parts[:-1] for file in found}
+    photos = [file for file in found if not any(map(OTHER_FOLDERS.match, folders[file]))] or found
+    lengths = [_count_shared(wanted, fold_name(file.relative_to(root).as_posix())) for file in photos]
+    best = [file for file, length in zip(photos, lengths, strict=True) if length == max(lengths)]
+    same_suffix = [file for file in best if file.suffix.lower() == PurePosixPath(name).suffix.lower()]
+    best = same_suffix if len(same_suffix) == 1 else best
+    if len(best) > 1:
+        shown = ", ".join(file.relative_to(root).as_posix() for file in best[:MAX_SHOWN])
+        raise InputError(where, "", f"{name!r}, which may mean {len(best)} files: {shown}", "the path of one file")
+    return (best[0], max(lengths)) if best else None
 
-        Raises:
-            InputError: several files may be meant, or one by two names; `where` and `key` name the place of the name.
-        """
-        if (file := self.find_exact(name)) is None and (file := self._find_folded(name, where, key)) is not None:
-            self.substituted[name] = file
-        if file is None:
-            return None
-        if (owner := self.owners.setdefault(file, name)) != name and owner in self.substituted:
-            found = f"{owner!r} and {name!r}, of which only {file.relative_to(self.root)} is there"
-            raise InputError(where, key, found, "a photo for each", "is the folder of photos complete?")
-        return file
 
-    def find_exact(self, name: str) -> Path | None:
-        """The file at a path relative to the root, whose extension may be missing."""
-        for suffix in ("", *IMAGE_SUFFIXES, *(suffix.upper() for suffix in IMAGE_SUFFIXES)):
-            try:
-                if (candidate := self.root / (name + suffix)).is_file():
-                    return candidate
-            except (OSError, ValueError):  # a name too long, or with a zero byte
-                return None
-        return None
+def _count_shared(wanted: tuple[str, ...], own: tuple[str, ...]) -> int:
+    """How many parts, from the last on, two paths share."""
+    pairs = zip(reversed(wanted), reversed(own), strict=False)
+    return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
 
-    def _find_folded(self, name: str, where: object, key: str) -> Path | None:
-        wanted = fold_name(name)
-        found = self._files.get(wanted[-1], []) if wanted else []
-        found = [file for file in found if file not in self.owners]
-        for only_photos in (True, False):
-            candidates = [file for file in found if not only_photos or self._is_photo(file)]
-            lengths = [self._common_tail(wanted, file) for file in candidates]
-            best = [file for file, length in zip(candidates, lengths, strict=True) if length == max(lengths)]
-            same_suffix = [file for file in best if file.suffix.lower() == PurePosixPath(name).suffix.lower()]
-            best = same_suffix if len(same_suffix) == 1 else best
-            if len(best) == 1:
-                return best[0]
-            if best:
-                shown = ", ".join(file.relative_to(self.root).as_posix() for file in best[:MAX_SHOWN])
-                found_text = f"{name!r}, which may mean {len(best)} files: {shown}"
-                raise InputError(where, key, found_text, "the path of one file", "correct the path")
-        return None
 
-    def _is_photo(self, file: Path) -> bool:
-        return not any(OTHER_FOLDERS.match(part) for part in file.relative_to(self.root).parts[:-1])
-
-    def _common_tail(self, wanted: tuple[str, ...], file: Path) -> int:
-        """How many parts, from the last on, a folded name and a file share."""
-        own = fold_name(file.relative_to(self.root).as_posix())
-        pairs = list(zip(reversed(wanted), reversed(own), strict=False))
-        return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
-
-    @cached_property
-    def _files(self) -> dict[str, list[Path]]:
-        """All image files below the root, by their folded base names."""
-        found: dict[str, list[Path]] = {}
-        for file in walk_images(self.root):
-            found.setdefault(fold_name(file.name)[-1], []).append(file)
-        return found
-
-    def report(self, where: object) -> None:
-        """Says once which names were substituted by others than their parts in this system's spelling."""
-        moved = {name: file for name, file in self.substituted.items() if self.root / Path(*split_name(name)) != file}
-        if not moved:
-            return
-        name, file = next(iter(moved.items()))
-        log.warning(
-            "%s: %d names are not those of the files on disk; taken by their base names, such as %s for %r",
-            where,
-            len(moved),
-            file.relative_to(self.root).as_posix(),
-            name,
-        )
+def report_missing(where: object, names: Sequence[str], files: Sequence[Path | None]) -> None:
+    """Names the photos that are not there, which are left out."""
+    missing = sorted(name for name, file in zip(names, files, strict=True) if file is None)
+    if 2 * len(missing) > len(names):
+        found = f"{missing[0]!r}, which is not there (nor are {len(missing) - 1} more)"
+        raise InputError(where, "", found, "at least half of the photos", "is the folder of photos in place?")
+    if missing:
+        shown = join_truncated(missing, MAX_SHOWN)
+        log.warning("%s: %d of %d photos are not there, %s: left out", where, len(missing), len(names), shown)
 
 
 def walk_images(root: Path) -> Iterator[Path]:

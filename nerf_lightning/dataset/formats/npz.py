@@ -1,8 +1,8 @@
 """The course format: one .npz file with images, OpenCV camera-to-world poses and a focal length."""
 
 import logging
+import math
 import re
-import zipfile
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -30,9 +30,7 @@ log = logging.getLogger(__name__)
 NEEDED = ("images_train", "c2ws_train")
 PAIRS = {"images_train": "c2ws_train", "images_val": "c2ws_val", "images_test": "c2ws_test"}
 """Images of each split, and their poses."""
-MAX_NUMBERS = 16
-"""In what is neither images nor poses of views: `to_source`, a 4 x 4 matrix, has most."""
-SCALARS = ("focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
+OTHERS = ("focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
 
 
 def load_npz(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -> Scene:
@@ -52,41 +50,36 @@ def load_npz(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -
     Raises:
         InputError: anything missing, malformed or contradictory.
     """
-    known = (*PAIRS, *PAIRS.values(), *SCALARS)
-    data = read_npz(path, known, partial(_check_headers, path))
-    with zipfile.ZipFile(path) as archive:
-        names = {member.removesuffix(".npy") for member in archive.namelist()}
-    if unused := sorted(names - {*known}):
-        log.info("%s: keys that are not used: %s", path, ", ".join(unused))
-    height, width = data["images_train"].shape[1:3]
-    longest = choose_resize(
-        path, [(width, height)] * len(data["c2ws_train"]), data["images_train"].shape[3], reading.resize
-    )
+    data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS), partial(_check_headers, path))
+    count, height, width, channels = data["images_train"].shape
+    longest = choose_resize(path, [(width, height)] * count, channels, reading.resize)
     K = _intrinsics(path, data, width, height)
 
-    def pose(key: str) -> tuple[Float[np.ndarray, "V 4 4"], Cameras]:
-        c2w = checks.rigid_poses(path, key + "[{}]", data[key])
+    def read_poses(key: str) -> tuple[Float[np.ndarray, "V 4 4"], Cameras]:
+        c2w = checks.check_poses(path, key + "[{}]", data[key])
+        checks.check_split_size(path, key, len(c2w))
         return c2w, Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height)
 
-    def read(key: str) -> PosedViews:
-        c2w, cameras = pose(PAIRS[key])
+    def read_views(key: str) -> PosedViews:
+        c2w, cameras = read_poses(PAIRS[key])
         views = Views.of(torch.from_numpy(_bytes(path, key, data[key])), cameras)
         return PosedViews(resize_views(views, longest), c2w)
 
-    train, *held_out = (read(key) for key in PAIRS if key in data)
+    train, *held_out = (read_views(key) for key in PAIRS if key in data)
     if not held_out:
         log.warning("%s: no held-out photos: every %d-th training photo is held out", path, reading.holdout)
         split = split_shots(path, len(train.c2w), reading.holdout)
         train, val = (PosedViews(train.views[torch.tensor(part)], train.c2w[part]) for part in (split.train, split.val))
         held_out = [val]
-    near, far = (checks.number(path, key, data[key]) if key in data else None for key in ("near", "far"))
-    checks.near_far(path, near, far)
+    near, far = (checks.parse_number(path, key, data[key]) if key in data else None for key in ("near", "far"))
+    checks.check_near_far(path, near, far)
+    has_path = "c2ws_test" in data and "images_test" not in data
     hints = Hints(
         keep_frame=True,
-        path=pose("c2ws_test")[1].resized(fit_size(width, height, longest)) if _has_path(data) else None,
+        path=read_poses("c2ws_test")[1].resized(fit_size(width, height, longest)) if has_path else None,
         background=_background(path, data["background"]) if "background" in data else None,
         bounds=_bounds(path, data, reading),
-        to_source=checks.similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,
+        to_source=checks.check_similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,
         near=near,
         far=far,
     )
@@ -94,35 +87,21 @@ def load_npz(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -
     return assemble_scene(path, name, train, held_out[0], held_out[1] if held_out[1:] else None, reading, hints)
 
 
-def _has_path(data: Mapping[str, np.ndarray]) -> bool:
-    """Whether there are poses without photos: a camera path."""
-    return "c2ws_test" in data and "images_test" not in data
-
-
 def _check_headers(path: Path, headers: Headers) -> None:
     """Compares shapes, before anything is unpacked."""
     checks.require_keys(path, headers, NEEDED)
     one = headers["images_train"].shape[1:]
-    for key, pose_key in PAIRS.items():
-        if key in headers:
-            checks.require_keys(path, headers, [pose_key])
-            shape, dtype = headers[key].shape, headers[key].dtype
-            if (
-                len(shape) != 4
-                or shape[3] not in (3, 4)
-                or 0 in shape[1:3]
-                or (dtype != np.uint8 and dtype.kind != "f")
-            ):
-                expected = "images of shape (V, H, W, 3 or 4), uint8 or floats in [0, 1]"
-                raise InputError(path, key, f"shape {shape}, {dtype}", expected)
-            if shape[1:] != one:
-                raise InputError(path, key, f"shape {shape}", f"images of shape {one}, as in images_train")
-            checks.split_size(path, key, shape[0], headers[pose_key].shape[0] if headers[pose_key].shape else 0)
-        elif pose_key in headers:
-            checks.split_size(path, pose_key, headers[pose_key].shape[0] if headers[pose_key].shape else 0)
-    for key in set(headers) & set(SCALARS):
-        if headers[key].size > MAX_NUMBERS:
-            raise InputError(path, key, f"shape {headers[key].shape}", f"at most {MAX_NUMBERS} numbers")
+    for key in (key for key in PAIRS if key in headers):
+        checks.require_keys(path, headers, [PAIRS[key]])
+        (count, *shape), dtype = headers[key].shape or (0,), headers[key].dtype
+        if len(shape) != 3 or shape[2] not in (3, 4) or 0 in shape or (dtype != np.uint8 and dtype.kind != "f"):
+            expected = "images of shape (V, H, W, 3 or 4), uint8 or floats in [0, 1]"
+            raise InputError(path, key, f"shape {headers[key].shape}, {dtype}", expected)
+        if tuple(shape) != one:
+            raise InputError(path, key, f"shape {headers[key].shape}", f"images of shape {one}, as in images_train")
+        checks.check_split_size(path, key, count)
+        if (poses := headers[PAIRS[key]].shape[:1]) != (count,):
+            raise InputError(path, key, f"{count} images for {math.prod(poses)} poses", "one pose for each image")
 
 
 def _bytes(path: Path, key: str, images: Shaped[np.ndarray, "V H W C"]) -> UInt8[np.ndarray, "V H W C"]:
@@ -137,19 +116,17 @@ def _bytes(path: Path, key: str, images: Shaped[np.ndarray, "V H W C"]) -> UInt8
 def _intrinsics(path: Path, data: Mapping[str, np.ndarray], width: int, height: int) -> Float[Tensor, "3 3"]:
     """Of all views, pixels."""
     if "K" in data:
-        K = checks.intrinsics(path, "K", data["K"], width, height)
-        checks.check_principal_point(path, "K", K[0, 2], K[1, 2], width, height)
-        return torch.from_numpy(K).float()
+        return torch.from_numpy(checks.check_intrinsics(path, "K", data["K"], width, height)).float()
     checks.require_keys(path, data, ["focal"])
-    focal = checks.number(path, "focal", data["focal"])
-    checks.focal_length(path, "focal", focal, max(width, height))
-    return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    focal = checks.parse_number(path, "focal", data["focal"])
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return torch.from_numpy(checks.check_intrinsics(path, "focal", K, width, height)).float()
 
 
 def _background(path: Path, colour: Shaped[np.ndarray, "..."]) -> tuple[float, float, float]:
     """sRGB in [0, 1]."""
-    red, green, blue = checks.numeric(path, "background", colour, "3").tolist()
-    if not (min(red, green, blue) >= 0 and max(red, green, blue) <= 1):
+    red, green, blue = checks.parse_array(path, "background", colour, 3).tolist()
+    if min(red, green, blue) < 0 or max(red, green, blue) > 1:
         raise InputError(path, "background", str([red, green, blue]), "three numbers from 0 to 1")
     return red, green, blue
 
@@ -158,11 +135,9 @@ def _bounds(path: Path, data: Mapping[str, np.ndarray], reading: Reading) -> Bou
     """The box that a file states."""
     if "aabb" not in data:
         return None
-    aabb = torch.from_numpy(checks.box(path, "aabb", data["aabb"])).float()
-    flag = data.get("unbounded", np.array(False))
-    if flag.shape != () or flag.dtype != bool:
-        raise InputError(path, "unbounded", f"{flag.dtype}", "one true or false")
-    return Bounds(aabb, bool(flag) if reading.bounded == "auto" else reading.bounded == "false")
+    aabb = torch.from_numpy(checks.check_box(path, "aabb", data["aabb"])).float()
+    unbounded = bool(checks.parse_number(path, "unbounded", data.get("unbounded", np.array(0))))
+    return Bounds(aabb, unbounded if reading.bounded == "auto" else reading.bounded == "false")
 
 
 def save_npz(scene: Scene, path: Path) -> None:

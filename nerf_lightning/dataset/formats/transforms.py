@@ -1,19 +1,20 @@
 """Posed photos in JSON: transforms.json of nerfstudio and instant-ngp, transforms_{train,val,test}.json of the NeRF paper."""
 
 import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.formats.frames import Frame, drop_missing, read_frames
-from nerf_lightning.dataset.formats.intrinsics import read_optics, read_size
-from nerf_lightning.dataset.formats.names import ImageFinder, fold_name
+from nerf_lightning.dataset.formats.decode import image_header
+from nerf_lightning.dataset.formats.frames import Frame, read_frames, read_optics, read_size
+from nerf_lightning.dataset.formats.names import find_images, fold_name, report_missing
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.optics import Optics
-from nerf_lightning.dataset.orientation import OrientationChooser
+from nerf_lightning.dataset.orientation import choose_orientations
 from nerf_lightning.dataset.posed import Hints, Split, build_scene, split_shots
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
@@ -22,6 +23,8 @@ from nerf_lightning.errors import InputError
 log = logging.getLogger(__name__)
 
 WHITE = (1.0, 1.0, 1.0)
+Photo = tuple[Frame, Path]
+"""A frame, and its file."""
 
 
 def load_transforms(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -> Scene:
@@ -39,10 +42,12 @@ def load_transforms(path: Path, name: str | None = None, reading: Reading = AS_I
         InputError: anything missing or malformed, or a lens that is not known here.
     """
     file = path / "transforms.json" if path.is_dir() else path
-    frames = sorted(drop_missing(file, read_frames(file, ImageFinder(file.parent))), key=lambda frame: frame.name)
+    frames = sorted(read_frames(file), key=lambda frame: frame.name)
+    names = [frame.name for frame in frames]
+    photos = keep_present(file, frames, find_images(file.parent, names, file))
     folder = file.resolve().parent
-    split = read_split(frames) or split_shots(file, len(frames), reading.holdout)
-    shots = read_cameras(file, frames, folder, reading)
+    split = read_split(file, frames[0].values, names, [frame.name for frame, _ in photos])
+    shots = make_shots(file, photos, folder, reading)
     return build_scene(path, name or (folder.name if file.stem == "transforms" else file.stem), shots, reading, split)
 
 
@@ -61,118 +66,104 @@ def load_blender(folder: Path, name: str | None = None, reading: Reading = AS_IT
     Raises:
         InputError: anything missing or malformed.
     """
-    finder = ImageFinder(folder)
-    frames: list[Frame] = []
-    indices: dict[str, list[int]] = {}
-    path = None
-    for split in ("train", "val", "test"):
-        file = folder / f"transforms_{split}.json"
-        if split != "train" and not file.is_file():
+    files = {split: folder / f"transforms_{split}.json" for split in ("train", "val", "test")}
+    splits = {split: read_frames(file) for split, file in files.items() if split == "train" or file.is_file()}
+    names = [frame.name for frames in splits.values() for frame in frames]
+    found = dict(zip(names, find_images(folder, names, folder), strict=True))
+    path: Sequence[Frame] | None = None
+    parts: dict[str, list[int]] = {}
+    photos: list[Photo] = []
+    for split, frames in splits.items():
+        images = [found[frame.name] for frame in frames]
+        if split != "train" and not any(images):
+            log.warning("%s: none of its %d photos is there: taken as a camera path", files[split], len(frames))
+            path = frames if path is None or split == "test" else path
             continue
-        found = read_frames(file, finder)
-        if split != "train" and not any(frame.image for frame in found):
-            log.warning("%s: none of its %d photos is there: taken as a camera path", file, len(found))
-            path = found if path is None or split == "test" else path
-            continue
-        found = drop_missing(file, found)
-        indices[split] = list(range(len(frames), len(frames) + len(found)))
-        frames += found
-    shots = read_cameras(folder, frames, folder, reading)
-    held_out = [indices[key] for key in ("val", "test") if key in indices]
+        present = keep_present(files[split], frames, images)
+        parts[split] = list(range(len(photos), len(photos) + len(present)))
+        photos += present
+    shots = make_shots(folder, photos, folder, reading)
+    train, *held_out = parts.values()
     if held_out:
-        parts = Split(indices["train"], held_out[0], held_out[1] if len(held_out) > 1 else [])
+        parted = Split(train, *held_out)
     else:
-        parts = split_shots(folder, len(frames), reading.holdout)
+        parted = split_shots(folder, len(photos), reading.holdout)
         log.warning("%s: no held-out photos: every %d-th training photo is held out", folder, reading.holdout)
     cameras = None if path is None else make_path(path, shots[0].optics)
     hints = Hints(alpha_background=WHITE, keep_frame=True, path=cameras)
-    return build_scene(folder, name or folder.resolve().name, shots, reading, parts, hints)
+    return build_scene(folder, name or folder.resolve().name, shots, reading, parted, hints)
 
 
-def read_split(frames: list[Frame]) -> Split | None:
+def keep_present(file: Path, frames: Sequence[Frame], images: Sequence[Path | None]) -> list[Photo]:
+    """The frames whose photo is there, see `report_missing`."""
+    report_missing(file, [frame.name for frame in frames], images)
+    return [(frame, image) for frame, image in zip(frames, images, strict=True) if image is not None]
+
+
+def read_split(file: Path, content: Mapping[str, Any], names: Sequence[str], present: Sequence[str]) -> Split | None:
     """The split that a file names; None where it names none.
+
+    Args:
+        file: for messages.
+        content: what it says.
+        names: of all its frames.
+        present: those with a photo.
 
     Raises:
         InputError: names that are no frame's, or photos in two parts of it.
     """
-    if not frames:
-        return None
-    file, content = frames[0].file, frames[0].content
-    every = {fold_name(entry["file_path"]) for entry in content["frames"]}
     named: dict[str, list[int]] = {}
     for part in ("train", "val", "test"):
         key = f"{part}_filenames"
         given = content.get(key) or []
         if not isinstance(given, list) or not all(isinstance(item, str) for item in given):
             raise InputError(file, key, repr(given)[:60], "a list of file_path strings")
-        if strangers := [item for item in given if fold_name(item) not in every]:
-            raise InputError(file, key, f"{strangers[0]!r}, which is no frame", "the file_path of a frame")
+        folded = {fold_name(item): item for item in given}
+        if strangers := folded.keys() - set(map(fold_name, names)):
+            raise InputError(file, key, f"{folded[min(strangers)]!r}, which is no frame", "the file_path of a frame")
         if given:
-            names = {fold_name(item) for item in given}
-            named[part] = [i for i, frame in enumerate(frames) if fold_name(frame.name) in names]
+            named[part] = [i for i, name in enumerate(present) if fold_name(name) in folded]
     if not named:
         return None
-    rest = [i for i in range(len(frames)) if not any(i in part for part in named.values())]
+    rest = [i for i in range(len(present)) if not any(i in part for part in named.values())]
     train = named.get("train", rest)
-    held_out = [named[part] for part in ("val", "test") if named.get(part)] or [rest]
-    for views in held_out:
-        if both := sorted(set(views) & set(train)):
-            found = f"{frames[both[0]].name!r}, which is in train_filenames too"
-            raise InputError(file, "val_filenames, test_filenames", found, "held-out photos of their own")
-    checks.split_size(file, "train split", len(train))
-    checks.split_size(file, "val split", len(held_out[0]))
-    test = held_out[1] if len(held_out) > 1 and held_out[1] != held_out[0] else []
-    return Split(train, held_out[0], test)
+    val, *test = [named[part] for part in ("val", "test") if named.get(part)] or [rest]
+    if both := sorted(set(train) & {*val, *(i for part in test for i in part)}):
+        found = f"{present[both[0]]!r}, which is in train_filenames too"
+        raise InputError(file, "val_filenames, test_filenames", found, "held-out photos of their own")
+    return Split(train, val, *(part for part in test if part != val))
 
 
-def read_cameras(source: Path, frames: list[Frame], folder: Path, reading: Reading) -> list[Shot]:
-    """The posed photos of frames that have one.
-
-    Raises:
-        InputError: intrinsics or masks that are none.
-    """
-    orientation = OrientationChooser(reading.orientation)
-    shots: list[Shot] = []
-    masks = read_mask_paths(frames, folder)
-    for frame, mask in zip(frames, masks, strict=True):
-        assert frame.image is not None  # the others were left out
-        stated = read_size(frame)
-        width, height, upright = orientation.choose(frame.image, stated)
-        if stated is not None and stated != (width, height) and not shots:
-            text = "%s: intrinsics are of photos of %dx%d; they are scaled to the photos there, of %dx%d"
-            log.warning(text, source, *stated, width, height)
-        optics = read_optics(frame, *(stated or (width, height)))
-        shots.append(Shot(frame.name, frame.image, frame.c2w, optics, mask, upright))
-    orientation.report(source)
+def make_shots(source: Path, photos: Sequence[Photo], folder: Path, reading: Reading) -> list[Shot]:
+    """Posed photos with their intrinsics and masks."""
+    files = [file for _, file in photos]
+    stated = [read_size(frame) for frame, _ in photos]
+    turned = choose_orientations(source, files, stated, reading.orientation)
+    masks = read_masks(source, photos, folder)
+    shots = []
+    for (frame, file), size, upright, mask in zip(photos, stated, turned, masks, strict=True):
+        optics = read_optics(frame, *(size or image_header(file, upright)[:2]))
+        shots.append(Shot(frame.name, file, frame.c2w, optics, mask, upright))
     return shots
 
 
-def read_mask_paths(frames: list[Frame], folder: Path) -> list[Path | None]:
-    """The masks that frames name, or else those found beside the photos.
-
-    Raises:
-        InputError: a named mask that is not there.
-    """
-    if not any(frame.entry.get("mask_path") for frame in frames):
-        return find_masks([frame.image for frame in frames if frame.image is not None], folder)
-    finder = ImageFinder(folder)
-    masks: list[Path | None] = []
-    for frame in frames:
-        name, key = frame.entry.get("mask_path"), f"{frame.key}.mask_path"
-        if name is None:
-            masks.append(None)
-            continue
+def read_masks(source: Path, photos: Sequence[Photo], folder: Path) -> list[Path | None]:
+    """The masks that frames name, or else those found beside the photos."""
+    named = {frame.where: name for frame, _ in photos if (name := frame.values.get("mask_path")) is not None}
+    if not named:
+        return find_masks([file for _, file in photos], folder)
+    for where, name in named.items():
         if not isinstance(name, str):
-            raise InputError(frame.file, key, repr(name)[:60], "a string")
-        if (mask := finder.find(name, frame.file, key)) is None:
-            found, expected = f"{name!r}, which is not there", "an image, white where the photo is kept"
-            raise InputError(frame.file, key, found, expected)
-        masks.append(mask)
-    finder.report(frames[0].file)
-    return masks
+            raise InputError(where, "mask_path", repr(name)[:60], "a string")
+    found = dict(zip(named, find_images(folder, list(named.values()), source), strict=True))
+    for where, file in found.items():
+        if file is None:
+            expected = "an image, white where the photo is kept"
+            raise InputError(where, "mask_path", f"{named[where]!r}, which is not there", expected)
+    return [found.get(frame.where) for frame, _ in photos]
 
 
-def make_path(frames: list[Frame], optics: Optics) -> Cameras:
+def make_path(frames: Sequence[Frame], optics: Optics) -> Cameras:
     """Pinhole cameras along the poses of frames without photos, with the intrinsics of a photo."""
     c2w = torch.from_numpy(np.stack([frame.c2w for frame in frames]))
     K = torch.from_numpy(optics.K).repeat(len(frames), 1, 1)

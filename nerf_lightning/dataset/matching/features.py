@@ -1,4 +1,4 @@
-"""Matches between photos: what the photos alone tell about the cameras that took them."""
+"""SIFT features of photos and matches between them: what the photos alone tell about the cameras that took them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,14 +6,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.utils.text import subsample
 
-MAX_TRAIN_PHOTOS, MAX_VAL_PHOTOS = 48, 8
-"""Photos that are matched, evenly chosen."""
 MAX_SIDE_PX, MIN_SIDE_PX, MAX_ENLARGEMENT = 320, 256, 3
 """Longest side of a photo when features are detected: larger ones are reduced, smaller ones enlarged."""
 MAX_FEATURES, MAX_COARSE_FEATURES = 400, 128
@@ -58,15 +57,16 @@ class Pair:
         return float(np.median(np.linalg.norm(self.places[:, 1] - self.places[:, 0], axis=1)))
 
 
-def detect_features(image: UInt8[np.ndarray, "H W C"], known: Bool[np.ndarray, "H W"] | None) -> Features:
-    """SIFT features of a photo, where it shows something."""
+def detect_features(views: Views, view: int) -> Features:
+    """SIFT features of one of several photos, where it shows something."""
+    image = views.image(view).numpy()
+    shows = np.ones(image.shape[:2], bool) if views.known is None else views.mask_of(view).numpy()
+    if image.shape[2] == 4:
+        shows = shows & (image[..., 3] > 127)
     height, width = image.shape[:2]
     longest = max(height, width)
     scale = min(max(1.0, min(MIN_SIDE_PX / longest, MAX_ENLARGEMENT)), MAX_SIDE_PX / longest)
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    shows = np.ones((height, width), bool) if known is None else known
-    if image.shape[2] == 4:
-        shows = shows & (image[..., 3] > 127)
     method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     colours = cv2.resize(np.ascontiguousarray(image[..., :3]), size, interpolation=method)
     mask = cv2.resize(shows.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
@@ -84,13 +84,7 @@ def detect_features(image: UInt8[np.ndarray, "H W C"], known: Bool[np.ndarray, "
     return Features(places * [width / size[0], height / size[1]], together)
 
 
-def detect_in_view(views: Views, view: int) -> Features:
-    """The same of one of several photos, where it is not masked."""
-    known = None if views.known is None else views.mask_of(view).numpy()
-    return detect_features(views.image(view).numpy(), known)
-
-
-def match(first: Features, second: Features) -> Float[np.ndarray, "M 2 2"]:
+def match_features(first: Features, second: Features) -> Float[np.ndarray, "M 2 2"]:
     """Places of features that are each other's nearest, and clearly so."""
     if min(len(first.places), len(second.places)) < 2:
         return np.zeros((0, 2, 2))
@@ -103,63 +97,48 @@ def match(first: Features, second: Features) -> Float[np.ndarray, "M 2 2"]:
 
 def count_matches(features: Sequence[Features]) -> Int[np.ndarray, "V V"]:
     """How many of the strongest features of each photo have a match in each other one, and in reverse, whichever is less."""
-    count, absent = len(features), 1e3
-    table = torch.full((count, MAX_COARSE_FEATURES, DESCRIPTOR), absent)
-    for view, one in enumerate(features):
-        some = one.descriptors[:MAX_COARSE_FEATURES]
-        table[view, : len(some)] = some
-    squares = table.square().sum(2)
-    found = torch.zeros(count, count, dtype=torch.long)
-    for view in range(count):
-        mine = table[view][table[view, :, 0] < absent]
-        if not len(mine):
-            continue
-        product = (mine @ table.flatten(0, 1).T).view(len(mine), count, -1)
-        distance = mine.square().sum(1)[:, None, None] + squares - 2 * product
-        nearest, which = distance.min(2)
-        distance.scatter_(2, which[..., None], torch.inf)
-        found[view] = (nearest < MAX_RATIO**2 * distance.amin(2)).sum(0)
-        found[view, view] = 0
+    table = torch.full((len(features), MAX_COARSE_FEATURES, DESCRIPTOR), 1e3)  # far from all, where there are fewer
+    coarse = [one.descriptors[:MAX_COARSE_FEATURES] for one in features]
+    for row, some in zip(table, coarse, strict=True):
+        row[: len(some)] = some
+    nearest = [torch.cdist(some, table).topk(2, dim=2, largest=False).values for some in coarse]
+    found = torch.stack([(two[..., 0] < MAX_RATIO * two[..., 1]).sum(1) for two in nearest]).fill_diagonal_(0)
     return torch.minimum(found, found.T).numpy()
 
 
-def pose_distances(c2w: Float[Tensor, "V 4 4"]) -> Float[np.ndarray, "V V"]:
-    """How far apart cameras are: their distance as a share of their spread, and the chord between their axes."""
-    centres, axes = c2w[:, :3, 3], c2w[:, :3, 2]
-    spread = (centres - centres.mean(0)).norm(dim=1).mean().clamp_min(1e-12)
-    return (torch.cdist(centres, centres) / spread + torch.cdist(axes, axes)).numpy()
-
-
-def find_pairs(views: Views) -> list[Pair]:
-    """Matches between photos that seem to show the same, or whose cameras stand side by side."""
-    features = [detect_in_view(views, view) for view in range(len(views))]
+def find_pairs(features: Sequence[Features], cameras: Cameras) -> list[Pair]:
+    """Matches between photos that seem to show the same, or whose cameras stand side by side and look the same way."""
     counts = count_matches(features)
     by_photo = np.argsort(-counts, axis=1, kind="stable")[:, :PARTNERS_BY_PHOTO]
-    by_pose = np.argsort(pose_distances(views.cameras.c2w), axis=1, kind="stable")[:, 1 : 1 + PARTNERS_BY_POSE]
+    centres, axes = cameras.centres, cameras.c2w[:, :3, 2]
+    spread = (centres - centres.mean(0)).norm(dim=1).mean().clamp_min(1e-12)
+    distance = (torch.cdist(centres, centres) / spread + torch.cdist(axes, axes)).numpy()
+    by_pose = np.argsort(distance, axis=1, kind="stable")[:, 1 : 1 + PARTNERS_BY_POSE]
     candidates = set()
-    for view in range(len(views)):
+    for view in range(len(cameras)):
         alike = [other for other in by_photo[view] if counts[view, other] >= MIN_COARSE_MATCHES]
-        candidates |= {(min(view, int(other)), max(view, int(other))) for other in (*by_pose[view], *alike)}
+        candidates |= {
+            (min(view, int(other)), max(view, int(other))) for other in (*by_pose[view], *alike) if other != view
+        }
+    every = sorted(candidates)
     pairs = []
-    every = sorted(candidate for candidate in candidates if candidate[0] != candidate[1])
     for first, second in (every[i] for i in subsample(len(every), MAX_PAIRS)):
-        places = match(features[first], features[second])
-        if len(places) >= MIN_MATCHES:
-            pair = Pair(first, second, places)
-            if pair.displacement >= MIN_DISPLACEMENT * max(views.cameras.size(first)):
-                pairs.append(pair)
+        pair = Pair(first, second, match_features(features[first], features[second]))
+        if len(pair.places) >= MIN_MATCHES and pair.displacement >= MIN_DISPLACEMENT * max(cameras.size(first)):
+            pairs.append(pair)
     return pairs
 
 
-def verified(pair: Pair, longest: int) -> Bool[np.ndarray, "M"]:
-    """Which matches agree on one fundamental matrix, whatever the cameras.
+def share_consistent(pairs: Sequence[Pair], longest: int) -> float:
+    """Share of the matches that agree on a fundamental matrix of their pair, whatever the cameras.
 
     Args:
-        pair: of photos.
+        pairs: of photos.
         longest: their longest side, pixels.
     """
-    places = pair.places / longest  # one unit for all sizes
-    _, inliers = cv2.findFundamentalMat(
-        places[:, 0], places[:, 1], cv2.FM_RANSAC, EPIPOLAR_TOLERANCE, 0.99, MAX_ITERATIONS
-    )
-    return np.zeros(len(places), bool) if inliers is None else inliers[:, 0] > 0
+    agree: list[Bool[np.ndarray, "M"]] = []
+    for pair in pairs:
+        one, other = (pair.places / longest).transpose(1, 0, 2)  # one unit for all sizes
+        _, inliers = cv2.findFundamentalMat(one, other, cv2.FM_RANSAC, EPIPOLAR_TOLERANCE, 0.99, MAX_ITERATIONS)
+        agree.append(np.zeros(len(one), bool) if inliers is None else inliers[:, 0] > 0)
+    return float(np.concatenate(agree).mean())

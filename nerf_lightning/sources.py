@@ -12,7 +12,6 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from nerf_lightning.dataset.bricks.scene import bricks
 from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PixelDataModule
@@ -21,6 +20,7 @@ from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
 from nerf_lightning.dataset.shots import Reading
 from nerf_lightning.dataset.size import AUTO, AutoResize, parse_resize
+from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.files import atomic, user_path
 from nerf_lightning.utils.options import AtLeast, Count
 

@@ -10,20 +10,19 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.dataset.evidence import detect_in_view, match
-from nerf_lightning.dataset.hypotheses import directions
-from nerf_lightning.dataset.resize import fit_size
+from nerf_lightning.dataset.matching.epipolar import unproject
+from nerf_lightning.dataset.matching.features import detect_features, match_features
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.utils.text import subsample
 
 log = logging.getLogger(__name__)
 
-MAX_PAIRS, MAX_SIDE = 8, 640
-"""Pairs of photos that are matched, and the longest side, in pixels, at which reprojection errors are measured."""
+MAX_PAIRS = 8
+"""Pairs of photos that are matched."""
 MIN_OVERLAP = 0.85
 """Least cosine between the axes of photos that are matched."""
-MAX_ERROR = 2.0
-"""Largest reprojection error of a point, pixels of the reduced photos."""
+MAX_ERROR, MAX_SIDE = 2.0, 640
+"""Largest reprojection error of a point, pixels; of larger photos, as many times more."""
 MIN_PARALLAX = 0.005
 """Least angle between two rays, radians, that tells a depth; farther points are put where it would be that."""
 
@@ -42,20 +41,17 @@ def match_points(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor,
     origin = local[:, :3, 3].median(0).values
     local[:, :3, 3] -= origin
     cameras = replace(views.cameras, c2w=local.float())
-    sizes = torch.tensor([fit_size(width, height, MAX_SIDE) for width, height in views.cameras.sizes.tolist()])
+    pairs = find_neighbours(local)
     found = [torch.zeros(0, 3)]
-    for first, second in neighbours(local):
-        places = match(detect_in_view(views, first), detect_in_view(views, second))
-        if len(places):
-            pair = torch.tensor([first, second])
-            reduced = places * (sizes[pair] / views.cameras.sizes[pair]).numpy()
-            found.append(triangulate(cameras[pair].resized(sizes[pair]), reduced[:, 0], reduced[:, 1]))
+    for pair in pairs:
+        places = match_features(*(detect_features(views, view) for view in pair))
+        found.append(triangulate(cameras[torch.tensor(pair)], torch.from_numpy(places)))
     points = torch.cat(found)
-    log.info("%d points from matches between %d pairs of photos", len(points), len(found) - 1)
+    log.info("%d points from matches between %d pairs of photos", len(points), len(pairs))
     return points.double() + origin
 
 
-def neighbours(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
+def find_neighbours(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
     """Pairs of photos, spread over a capture: one each of which has the median baseline among those that look alike."""
     axes, centres = normalize(c2w[:, :3, 2], dim=1), c2w[:, :3, 3]
     pairs = set()
@@ -70,19 +66,12 @@ def neighbours(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def triangulate(
-    cameras: Cameras, one: Float[np.ndarray, "N 2"], other: Float[np.ndarray, "N 2"]
-) -> Float[Tensor, "M 3"]:
-    """Points that two cameras see where they are said to, in front of both.
-
-    Args:
-        cameras: two.
-        one, other: places in their photos, pixels.
-    """
+def triangulate(cameras: Cameras, places: Float[Tensor, "N 2 2"]) -> Float[Tensor, "M 3"]:
+    """Points that two cameras see where they are said to, in pixels of their photos, in front of both."""
     a, b = (
-        torch.from_numpy(directions(cameras, np.full(len(places), view), torch.from_numpy(places).float()))
+        torch.from_numpy(unproject(cameras, np.full(len(places), view), places[:, view].float()))
         @ cameras.c2w[view, :3, :3].double().T
-        for view, places in enumerate((one, other))
+        for view in (0, 1)
     )
     baseline = (cameras.centres[1] - cameras.centres[0]).double()
     # Least squares for s a - t b = baseline; the angle is held above the least that tells a depth.
@@ -94,8 +83,8 @@ def triangulate(
     is_far = (sine < MIN_PARALLAX) | (s <= 0) | (t <= 0) | (s > farthest)
     points = cameras.centres[0].double() + torch.where(is_far, farthest, s)[:, None] * a
     kept = torch.ones(len(points), dtype=torch.bool)
-    for view, places in enumerate((one, other)):
+    for view in (0, 1):
         pixels, _, seen = cameras.project(points.float(), view)
-        off = (pixels.double() - torch.from_numpy(places)).norm(dim=1)
-        kept &= seen & (off < MAX_ERROR)
+        off = (pixels.double() - places[:, view]).norm(dim=1)
+        kept &= seen & (off < MAX_ERROR * max(1.0, max(cameras.size(view)) / MAX_SIDE))
     return points[kept].float()

@@ -1,1 +1,0 @@
-"""The built-in scene: a model of bricks, traced ray by ray."""

@@ -1,0 +1,137 @@
+"""Mistakes that people make with the cameras of a file."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+Rotations = Float[np.ndarray, "V 3 3"]
+Poses = Float[np.ndarray, "V 4 4"]
+
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""Camera axes of OpenGL in OpenCV's, and the reverse."""
+SIDEWAYS = "turn them, as dataset.orientation=exif does where their EXIF data say so"
+"""What to do about photos that lie on their sides."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Cameras that a file may mean, and what is wrong with it if it does."""
+
+    found: str
+    todo: str
+    c2w: Poses
+    """OpenCV; in no particular world frame, as only relative poses count. Mirrored cameras have det R = -1."""
+    zoom: float = 1.0
+    """Focal length, in those given."""
+    rare: bool = False
+    """Whether hardly anybody errs so: it must explain clearly more than the others."""
+
+
+def list_conventions(c2w: Poses) -> Iterator[Hypothesis]:
+    """What other tools' conventions make of poses; the likeliest first.
+
+    Args:
+        c2w: as read, OpenCV, in the file's world frame.
+    """
+    rotation, centre = c2w[:, :3, :3], c2w[:, :3, 3]
+    transposed = rotation.transpose(0, 2, 1)
+    of_inverse = _apply(-transposed, centre)
+    flips, changes = (np.eye(3), FLIP), list_axis_changes()[1:]
+
+    def suppose(
+        found: str, todo: str, rotation: Rotations, centre: Float[np.ndarray, "V 3"], rare: bool = False
+    ) -> Hypothesis:
+        moved = np.tile(np.eye(4), (len(rotation), 1, 1))
+        moved[:, :3, :3], moved[:, :3, 3] = rotation, centre
+        return Hypothesis(found, todo, moved, rare=rare)
+
+    axes = "camera axes of the other convention: OpenCV has y down and z forward, OpenGL y up and z backward"
+    yield suppose(axes, "negate the second and third column of each rotation", rotation @ FLIP, centre)
+    inverse = "world-to-camera matrices, where camera-to-world ones belong"
+    for flip in flips:
+        yield suppose(inverse, "invert each matrix", transposed @ flip, of_inverse)
+    for left, right in product(flips, repeat=2):
+        found = "transposed rotations beside the cameras' centres"
+        yield suppose(found, "transpose each rotation", left @ transposed @ right, centre)
+    for flip in flips:
+        found = "camera-to-world rotations beside translations of world-to-camera matrices"
+        todo = "put the cameras' centres -R t in the fourth column"
+        yield suppose(found, todo, rotation, _apply(-rotation @ flip, centre))
+    for change in changes:
+        if np.linalg.det(change) < 0:
+            found = "a mirrored world: left-handed axes, or photos that are flipped"
+            todo = "negate one axis, of the world and of the cameras, or flip the photos back"
+        elif change[2, 2] == 1:
+            found, todo = "photos that lie on their sides or upside down in their cameras", SIDEWAYS
+        else:
+            found, todo = "camera axes in another order", "the columns of a rotation are the camera's axes in the world"
+        yield suppose(found, todo, rotation @ change, centre, rare=bool(change[2, 2] != 1))
+        yield suppose(f"{inverse}, of other axes", "invert each matrix", transposed @ change, of_inverse, rare=True)
+    found, todo = "rotations of quaternions in another order", "the order is w, x, y, z"
+    for backward in (False, True):
+        for flip in flips:
+            yield suppose(found, todo, roll_quaternions(rotation @ flip, backward) @ flip, centre)
+        turned = roll_quaternions(transposed, backward).transpose(0, 2, 1)
+        yield suppose(found, todo, turned, _apply(-turned, of_inverse))  # world-to-camera poses keep their translations
+    for flip, change in product(flips, changes):
+        found, todo = "centres in another world frame than rotations", "turn both alike"
+        yield suppose(found, todo, rotation @ flip, centre @ change.T, rare=True)
+
+
+def _apply(matrices: Rotations, vectors: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+    return (matrices @ vectors[..., None])[..., 0]
+
+
+def list_axis_changes() -> list[Float[np.ndarray, "3 3"]]:
+    """The 48 ways to name three axes: the identity, the other rotations, then mirrors."""
+    every = [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+    return sorted(every, key=lambda one: (np.linalg.det(one) < 0, -np.trace(one)))
+
+
+def roll_quaternions(rotation: Rotations, backward: bool) -> Rotations:
+    """Rotations of the same quaternions, had x, y, z, w been read as w, x, y, z, or in reverse."""
+    stored = Rotation.from_matrix(rotation).as_quat()  # x, y, z, w
+    return Rotation.from_quat(np.roll(stored, 2 * backward - 1, axis=1)).as_matrix()
+
+
+def list_orders(names: Sequence[str], c2w: Poses, kept: Int[np.ndarray, "K"]) -> Iterator[Hypothesis]:
+    """Poses in another order than the photos.
+
+    Args:
+        names: of the first photos, which may be in another order.
+        c2w: of all photos.
+        kept: those whose poses count.
+    """
+    every = range(len(names))
+    alphabetical = np.array(sorted(every, key=lambda i: names[i]))
+    numeric = np.array(sorted(every, key=lambda i: _split_numbers(names[i])))
+
+    def suppose(found: str, source: Int[np.ndarray, "V"], target: Int[np.ndarray, "V"]) -> Hypothesis:
+        moved = c2w.copy()
+        moved[target] = c2w[source]
+        return Hypothesis(found, "give each photo its own pose", moved[kept])
+
+    for order in (alphabetical, numeric):
+        for step, where in ((1, "before"), (-1, "after")):
+            # Read: each photo has the pose of the one before it; so its own is at the next.
+            found = f"poses that are those of the photos {where} them in the order of names"
+            yield suppose(found, np.roll(order, -step), order)
+        yield suppose("poses in the reverse order of the photos", order[::-1], order)
+    found = "poses in another order than the photos, whose names sort otherwise as numbers (2, 10) than as text (10, 2)"
+    if (alphabetical != numeric).any():
+        yield suppose(found, alphabetical, numeric)
+        yield suppose(found, numeric, alphabetical)
+
+
+def _split_numbers(name: str) -> list[tuple[int, str]]:
+    """Sorts numbers in a name by their value."""
+    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]

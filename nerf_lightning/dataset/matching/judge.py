@@ -1,0 +1,212 @@
+"""Whether photos and cameras belong together, by the matches between photos: wrong conventions, orders and units are named."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from nerf_lightning.cameras import Cameras, Lenses, has_panoramas, in_other_frame
+from nerf_lightning.dataset.matching.epipolar import Matches, explain, share_explained
+from nerf_lightning.dataset.matching.features import Pair, detect_features, find_pairs, share_consistent
+from nerf_lightning.dataset.matching.hypotheses import Hypothesis, Poses, list_conventions, list_orders
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.utils.text import join_truncated, subsample
+
+MAX_TRAIN_PHOTOS, MAX_VAL_PHOTOS = 48, 8
+"""Photos that are matched, evenly chosen."""
+ZOOMS = tuple(2.0 ** (step / 8) for step in range(-32, 57) if step)
+"""Focal lengths that are tried, in those given: lenses in millimetres are up to a hundred times too short."""
+MIN_PAIRS, MIN_MATCHES = 4, 60
+"""That say anything."""
+MIN_SHARE, MAX_GAP = 0.1, 0.4
+"""Share of the matches that cameras must explain to be believed, and by how much less it may be than what epipolar geometries
+of any cameras explain: with few matches these agree with wrong ones too."""
+MIN_DEVIATIONS = 6.0
+"""Standard deviations by which it must exceed what shuffled poses explain."""
+REFUTED, DOUBTED = 0.5, 0.75
+"""Share of what another hypothesis explains, below which the cameras given are refuted, and doubted."""
+NEARLY = 0.98
+"""Hypotheses that explain this share of the best one's matches are as good: the first counts."""
+FINE_TOLERANCE = 1 / 3
+"""Of the usual one: around a subject that is small beside its distance, wrong focal lengths nearly fit."""
+UNRELATED_TOLERANCE = 5.0
+"""Likewise: poses that are off by a few degrees are inexact, not unrelated."""
+MIN_VIEW_MATCHES, MAX_NAMES = 24, 5
+"""Of a photo, for it to be blamed alone; and names in a message."""
+RARE = 0.85
+"""What a rare mistake's explanation counts for: among many hypotheses some nearly fit photos taken side by side."""
+SHUFFLES = 8
+SURE = 0.65
+"""Share of all matches that agree on epipolar geometries, from which on the cameras are to blame if they do not explain them:
+repeated patterns and bare walls have wrong ones."""
+MANY_PAIRS = 15
+"""That make it doubtful without such certainty."""
+UNRELATED, INEXACT = 0.15, 0.5
+"""Share of what shuffled poses leave unexplained, below which cameras are unrelated to the photos, and inexact."""
+HELD_OUT = 0.35
+"""Share of how well training photos fit, below which held-out ones do not."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A problem with the data that will spoil the result."""
+
+    text: str
+    todo: str = "see the file's convention"
+    hopeless: bool = False
+    """Whether training cannot work at all."""
+    inexact: bool = False
+    """Whether correcting the poses may help."""
+    far_off: bool = False
+    """Whether it is certain that they are wrong."""
+
+
+def judge_cameras(scene: Scene) -> tuple[list[Doubt], bool]:
+    """Compares the cameras of a scene, and what people often mistake them for, with matches between its photos.
+
+    Without enough matches, as between tiny or plain photos, nothing is found and nothing is confirmed; nor is it of photos
+    of all directions.
+
+    Returns:
+        What matches say against the cameras, and whether they confirm the poses: then no look at their geometry is needed.
+    """
+    if has_panoramas(scene.train.cameras):
+        return [], False
+    train, val = subsample(len(scene.train), MAX_TRAIN_PHOTOS), subsample(len(scene.val), MAX_VAL_PHOTOS)
+    parts = [(scene.train, train), (scene.val, val)]
+    cameras = join_cameras(*(views.cameras[torch.tensor(some, dtype=torch.long)] for views, some in parts))
+    pairs = find_pairs([detect_features(views, view) for views, some in parts for view in some], cameras)
+    trained = [pair for pair in pairs if max(pair.first, pair.second) < len(train)]
+    if not has_evidence(trained):
+        return [], False
+    matches = Matches.of(trained, cameras)
+    every = in_other_frame(torch.cat([scene.train.cameras.c2w, scene.val.cameras.c2w]), scene.to_source).numpy()
+    kept = np.array([*train, *(len(scene.train) + i for i in val)])
+    c2w = every[kept]
+    given, free = share_explained(matches, c2w), share_consistent(trained, int(cameras.sizes.max()))
+    chance, needed = 0.0, 0.0
+    zoomed = suppose_focal(matches, c2w, float(cameras.K[:, 0, 0].median()))
+    doubt = None
+    if given < DOUBTED:
+        shuffled = shuffled_shares(matches, c2w, len(train))
+        chance = float(shuffled.mean())
+        needed = max(chance + MIN_DEVIATIONS * float(shuffled.std()), MIN_SHARE, free - MAX_GAP)
+        names = [*scene.train.names, *scene.val.names] or [f"{i:06}" for i in range(len(scene.train))]
+        best, share = choose_best(matches, [*list_conventions(c2w), *list_orders(names, every, kept), zoomed])
+        doubt = None if share < needed else compare(best, share, given)
+    doubt = doubt or wrong_focal(matches, c2w, zoomed, free)
+    if doubt is None and given < DOUBTED and free >= SURE:
+        doubt = wrong_poses(matches, c2w, len(train))
+    elif doubt is None and given < needed and len(trained) >= MANY_PAIRS:
+        found = f"poses that explain {given:.0%} of the matches between photos, shuffled ones {chance:.0%}"
+        doubt = Doubt(found, "check which pose belongs to which photo", inexact=True)
+    if doubt is not None or given < needed:
+        return ([] if doubt is None else [doubt]), False
+    if given >= REFUTED and (lost := find_misplaced(matches, c2w, HELD_OUT * given)):
+        named = join_truncated([scene.train.name(train[view]) for view in lost], MAX_NAMES)
+        found = f"{len(lost)} training photos whose poses do not fit the others: {named}"
+        return [Doubt(found, "", inexact=True)], True
+    tested = [pair for pair in pairs if pair not in trained]
+    held_out = share_explained(Matches.of(tested, cameras), c2w) if has_evidence(tested) else given
+    if held_out - chance >= HELD_OUT * (given - chance):
+        return [], True
+    found = f"held-out photos whose poses explain {held_out:.0%} of the matches, those of training photos {given:.0%}"
+    # Where few matches are right, those of a few held-out photos may all be wrong.
+    is_sure = given >= REFUTED
+    return [Doubt(found, "check which photos and poses each split has", is_sure, True, is_sure)], True
+
+
+def join_cameras(first: Cameras, second: Cameras) -> Cameras:
+    K, c2w, sizes = (torch.cat([getattr(one, key) for one in (first, second)]) for key in ("K", "c2w", "sizes"))
+    lenses = [one.lenses for one in (first, second) if one.lenses is not None]
+    if len(lenses) < 2:
+        return Cameras(K, c2w, sizes)
+    joined = (torch.cat([getattr(one, key) for one in lenses]) for key in ("coefficients", "projection"))
+    return Cameras(K, c2w, sizes, Lenses(*joined))
+
+
+def has_evidence(pairs: Sequence[Pair]) -> bool:
+    """Whether there are enough matches to say anything."""
+    return len(pairs) >= MIN_PAIRS and sum(len(pair.places) for pair in pairs) >= MIN_MATCHES
+
+
+def suppose_focal(matches: Matches, c2w: Poses, focal: float) -> Hypothesis:
+    """The focal length that explains most matches, other than that as read, in pixels."""
+    shares = np.array([share_explained(matches, c2w, zoom, FINE_TOLERANCE) for zoom in ZOOMS])
+    alike = np.array(ZOOMS)[shares >= NEARLY * shares.max()]
+    zoom = float(np.exp(np.log(alike).mean()))
+    todo = "is it in millimetres, or of reduced photos?" if zoom > 1 else "is it that of larger photos?"
+    found = f"a focal length of {focal:.4g} pixels, where about {zoom * focal:.2g} would fit"
+    return Hypothesis(found, todo, c2w, zoom)
+
+
+def wrong_focal(matches: Matches, c2w: Poses, zoomed: Hypothesis, free: float) -> Doubt | None:
+    """Another focal length, if it explains clearly more.
+
+    Args:
+        matches, c2w: see `explain`.
+        zoomed: has it.
+        free: share of the matches that agree on epipolar geometries.
+    """
+    given, share = (share_explained(matches, c2w, zoom, FINE_TOLERANCE) for zoom in (1.0, zoomed.zoom))
+    deviation = np.sqrt(share / len(matches.pair))
+    least = max(MIN_SHARE, free - MAX_GAP, given + MIN_DEVIATIONS * deviation)
+    return None if share < least else compare(zoomed, share, given)
+
+
+def choose_best(matches: Matches, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, float]:
+    """The first of the hypotheses that explain matches best, and the share that it explains."""
+    best, share, quality = hypotheses[0], 0.0, 0.0
+    for hypothesis in hypotheses:
+        # The finer tolerance decides between hypotheses that are nearly the same over the angles of these photos.
+        coarse, fine = (
+            share_explained(matches, hypothesis.c2w, hypothesis.zoom, slack) for slack in (1.0, FINE_TOLERANCE)
+        )
+        score = (coarse + fine) * (RARE if hypothesis.rare else 1.0)
+        if score * NEARLY > quality:
+            best, share, quality = hypothesis, coarse, score
+    return best, share
+
+
+def compare(hypothesis: Hypothesis, share: float, given: float) -> Doubt | None:
+    """That the cameras as read explain too little beside a hypothesis, if they do."""
+    if given >= DOUBTED * share:
+        return None
+    found = (
+        f"{hypothesis.found}: that explains {share:.0%} of the matches between photos, the cameras as read {given:.0%}"
+    )
+    return Doubt(found, hypothesis.todo, given < REFUTED * share)
+
+
+def wrong_poses(matches: Matches, c2w: Poses, count: int) -> Doubt | None:
+    """Poses that explain little more than those of other photos would."""
+    given, chance = (np.zeros(2), np.zeros(2))
+    for i, slack in enumerate((1.0, UNRELATED_TOLERANCE)):
+        given[i] = share_explained(matches, c2w, tolerance=slack)
+        chance[i] = shuffled_shares(matches, c2w, count, slack).mean()
+    skill, loose_skill = (given - chance) / (1 - chance)
+    if skill >= INEXACT:
+        return None
+    found = (
+        f"poses that explain {given[0]:.0%} of the matches between photos, while shuffled ones explain {chance[0]:.0%}:"
+        " they belong to other photos, or are inexact"
+    )
+    unrelated = bool(loose_skill < UNRELATED)
+    return Doubt(found, "check which pose belongs to which photo", unrelated, True, unrelated)
+
+
+def shuffled_shares(matches: Matches, c2w: Poses, count: int, tolerance: float = 1.0) -> Float[np.ndarray, "S"]:
+    """Shares of the matches that the first `count` cameras explain in random orders."""
+    generator = np.random.default_rng(0)
+    orders = [generator.permutation(count) for _ in range(SHUFFLES)]
+    return np.array([share_explained(matches, c2w[order], tolerance=tolerance) for order in orders])
+
+
+def find_misplaced(matches: Matches, c2w: Poses, least: float) -> list[int]:
+    """Views that have enough matches, of which the cameras explain less than a share."""
+    views = matches.views[matches.pair].T.ravel()
+    right = np.bincount(views, np.tile(explain(matches, c2w), 2), len(c2w))
+    count = np.bincount(views, minlength=len(c2w))
+    return np.flatnonzero((count >= MIN_VIEW_MATCHES) & (right < least * count)).tolist()

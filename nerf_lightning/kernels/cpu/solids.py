@@ -1,0 +1,195 @@
+"""Boxes and cylinders, rasterised and shaded; `nerf_lightning.synthetic.tracer` says what they are called with.
+
+Only + - * / and sqrt are used, which IEEE 754 fixes to the last bit, so that images are the same on every machine. Constants
+are single: a double among them would make doubles of all.
+"""
+
+import numpy as np
+from numba import prange
+
+from nerf_lightning.kernels.cpu.compile import inner, kernel
+
+single = np.float32
+ZERO, HALF, ONE, TWO, TINY, INF = (single(number) for number in (0, 0.5, 1, 2, 1e-6, np.inf))
+CHEQUER, STRIPES, BRICKWORK = 1, 2, 3
+LIGHT = (single(4.5), single(5.0), single(10.0))
+"""Position of the key light, world frame; no fall-off with distance."""
+FILL = tuple(single(part) / single(np.sqrt(0.985)) for part in (-0.65, -0.60, 0.45))
+"""Unit direction towards the fill light, which casts no shadow."""
+SKY, FLOOR = np.array([0.30, 0.32, 0.36], np.float32), np.array([0.13, 0.12, 0.10], np.float32)
+KEY_SHARE, FILL_SHARE, JOINT = single(0.80), single(0.32), single(0.09)
+SHADOW_BIAS = single(0.01)
+"""World units a surface may lie behind the shadow map: more than the slope of a texel, less than a stud."""
+
+
+@inner
+def dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inner
+def subtract(a, b):
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@inner
+def transform(m, v):
+    return dot(m[0], v), dot(m[1], v), dot(m[2], v)
+
+
+@inner
+def normalize(v):
+    length = np.sqrt(dot(v, v))
+    return v[0] / length, v[1] / length, v[2] / length
+
+
+@inner
+def cross_slab(o, d):
+    """Distances at which a ray crosses -1 and 1 along one axis, the nearer first."""
+    inverse = ONE / d
+    low, high = (-ONE - o) * inverse, (ONE - o) * inverse
+    return np.minimum(low, high), np.maximum(low, high)
+
+
+@inner
+def enter(cylinder, o, d):
+    """The t at which a ray o + t * d enters the unit cube or cylinder (axis z), from outside; inf where it does not."""
+    # A ray along a face divides by zero: infinities do the right thing, and the nan of one inside a face compares false.
+    near, far = cross_slab(o[2], d[2])
+    if cylinder:
+        # A ray along the axis has no crossing to solve for: tilt it by less than single precision can see.
+        dx, dy = TINY if abs(d[0]) + abs(d[1]) < TINY else d[0], d[1]
+        a = dx * dx + dy * dy
+        # Distance from the axis by the cross product: small numbers stay small where b^2 - ac would cancel.
+        cross = o[0] * dy - o[1] * dx
+        if a < cross * cross:
+            return INF
+        chord, middle = np.sqrt(a - cross * cross), -(o[0] * dx + o[1] * dy)
+        near, far = np.maximum(near, (middle - chord) / a), np.minimum(far, (middle + chord) / a)
+    else:
+        for k in range(2):
+            low, high = cross_slab(o[k], d[k])
+            near, far = np.maximum(near, low), np.minimum(far, high)
+    return near if near < far and near > 0 else INF
+
+
+@kernel
+def rasterize(cylinder, lift, eye, first, last, solid, depth, workers):
+    """Writes what is nearest at each pixel [H, W]: the solid, and t.
+
+    Args:
+        lift: [P, 3, 3], from (u, v, 1) in pixels to a ray's direction in each solid's own frame.
+        eye: [P, 3], the camera there.
+        first, last: [P, 2], column and row where the pixels that a solid may cover begin and end.
+    """
+    height = len(depth)
+    for worker in prange(workers):
+        top, bottom = height * worker // workers, height * (worker + 1) // workers
+        for k in range(len(cylinder)):
+            m, o = lift[k], (eye[k, 0], eye[k, 1], eye[k, 2])
+            for row in range(max(top, first[k, 1]), min(bottom, last[k, 1])):
+                v = single(row) + HALF
+                x, y, z = m[0, 1] * v + m[0, 2], m[1, 1] * v + m[1, 2], m[2, 1] * v + m[2, 2]
+                for col in range(first[k, 0], last[k, 0]):
+                    u = single(col) + HALF
+                    t = enter(cylinder[k], o, (m[0, 0] * u + x, m[1, 0] * u + y, m[2, 0] * u + z))
+                    if t < depth[row, col]:
+                        solid[row, col], depth[row, col] = k, t
+
+
+@inner
+def find_normal(cylinder, unit):
+    """Outward normal at a point of the unit cube or cylinder, and the number of the axis whose face it is on (0: the curve)."""
+    x, y, z = unit
+    radius = np.sqrt(x * x + y * y) if cylinder else abs(x)
+    if abs(z) > radius and (cylinder or abs(z) > abs(y)):
+        return (ZERO, ZERO, np.sign(z)), 2
+    if cylinder:
+        return (x / radius, y / radius, ZERO), 0
+    return ((ZERO, np.sign(y), ZERO), 1) if abs(y) > radius else ((np.sign(x), ZERO, ZERO), 0)
+
+
+@inner
+def has_accent(pattern, period, x, y, z, face):
+    """Whether a pattern shows its second colour, given the place in the solid (from its lower corner) and the face."""
+    # Along the face: u is horizontal on a side, v is vertical; x and y on a top.
+    u, v = y if face == 0 else x, y if face == 2 else z
+    if pattern == CHEQUER:
+        return (np.floor(u / period) + np.floor(v / period)) % 2 == 1
+    if pattern == STRIPES:
+        return np.floor((u + v) / period) % 2 == 1
+    if pattern == BRICKWORK:
+        # Courses one period high of bricks three long, every other course moved by half a brick.
+        course, length = np.floor(v / period), period * single(3)
+        along = (u + (course % TWO) * length / TWO) % length
+        return min(along, v - course * period) < JOINT * period
+    return False
+
+
+@inner
+def is_lit(shadow, solid, point):
+    """Whether the key light reaches a point (world frame) on a solid, or on none of them (-1)."""
+    x, y, z = transform(shadow.rotation.T, subtract(point, LIGHT))
+    size, focal = len(shadow.depth), single(shadow.focal)
+    col = int(min(max(focal * x / z + single(size / 2), ZERO), single(size - 1)))
+    row = int(min(max(focal * y / z + single(size / 2), ZERO), single(size - 1)))
+    # A convex solid never shadows its own lit side, so the same solid in the map needs no bias at all.
+    return shadow.solid[row, col] == solid or z <= shadow.depth[row, col] + SHADOW_BIAS
+
+
+@inner
+def add_colour(solids, shadow, k, point, direction, out):
+    """Adds sRGB of a point on solid k, seen along a unit direction, to out [3]: Lambert, ambient and Blinn-Phong."""
+    place, half = transform(solids.axes[k], subtract(point, solids.centre[k])), solids.half[k]
+    own, face = find_normal(solids.cylinder[k], (place[0] / half[0], place[1] / half[1], place[2] / half[2]))
+    corner = (place[0] + half[0], place[1] + half[1], place[2] + half[2])
+    accent = has_accent(solids.pattern[k], solids.period[k], corner[0], corner[1], corner[2], face)
+    albedo = solids.accent[k] if accent else solids.colour[k]
+    normal = transform(solids.axes[k].T, own)
+    light = normalize(subtract(LIGHT, point))
+    key = max(dot(normal, light), ZERO) * single(is_lit(shadow, k, point))
+    fill = max(dot(normal, FILL), ZERO)
+    highlight = max(dot(normal, normalize(subtract(light, direction))), ZERO)
+    for _ in range(5):  # to the power 32
+        highlight = highlight * highlight
+    highlight = highlight * single(key > 0) * solids.gloss[k]
+    up = (normal[2] + ONE) / TWO
+    for channel in range(3):
+        ambient = FLOOR[channel] + (SKY[channel] - FLOOR[channel]) * up
+        # A square root stands for the sRGB curve.
+        out[channel] += np.sqrt(min(albedo[channel] * (ambient + KEY_SHARE * key + FILL_SHARE * fill) + highlight, ONE))
+
+
+@kernel
+def shade(solids, shadow, K, c2w, solid, depth, rgba, workers):
+    """Writes an image [H, W, 4], straight alpha in bytes, each pixel the mean of n x n samples.
+
+    Args:
+        solids, shadow: see `nerf_lightning.synthetic`.
+        K, c2w: of the camera of n times the pixels.
+        solid, depth: what `rasterize` found for it.
+    """
+    height, width = rgba.shape[:2]
+    n = len(solid) // height
+    for worker in prange(workers):
+        total = np.zeros(3)
+        for row in range(height * worker // workers, height * (worker + 1) // workers):
+            for col in range(width):
+                count = 0
+                total[:] = 0
+                for i in range(row * n, row * n + n):
+                    for j in range(col * n, col * n + n):
+                        if solid[i, j] < 0:
+                            continue
+                        x, y = (j + 0.5 - K[0, 2]) / K[0, 0], (i + 0.5 - K[1, 2]) / K[1, 1]
+                        ray = transform(c2w, (x, y, 1.0))
+                        way, t = (single(ray[0]), single(ray[1]), single(ray[2])), depth[i, j]
+                        point = (c2w[0, 3] + t * way[0], c2w[1, 3] + t * way[1], c2w[2, 3] + t * way[2])
+                        length = single(np.sqrt(x * x + y * y + 1))
+                        direction = (way[0] / length, way[1] / length, way[2] / length)
+                        add_colour(solids, shadow, solid[i, j], point, direction, total)
+                        count += 1
+                # Averaged in sRGB, as a field's renderer composites it, over the samples that hit: alpha says how many did.
+                for channel in range(3):
+                    rgba[row, col, channel] = np.rint(total[channel] / max(count, 1) * 255)
+                rgba[row, col, 3] = np.rint(count / (n * n) * 255)

@@ -1,0 +1,70 @@
+"""The built-in scene: a ray-traced bulldozer of bricks, so that a run needs no download."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf_lightning.cameras import Bounds, look_at, orbit_around
+from nerf_lightning.dataset.scene import BUILT_IN, Scene
+from nerf_lightning.dataset.views import Views
+from nerf_lightning.synthetic.objects import make_cameras
+from nerf_lightning.synthetic.solids import bulldozer
+from nerf_lightning.synthetic.tracer import render_view
+from nerf_lightning.utils.memory import check_memory
+
+RADIUS = 4.0311
+"""Distance of every camera from the origin, as in the NeRF paper's Lego scene."""
+FIELD_OF_VIEW_RAD = 0.6911112
+"""Horizontal; from the same scene."""
+BYTES_PER_POSE = 116
+"""With its intrinsics and size."""
+UP = (0.0, 0.0, 1.0)
+
+
+def bricks(size: int = 200, train_views: int = 100, val_views: int = 10, orbit_views: int = 60) -> Scene:
+    """The bulldozer, seen by cameras like those of the NeRF paper's Lego scene; the same bytes on every run.
+
+    Args:
+        size: width and height of the images in pixels.
+        train_views: how many views to train on, spread over the upper hemisphere.
+        val_views: how many views to hold out, spread likewise, at other directions.
+        orbit_views: how many frames the circle around it has.
+    """
+    views = train_views + val_views
+    what = f"{views:,} pictures of {size:,}x{size:,} pixels, with a pose each,"
+    needed = views * (4 * size**2 + BYTES_PER_POSE) + BYTES_PER_POSE * orbit_views
+    check_memory("bricks", "size, train_views, val_views", what, needed)
+    aabb = torch.from_numpy(bulldozer().aabb).float()
+    centre = aabb.mean(0)
+    orbit = orbit_around(torch.zeros(3), torch.tensor(UP), RADIUS, math.radians(30), orbit_views)
+    return Scene(
+        name="bricks",
+        source=BUILT_IN,
+        train=_render_views(_place_cameras(torch.arange(1, train_views + 1)), size),
+        val=_render_views(_place_cameras(-torch.arange(1, val_views + 1)), size),
+        orbit=make_cameras(orbit, size, size, FIELD_OF_VIEW_RAD),
+        bounds=Bounds(centre + 1.02 * (aabb - centre)),
+        background=(0.0, 0.0, 0.0),
+    )
+
+
+def _render_views(c2w: Float[Tensor, "V 4 4"], size: int) -> Views:
+    cameras = make_cameras(c2w, size, size, FIELD_OF_VIEW_RAD)
+    return Views.of(torch.from_numpy(np.stack([render_view(cameras, view) for view in range(len(cameras))])), cameras)
+
+
+def _place_cameras(index: Tensor) -> Float[Tensor, "V 4 4"]:
+    """Poses on the upper hemisphere, evenly spread whatever their number; no two indices share one.
+
+    The R2 sequence: multiples of 1/g^2 and 1/g modulo 1, with g^3 = g + 1, fill the unit square; equal areas of it map
+    to equal areas of the sphere. The pole and the horizon are left out: there up is undefined, here the plate an edge.
+    """
+    g = 1.324717957244746
+    a, b = ((0.5 + index.double() / g**k) % 1 for k in (2, 1))
+    z, azimuth = 0.03 + 0.94 * a, 2 * math.pi * b
+    ring = (1 - z**2).sqrt()
+    eye = RADIUS * torch.stack([ring * azimuth.cos(), ring * azimuth.sin(), z], dim=-1)
+    return look_at(eye, torch.zeros(3).double(), torch.tensor(UP).double()).float()
