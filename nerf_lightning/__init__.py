@@ -29,10 +29,6 @@ to world; pixel centres lie at +0.5. Lengths are in the scene's own unit, colour
 
 from typing import TYPE_CHECKING, Any
 
-from nerf_lightning.utils.libraries import guard_torchvision
-
-guard_torchvision()  # before anything imports Lightning
-
 if TYPE_CHECKING:
     from nerf_lightning.api import Run, View, compare, load_run, load_scene, rightsize, train
 

@@ -35,11 +35,7 @@ class InputError(ValueError):
         return type(self), (self.place, "", self.found, self.expected, self.todo)
 
 
-class Unwritable(InputError):
-    """A place where nothing can be written."""
-
-
-class NoRoom(Unwritable):
+class NoRoom(InputError):
     """A disk, a quota or a limit on files is full. Told as bad input is: the user can make room and go on."""
 
 

@@ -71,7 +71,7 @@ def test_run_on_mixed_masked_fisheye_photos_writes_outputs(
 
     export_compact(run.path, loss_db=20.0, device="cpu")
     assert (tmp_path / "run/compact.npz").exists()
-    assert len(list(frusta(scene.train, "train", 16))) == len(scene.train)
+    assert len(list(frusta(scene.train, 16))) == len(scene.train)
 
 
 def test_run_nan_pictures_and_corrections_is_collapsed(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

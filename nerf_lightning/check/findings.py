@@ -47,13 +47,12 @@ def find_doubts(scene: Scene) -> list[str]:
 
 def judge_photos(scene: Scene) -> tuple[list[Photo], list[tuple[int, Float[np.ndarray, "4 4"]]]]:
     """All photos in the order of their names with their troubles, and the number and pose of each."""
-    train, val = look_at(scene.train, "train", 1), look_at(scene.val, "held out", 1 + len(scene.train))
+    photos = [*look_at(scene.train, "train"), *look_at(scene.val, "held out")]
     poses = [*scene.train.cameras.c2w.double().numpy(), *scene.val.cameras.c2w.double().numpy()]
-    posed = list(zip([*train, *val], poses, strict=True))
-    posed.sort(key=lambda pair: (not scene.train.names, pair[0].name))
+    posed = sorted(zip(photos, poses, strict=True), key=lambda pair: pair[0].name)
     for number, (photo, _) in enumerate(posed, 1):
         photo.number = number
-    photos = [photo for photo, _ in posed]
+    photos.sort(key=lambda photo: photo.number)
     judge(photos, not scene.bounds.unbounded)
     return photos, [(photo.number, pose) for photo, pose in posed]
 

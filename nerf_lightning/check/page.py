@@ -4,9 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float
 
+from nerf_lightning.check.findings import describe_scene
 from nerf_lightning.check.quality import Photo
+from nerf_lightning.dataset import Scene
+from nerf_lightning.drawing.camera_map import camera_map
+from nerf_lightning.drawing.ink import pixels_of
 from nerf_lightning.drawing.panels import data_url
 from nerf_lightning.utils.html import render_page
 
@@ -14,30 +18,17 @@ HERE = Path(__file__).parent
 
 
 def check_page(
-    name: str,
-    facts: dict[str, str],
-    doubts: Sequence[str],
-    photos: Sequence[Photo],
-    cameras: UInt8[np.ndarray, "H W 3"],
+    scene: Scene, doubts: Sequence[str], photos: Sequence[Photo], poses: list[tuple[int, Float[np.ndarray, "4 4"]]]
 ) -> str:
-    """The page's HTML.
-
-    Args:
-        name: of the scene.
-        facts: what it is, by name.
-        doubts: what is wrong with it, in words.
-        photos: all, with their troubles; those with the most come first.
-        cameras: a map of them.
-    """
+    """The page's HTML, with what is wrong in words, and the photos with the most troubles first."""
     worst_first = sorted(photos, key=lambda photo: (-len(photo.troubles), photo.number))
-    shown = [(photo, data_url(photo.small, "jpeg")) for photo in worst_first]
     return render_page(
         HERE / "check.html",
         [HERE / "check.css"],
-        title=name,
-        facts=facts,
+        title=scene.name,
+        facts=describe_scene(scene),
         doubts=doubts,
-        photos=shown,
+        photos=[(photo, data_url(photo.small, "jpeg")) for photo in worst_first],
         bad=sum(bool(photo.troubles) for photo in photos),
-        map=data_url(cameras, "png"),
+        map=data_url(pixels_of(camera_map(poses, scene, {})), "png"),
     )

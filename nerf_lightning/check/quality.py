@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
+from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.views import Views
 
 SIDE = 400
@@ -27,7 +28,6 @@ THUMB, ALIKE = 48, 10
 class Photo:
     """One photo and what is known of it."""
 
-    number: int
     name: str
     split: str
     """"train" or "held out"."""
@@ -40,11 +40,13 @@ class Photo:
     """Share of pixels whose brightest channel is saturated."""
     under: float
     """Share of pixels that are black."""
+    number: int = 0
+    """On the page."""
     troubles: list[str] = field(default_factory=list)
 
 
-def look_at(views: Views, split: str, first: int) -> list[Photo]:
-    """Measures photos; `first` is the number of the first."""
+def look_at(views: Views, split: str) -> list[Photo]:
+    """Measures photos."""
     found = []
     for view in range(len(views)):
         image = views.image(view).numpy()
@@ -52,15 +54,11 @@ def look_at(views: Views, split: str, first: int) -> list[Photo]:
         if views.known is not None:
             shown &= views.mask_of(view).numpy()
         rgb = np.where(shown[..., None], image[..., :3], 128).astype(np.uint8)
-        height, width = rgb.shape[:2]
-        scale = min(1.0, SIDE / max(height, width))
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+        small = area_resize(rgb, *fit_size(rgb.shape[1], rgb.shape[0], SIDE))
         pixels = rgb[shown] if shown.any() else rgb.reshape(-1, 3)
         name = views.names[view] if views.names else f"{split} {view}"
-        number = first + view
         over, under = (float(np.mean(mask)) for mask in (pixels.max(1) >= BRIGHT, pixels.max(1) <= DARK))
-        found.append(Photo(number, name, split, small, sharpness(rgb), float(pixels.mean() / 255), over, under))
+        found.append(Photo(name, split, small, sharpness(rgb), float(pixels.mean() / 255), over, under))
     return found
 
 
@@ -81,15 +79,17 @@ def judge(photos: Sequence[Photo], plain: bool) -> None:
         photos: all of a scene.
         plain: whether they stand before a plain background, which may be saturated.
     """
-    level = Level.of([photo.sharpness for photo in photos])
+    sharp = np.array([photo.sharpness for photo in photos])
+    usual_sharpness = float(np.median(sharp))
+    spread = 1.4826 * float(np.median(np.abs(sharp - usual_sharpness)))  # as a standard deviation
     brightness = float(np.median([photo.brightness for photo in photos]))
     usual = {side: float(np.median([getattr(photo, side) for photo in photos])) for side in ("over", "under")}
     thumbs = np.stack([cv2.resize(p.small, (THUMB, THUMB), interpolation=cv2.INTER_AREA) for p in photos]).astype(
         np.float32
     )
     for i, photo in enumerate(photos):
-        if level.far_below(photo.sharpness):
-            photo.troubles.append(f"blurred: sharpness {photo.sharpness / level.middle:.0%} of the others'")
+        if photo.sharpness < min(SOFT * usual_sharpness, usual_sharpness - SPREADS * spread):
+            photo.troubles.append(f"blurred: sharpness {photo.sharpness / usual_sharpness:.0%} of the others'")
         for side, word in (("over", "over-exposed"), ("under", "under-exposed")):
             share = getattr(photo, side)
             if share > usual[side] + LOST and not plain:
@@ -101,21 +101,3 @@ def judge(photos: Sequence[Photo], plain: bool) -> None:
             off = np.percentile(np.abs(thumbs[:i] - thumbs[i]).max(3), 99, axis=(1, 2))
             if float(off.min()) < ALIKE:
                 photo.troubles.append(f"doubled: it shows what {photos[int(off.argmin())].name} shows")
-
-
-@dataclass(frozen=True)
-class Level:
-    """What is usual among some figures."""
-
-    middle: float
-    spread: float
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> "Level":
-        """Median, and median absolute deviation as a standard deviation."""
-        array: Float[np.ndarray, "N"] = np.array(values, np.float64)
-        middle = float(np.median(array))
-        return cls(middle, 1.4826 * float(np.median(np.abs(array - middle))))
-
-    def far_below(self, value: float) -> bool:
-        return value < SOFT * self.middle and value < self.middle - SPREADS * self.spread

@@ -87,11 +87,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def find_cause(error: Exception) -> InputError | None:
-    """What the user can mend about an error: bad input, a full disk, or memory that ran out; None for a defect."""
+    """What the user can mend about an error: bad input, a file that cannot be read or written, a torchvision built
+    for another PyTorch, or memory that ran out; None for a defect."""
     if isinstance(error, InputError):
         return error
     if full_disk(error):
         return no_room(getattr(error, "filename", None) or os.getcwd())
+    if isinstance(error, OSError) and error.filename:
+        return InputError(error.filename, "", str(error.strerror), "a file or folder that can be read or written")
+    if "torchvision::" in str(error):  # torchmetrics, which Lightning needs, imports an installed one
+        todo = "pip install --force-reinstall --no-deps torchvision, from the package index that PyTorch came from"
+        return InputError("torchvision", "", str(error), "one built for this PyTorch", todo)
     if isinstance(error, MemoryError | RuntimeError):
         from nerf_lightning.utils.memory import out_of_memory
 

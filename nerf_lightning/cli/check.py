@@ -38,12 +38,10 @@ def check(
     Raises:
         InputError: where there is no scene, or a damaged one.
     """
-    from nerf_lightning.check.findings import describe_scene, find_doubts, judge_photos, record_warnings
+    from nerf_lightning.check.findings import find_doubts, judge_photos, record_warnings
     from nerf_lightning.check.page import check_page
     from nerf_lightning.dataset import PhotoLoadOptions, open_scene
-    from nerf_lightning.drawing.camera_map import camera_map
-    from nerf_lightning.drawing.ink import pixels_of
-    from nerf_lightning.utils.files import atomic, output_path
+    from nerf_lightning.utils.files import output_path, write_text
 
     path = output_path(output or "check.html")
     with record_warnings() as warnings:
@@ -51,11 +49,7 @@ def check(
         found = open_scene(str(scene), options=options)
         doubts = find_doubts(found)
     photos, poses = judge_photos(found)
-    page = check_page(
-        found.name, describe_scene(found), warnings + doubts, photos, pixels_of(camera_map(poses, found, {}))
-    )
-    with atomic(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_text(path, check_page(found, warnings + doubts, photos, poses))
     bad = [f"{photo.name}: {trouble}" for photo in photos for trouble in photo.troubles]
     for line in doubts + bad:
         print(line)

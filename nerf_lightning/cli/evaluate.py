@@ -35,14 +35,13 @@ def evaluate(
         InputError: where the device, the run or the photos are no good, or do not fit each other, or have no such split.
     """
     from dataclasses import replace
-    from statistics import fmean
 
-    from rich.console import Console
+    import pandas as pd
 
     from nerf_lightning.dataset import RayDataModule
     from nerf_lightning.drawing.contact_sheet import contact_sheet
     from nerf_lightning.drawing.panels import result_panel, write_png
-    from nerf_lightning.evaluate.metrics import ViewMetrics, format_table, to_json
+    from nerf_lightning.evaluate.metrics import DIGITS, format_table, to_json
     from nerf_lightning.evaluate.perceptual import SMALLEST, TOO_SMALL, perceptual_distance
     from nerf_lightning.runs.data import data_again
     from nerf_lightning.runs.open import beside, open_run
@@ -60,27 +59,25 @@ def evaluate(
         data.scene = replace(data.scene, val=data.scene.test)
     folder = beside(source) / "evaluation" if output is None else output_path(output)
     distance, reason = perceptual_distance()
-    metrics, results = [], {}
+    rows, results = [], {}
     views = tracked(range(data.held_out_views), data.held_out_views, "held-out views")
     for view, result in enumerate(found.system.evaluate_held_out(data, views)):
         reason = TOO_SMALL if min(result.rgb.shape[:2]) < SMALLEST else reason
         lpips = None if distance is None else distance(result.rgb, result.comparable)
-        metrics.append(ViewMetrics(view, result.psnr, result.ssim, lpips, result.seconds))
+        rows.append((result.psnr, result.ssim, lpips, result.seconds))
         results[view] = result
         if len(results) > worst:
             del results[max(results, key=lambda one: results[one].psnr)]
+    metrics = pd.DataFrame(rows, columns=list(DIGITS), dtype=float)
     evaluation = to_json(metrics, source, data.scene.describe(), where)
     write_json(folder / "views.json", evaluation)
     order = sorted(results, key=lambda view: results[view].psnr)
-    captions = [f"view {view}, {metrics[view].psnr:.2f} dB, SSIM {metrics[view].ssim:.3f}" for view in order]
+    captions = [f"view {view}, {metrics.psnr[view]:.2f} dB, SSIM {metrics.ssim[view]:.3f}" for view in order]
     panels = [result_panel(results[view], "") for view in order]
     write_png(folder / "worst.png", contact_sheet(panels, captions, columns=1))
-    Console(highlight=False, soft_wrap=True).print(format_table(metrics))
-    mean = fmean(one.psnr for one in metrics)
-    views_of_split = f"{len(metrics)} {'test' if split == 'test' else 'held-out'} views"
-    print(
-        f"{data.scene.name}: {mean:.2f} dB over {views_of_split} on {device_in_words(where)}; {folder}/worst.png, views.json"
-    )
+    print(format_table(metrics))
+    views_of_split = f"{len(metrics)} {'test' if split == 'test' else 'held-out'} views on {device_in_words(where)}"
+    print(f"{data.scene.name}: {metrics.psnr.mean():.2f} dB over {views_of_split}; {folder}/worst.png, views.json")
     if reason:
         print(f"no LPIPS: {reason}")
     return evaluation

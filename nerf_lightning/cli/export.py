@@ -106,12 +106,19 @@ def export_compact(
     Args:
         output: FILE.npz; default: compact.npz in the run.
     """
-    from nerf_lightning.export.smallest import compact_run
+    from nerf_lightning.export.smallest import smallest
+    from nerf_lightning.runs.data import data_again
+    from nerf_lightning.runs.folder import plain_config
+    from nerf_lightning.runs.open import open_run
     from nerf_lightning.utils.device import the_device
 
     where, source = the_device(device), find_run(run)
     target = _target(source, output, "compact.npz", (".npz",))
-    return _write(target, *compact_run(source, where, loss_db, precision, photos))
+    found = open_run(source, where)
+    data = data_again(found.cfg, found.scene, photos)
+    compact = smallest(found.system, data, plain_config(found.cfg), loss_db, precision)
+    size = f"{len(compact.content) / 1000:,.1f} kB, {compact.precision} precision"
+    return _write(target, compact.content, f"{size}, held-out PSNR {compact.before:.2f} -> {compact.psnr:.2f} dB")
 
 
 @export.command(name="html")
@@ -137,19 +144,22 @@ def export_html(
         cells: Along a side of the voxels that replace another field; default: as fine as the photos.
         output: FILE.html; default: field.html in the run.
     """
-    from nerf_lightning.export.pages import PageOptions, build_page, write_gallery
+    from functools import partial
+
+    from nerf_lightning.export.pages import build_page, write_gallery
     from nerf_lightning.runs.find import OUTPUTS
     from nerf_lightning.utils.device import the_device
 
-    where, options = the_device(device), PageOptions(cells, precision, loss_db, photos)
+    where = the_device(device)
+    build = partial(build_page, device=where, cells=cells, precision=precision, loss_db=loss_db, photos=photos)
     if all:
         folder = run or OUTPUTS
         target = _target(folder, output, "gallery.html", (".html",))
-        print(f"{target}: {write_gallery(folder, target, where, options)} fields side by side: open it in a browser")
+        print(f"{target}: {write_gallery(folder, target, build)} fields side by side: open it in a browser")
         return target
     source = find_run(run)
     target = _target(source, output, "field.html", (".html",))
-    page, words = build_page(source, where, options)
+    page, words = build(source)
     return _write(target, page.encode(), f"{len(page) / 1000:,.1f} kB, {words}: open it in a browser")
 
 
@@ -161,12 +171,25 @@ def export_transforms(run: RunPath = None, /, *, output: Output = None, photos: 
     Args:
         output: A new folder; default: posed/ in the run.
     """
-    from nerf_lightning.export.photos import write_posed_photos
-    from nerf_lightning.utils.files import output_path
+    from nerf_lightning.dataset import RayDataModule
+    from nerf_lightning.export.photos import write_photos
+    from nerf_lightning.runs.data import data_again
+    from nerf_lightning.runs.folder import load_config
+    from nerf_lightning.runs.scene_file import load_scene
+    from nerf_lightning.utils.files import atomic_folder, output_path
 
     source = find_run(run)
     target = source / "posed" if output is None else output_path(output)
-    print(f"{target}: {write_posed_photos(source, target, photos)}")
+    if target.exists():
+        raise InputError(target, "", "something", "a folder that is not there yet", "give another -o, or remove it")
+    content = load_scene(source)  # a compact file does not know corrected cameras
+    data = data_again(load_config(source), content, photos)
+    if not isinstance(data, RayDataModule):
+        raise InputError(source, "", "a picture's run", "a scene's run")
+    with atomic_folder(target) as temporary:
+        write_photos(data.scene, temporary)
+    cameras = "corrected" if "corrected" in content else "given"
+    print(f"{target}: {len(data.scene.train) + len(data.scene.val)} photos and transforms.json, cameras as {cameras}")
     return target
 
 
@@ -207,16 +230,28 @@ def _write_shape(
     photos: Path | None = None,
 ) -> Path:
     """Writes a mesh, points or voxels."""
-    from nerf_lightning.export.mesh import SUFFIXES, export_shape
+    if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+        raise InputError("export", "box", " ".join(map(str, box)), "the lower, then the upper corner: X Y Z X Y Z")
+    import torch
+
+    from nerf_lightning.export.mesh import SUFFIXES, mesh_file, points_file, training_views, voxels_file
+    from nerf_lightning.export.volume import volume_of
+    from nerf_lightning.runs.open import open_scene_run
     from nerf_lightning.utils.device import the_device
     from nerf_lightning.utils.libraries import require
 
     where, source = the_device(device), find_run(run)
-    suffixes = SUFFIXES[kind]
-    target = _target(source, output, kind + suffixes[0], suffixes)
-    if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
-        raise InputError("export", "box", " ".join(map(str, box)), "the lower, then the upper corner: X Y Z X Y Z")
+    target = _target(source, output, kind + SUFFIXES[kind][0], SUFFIXES[kind])
     if kind != "voxels":
         require("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
-    shape = export_shape(source, where, kind, target.suffix.lower(), resolution, box, threshold, photos)
-    return _write(target, shape.content, shape.words)
+    found = open_scene_run(source, where)
+    volume = volume_of(found, resolution, None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3))
+    if kind == "voxels":
+        content, words = voxels_file(found, volume)
+    elif kind == "points":
+        content, words = points_file(found, training_views(found, photos), volume, threshold)
+    else:
+        suffix = target.suffix.lower()
+        content, words = mesh_file(found, training_views(found, photos), volume, threshold, suffix)
+    size = f"{len(content) / 1e6:,.2f} MB"
+    return _write(target, content, f"{size}, {words}, cells of {volume.cell * found.scale:.4g}")

@@ -81,12 +81,10 @@ def describe_scene(scene: str) -> list[str]:
     from nerf_lightning.config.literal import override_of
     from nerf_lightning.utils.files import user_path
 
-    path = user_path(scene)
     for key in ("+experiment", "dataset"):
-        if scene in {file.stem for file in (conf_dir() / key.lstrip("+")).glob("*.yaml")}:
-            if path.exists():
-                print(f"{scene}: {key}={scene}; ./{scene} means what is here")
+        if scene.isidentifier() and (conf_dir() / key.lstrip("+") / f"{scene}.yaml").is_file():
             return [f"{key}={scene}"]
+    path = user_path(scene)
     if not path.exists():
         raise InputError("rightsize", "scene", scene, "a path, or a name in conf/experiment or conf/dataset")
     kind = "+experiment=picture" if path.suffix.lower() in IMAGES else "dataset=photos"

@@ -12,16 +12,11 @@ from cyclopts import Parameter
 
 from nerf_lightning.config import conf_dir
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import output_path, remove_empty, user_path
+from nerf_lightning.utils.files import remove_empty, user_path
 from nerf_lightning.utils.text import suggest
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
-
-TEXT_KEYS = ("resume", "name", "method", "dataset.path", "dataset.name", "dataset.folder", "dataset.url")
-"""Keys whose values are text, whatever its letters."""
-FOLDER_KEYS = ("hydra.run.dir", "hydra.sweep.dir")
-"""Keys of folders that Hydra makes."""
 
 
 def is_override(word: str) -> bool:
@@ -80,8 +75,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
 
     from nerf_lightning.cli.app import fail, find_cause
     from nerf_lightning.config import resolvers  # noqa: F401  (conf/ uses the resolvers)
-    from nerf_lightning.config.literal import escape, quote_texts
-    from nerf_lightning.config.options import replace_nulls
+    from nerf_lightning.config.literal import escape
 
     def job(cfg: "DictConfig") -> float | None:
         try:
@@ -98,9 +92,10 @@ def run_hydra(overrides: Sequence[str]) -> None:
             fail(known)  # here, as Hydra would print a line of its own
 
     def refuse(message: str) -> None:
-        raise InputError(
-            "command line", "", message, "KEY=VALUE, or flags that --hydra-help lists", _suggest_flag(message)
-        )
+        unknown = re.search(r"--([\w.]+)(=\S+)?", message)
+        plus = "+" if unknown and unknown[1] == "experiment" else ""
+        todo = f"did you mean {plus}{unknown[1]}{unknown[2] or '=...'}?" if unknown else ""
+        raise InputError("command line", "", message, "KEY=VALUE, or flags that --hydra-help lists", todo)
 
     parser = get_args_parser()
     parser.allow_abbrev = False  # --experiment is not --experimental-rerun
@@ -112,8 +107,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
         if ("=" not in word and not word.startswith("~")) or os.path.exists(word):
             todo = f"to train on photos: dataset=photos {shlex.quote(f'dataset.path={word}')}"
             raise InputError("command line", "", word, "KEY=VALUE", todo)
-    given = replace_nulls(_find_experiments(_resume_overrides(overrides)))
-    sys.argv[1:] = _expand_folders(quote_texts(given, (*TEXT_KEYS, *FOLDER_KEYS), flags.multirun or None))
+    sys.argv[1:] = rewrite_overrides(overrides, flags.multirun)
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing a report and exiting with 1
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job)()
@@ -140,9 +134,9 @@ def train_job(cfg: "DictConfig") -> float | None:
 
     hydra: Any = HydraConfig.get()
     if hydra.mode == RunMode.MULTIRUN:
-        from nerf_lightning.training.sweep import job
+        from nerf_lightning.training.job import run_job
 
-        return job(cfg)
+        return run_job(cfg)
     check_run_options(cfg, hydra.runtime.choices)
     from nerf_lightning.runs.owner import own_folder, owned
     from nerf_lightning.training.train import train as train_run
@@ -164,68 +158,35 @@ def train_job(cfg: "DictConfig") -> float | None:
         raise
 
 
-def _resume_overrides(arguments: Sequence[str]) -> list[str]:
-    """A command line that, if it resumes a run, continues in that run's folder and may set any of that run's options."""
-    from nerf_lightning.config.literal import override_of
-
-    resumed = [argument.removeprefix("resume=") for argument in arguments if argument.startswith("resume=")]
-    if not resumed or resumed[-1] in ("", "null"):
-        return [*arguments]
-    folder = user_path(resumed[-1])
-    if folder.is_file():  # Hydra would try to make a folder of this name
-        raise InputError(folder, "", "a file", "the folder of a run", "give resume=FOLDER")
-    # conf/ composes another run than the resumed one, with other options in its groups: ++ sets also those that only this has.
-    options = [f"++{one}" if re.match(r"(?!hydra\.)\w+\.[\w.]+=", one) else one for one in arguments]
-    return [*options, override_of("hydra.run.dir", folder.absolute()) if folder.is_dir() else "hydra.run.dir=${resume}"]
-
-
-def _find_experiments(arguments: Sequence[str]) -> list[str]:
-    """Rewrites +experiment=FILE.yaml so that Hydra finds it: relative to the shipped experiments.
+def rewrite_overrides(words: Sequence[str], sweep: bool) -> list[str]:
+    """A command line as Hydra must be given it: groups set to null, files of experiments, `~`, and text of any letters. One
+    that resumes a run continues in that run's folder and may set any of that run's options.
 
     Raises:
-        InputError: where such a file is no YAML.
+        InputError: for a group that no run can do without, an experiment that is no YAML, and a run that is not there.
     """
-    from nerf_lightning.config.literal import override_of
+    from nerf_lightning.config.literal import FOLDER_KEYS, override_of, quote_texts
+    from nerf_lightning.config.options import replace_nulls
     from nerf_lightning.utils.parsing import read_yaml
 
+    resumes = [word for word in words if word.startswith("resume=") and word not in ("resume=", "resume=null")]
     rewritten = []
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key == "+experiment" and value.endswith(".yaml") and (path := user_path(value)).is_file():
-            read_yaml(path, "an experiment in YAML")  # Hydra reads without limits
-            argument = override_of(key, os.path.relpath(path.with_suffix(""), conf_dir() / "experiment"))
-        rewritten.append(argument)
-    return rewritten
-
-
-def _expand_folders(arguments: Sequence[str]) -> list[str]:
-    """Rewrites the folders that Hydra makes, with ~ filled in.
-
-    Raises:
-        InputError: where there can be no such folder.
-    """
-    from nerf_lightning.config.literal import override_of, parse_argument
-
-    rewritten = []
-    for argument in arguments:
-        key = argument.partition("=")[0]
-        parsed = parse_argument(argument) if key in FOLDER_KEYS else None
-        if parsed is not None and isinstance(text := parsed.value(), str) and "${" not in text:
-            folder = output_path(text)
-            if folder.exists() and not folder.is_dir():
-                raise InputError(folder, "", "a file", f"a folder to write into ({key})", "give another one")
-            argument = override_of(key, folder)
-        rewritten.append(argument)
-    return rewritten
-
-
-def _suggest_flag(message: str) -> str:
-    """What may be meant by a flag that Hydra does not know, such as --experiment=lego."""
-    found = re.search(r"--([\w.]+)(=\S+)?", message)
-    if found is None:
-        return ""
-    key = f"+{found[1]}" if found[1] == "experiment" else found[1]
-    return f"did you mean {key}{found[2] or '=...'}?"
+    for word in replace_nulls(words):
+        key, _, value = word.partition("=")
+        if key == "+experiment" and value.endswith(".yaml") and (file := user_path(value)).is_file():
+            read_yaml(file, "an experiment in YAML")  # Hydra reads without limits
+            word = override_of(key, os.path.relpath(file.with_suffix(""), conf_dir() / "experiment"))
+        elif key in FOLDER_KEYS and value.startswith("~"):
+            word = override_of(key, user_path(value))
+        elif resumes and re.match(r"(?!hydra\.)\w+\.[\w.]+=", word):
+            word = f"++{word}"  # conf/ composes another run: this sets also what only the resumed one has
+        rewritten.append(word)
+    if resumes:
+        folder = user_path(resumes[-1].removeprefix("resume="))
+        if not folder.is_dir():
+            raise InputError(folder, "", "no folder", "the folder of a run", "give resume=FOLDER")
+        rewritten.append(override_of("hydra.run.dir", folder.absolute()))
+    return quote_texts(rewritten, sweep)
 
 
 def translate_error(error: Exception) -> InputError:

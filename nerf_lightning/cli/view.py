@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 from nerf_lightning.cli.command import Device, command
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.find import OUTPUTS, find_run
+from nerf_lightning.runs.find import OUTPUTS, find_run, is_run
 from nerf_lightning.utils.options import AtLeast, AtMost, Count, Port
 from nerf_lightning.utils.signals import Interrupted
 
@@ -69,16 +69,16 @@ def has_run(path: Path) -> bool:
     import zipfile
 
     path = path.expanduser()
-    if path.is_file():
-        try:
-            with zipfile.ZipFile(path) as file:
-                return "header.npy" in file.namelist()
-        except (OSError, zipfile.BadZipFile):  # whatever reads it says what is wrong
-            return False
-    if (path / "config.yaml").is_file() or path.absolute() == OUTPUTS.absolute():
+    if is_run(path) or path.absolute() == OUTPUTS.absolute():
         return True
-    scene = any(path.glob("*.json")) or any((path / name).exists() for name in ("images", "sparse", "poses_bounds.npy"))
-    return not scene and any(file.with_name("checkpoints").is_dir() for file in path.rglob("config.yaml"))
+    if not path.is_file():
+        scene = any(path.glob("transforms*.json")) or any((path / name).exists() for name in ("images", "sparse"))
+        return not scene and any(is_run(file.parent) for file in path.rglob("config.yaml"))
+    try:
+        with zipfile.ZipFile(path) as file:
+            return "header.npy" in file.namelist()
+    except (OSError, zipfile.BadZipFile):  # whatever reads it says what is wrong
+        return False
 
 
 def _open_scene(path: Path, resize: int | str | None, holdout: int, host: str, port: int) -> "Page":

@@ -12,8 +12,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, Quote, QuotedString, ValueType
 from hydra.errors import HydraException
 
-from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import user_path
+TEXT_KEYS = ("resume", "name", "method", "dataset.path", "dataset.name", "dataset.folder", "dataset.url")
+"""Keys whose values are text, whatever its letters."""
+FOLDER_KEYS = ("hydra.run.dir", "hydra.sweep.dir")
+"""Keys of folders that Hydra makes: text, too, and always one value."""
 
 
 def escape(value: Any) -> Any:
@@ -28,70 +30,46 @@ def escape(value: Any) -> Any:
 
 
 def override_of(key: str, text: str | os.PathLike[str]) -> str:
-    """The command-line argument that sets a key to text, whatever its letters are: quoted where that is needed."""
-    literal = escape(os.fspath(text))
-    return f"{key}={literal if _means(parse_argument(f'{key}={literal}'), literal) else _quote(literal)}"
+    """The command-line argument that sets a key to text, whatever its letters are."""
+    return f"{key}={_quote(key, escape(os.fspath(text)))}"
 
 
-def parse_argument(argument: str) -> Override | None:
+def quote_texts(arguments: Sequence[str], sweep: bool) -> list[str]:
+    """Quotes values that Hydra would not read as the text they are: those of text keys, and all that it cannot parse.
+
+    The name of an existing file or folder is literal. Other text may hold interpolations, be quoted by the user, or be a list
+    in brackets; in a sweep it may be several values, separated by commas.
+    """
+    return [_quote_value(argument, sweep) for argument in arguments]
+
+
+def _quote_value(argument: str, sweep: bool) -> str:
+    key, _, value = argument.partition("=")
+    if value in ("", "null") or key.startswith(("-", "~")):
+        return argument
+    parsed, name = _parse(argument), key.lstrip("+")
+    if name not in (*TEXT_KEYS, *FOLDER_KEYS):
+        return argument if parsed else f"{key}={_quote(key, value)}"
+    if os.path.exists(os.path.expanduser(value)):
+        return override_of(key, value)
+    is_function = parsed and parsed.is_sweep_override() and parsed.value_type is not ValueType.SIMPLE_CHOICE_SWEEP
+    if parsed and (value[0] in "'\"[" or (sweep and is_function)):
+        return argument
+    values = [one.strip() for one in value.split(",")] if sweep and name in TEXT_KEYS else [value]
+    return f"{key}={','.join(_quote(key, one) for one in values)}"
+
+
+def _quote(key: str, text: str) -> str:
+    """Text in quotes, where Hydra would not read it as it is."""
+    parsed = _parse(f"{key}={text}")
+    if parsed is not None and not parsed.is_sweep_override() and parsed.value() == text:
+        return text
+    return QuotedString(text, Quote.single).with_quotes()
+
+
+def _parse(argument: str) -> Override | None:
     """An argument as Hydra reads it; None where it cannot."""
     try:
         return OverridesParser.create().parse_override(argument)
     except HydraException:
         return None
-
-
-def quote_texts(arguments: Sequence[str], keys: Sequence[str], sweep: bool | None = False) -> list[str]:
-    """Quotes values that Hydra would not read as the text they are: those of some keys, and all that it cannot parse.
-
-    The name of an existing file or folder is literal. Other text may hold interpolations, be quoted by the user, or be a list
-    in brackets; in a sweep it may be several values, separated by commas.
-
-    Args:
-        arguments: of the command line.
-        keys: whose values are text, such as paths.
-        sweep: whether several values make several jobs; None where an experiment may say so.
-    """
-    return [argument if argument.startswith(("-", "~")) else _quoted(argument, keys, sweep) for argument in arguments]
-
-
-def _quoted(argument: str, keys: Sequence[str], sweep: bool | None) -> str:
-    key, equals, value = argument.partition("=")
-    if not equals or value in ("", "null"):
-        return argument
-    parsed = parse_argument(argument)
-    if key.lstrip("+") not in keys:
-        return argument if parsed else f"{key}={_quote(value)}"
-    values = [value] if key.startswith("hydra.") else [one.strip() for one in value.split(",")]
-    if _exists(value):
-        if sweep and len(values) > 1:
-            print(f"{key}={value}: one value, as there is a file or folder of this name")
-        return override_of(key, value)
-    if parsed and (value[0] in "'\"[" or (sweep and _is_function(parsed))):
-        return argument
-    if len(values) > 1 and all(values) and (sweep or (sweep is None and all(map(_exists, values)))):
-        if sweep:
-            print(f"{key}: {len(values)} values to sweep: {' | '.join(values)}")
-        return f"{key}={','.join(_quoted(f'{key}={one}', keys, False).partition('=')[2] for one in values)}"
-    return argument if _means(parsed, value) else f"{key}={_quote(value)}"
-
-
-def _quote(value: str) -> str:
-    return QuotedString(value, Quote.single).with_quotes()
-
-
-def _means(parsed: Override | None, text: str) -> bool:
-    """Whether Hydra reads an argument's value as exactly this text."""
-    return parsed is not None and not parsed.is_sweep_override() and parsed.value() == text
-
-
-def _is_function(parsed: Override) -> bool:
-    """Whether it is one of Hydra's sweeps, such as choice(a,b), but for values separated by commas."""
-    return parsed.is_sweep_override() and parsed.value_type is not ValueType.SIMPLE_CHOICE_SWEEP
-
-
-def _exists(text: str) -> bool:
-    try:
-        return user_path(text).exists()
-    except (InputError, OSError):  # told where the path is opened
-        return False

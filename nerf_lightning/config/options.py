@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerf_lightning.config import conf_dir
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.options import AtLeast, AtMost, Count, Seed, check_options
+from nerf_lightning.utils.options import AtMost, Count, Seed, check_options
 
 OPTIONAL_GROUPS = ("callbacks", "logger", "recipe", "refine", "renderer", "sampler")
 """Groups that a run can do without: a 2D field has no sampler and no renderer."""
@@ -47,7 +47,7 @@ class RunOptions:
     refine: dict | None = None
     callbacks: dict | None = None
     logger: dict | None = None
-    render: dict[str, Annotated[float, AtLeast(0)] | None] | None = None
+    render: dict | None = None
     """Of an experiment with a 2D field: `scale` of the enlarged image."""
 
 

@@ -4,7 +4,6 @@ import hashlib
 import sys
 from collections.abc import Sequence
 
-import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
@@ -28,11 +27,8 @@ def sweep_folder(arguments: Sequence[str]) -> str:
     It is named after the run's name (or else the experiment) and all other options given; flags, Hydra's own settings and
     `overwrite` do not count.
     """
-    given: dict[str, str] = {}
-    for argument in arguments:
-        key, equals, value = argument.lstrip("+").partition("=")
-        if (equals or key.startswith("~")) and not key.startswith(("-", "hydra.", "hydra/")):
-            given[key] = value
+    words = [word.lstrip("+") for word in arguments if not word.startswith("-")]
+    given = dict(word.partition("=")[::2] for word in words if not word.startswith(("hydra.", "hydra/")))
     experiment = given.pop("experiment", "run")
     name = given.pop("name", experiment)
     given.pop("overwrite", None)
@@ -52,21 +48,14 @@ def job_name(overrides: Sequence[str], fixed: Sequence[str]) -> str:
 
 
 def recipe_of(recipe: str | None, model: str) -> str | None:
-    """The recipe, if the model chosen is the recipe's; None for another one, as in `+experiment=lego model=mlp`."""
-    file = conf_dir() / "recipe" / f"{recipe}.yaml"
-    if not file.is_file():
-        return recipe  # a user's own, in another folder
-    for entry in yaml.safe_load(file.read_text(encoding="utf-8"))["defaults"]:
-        if isinstance(entry, str):
-            return recipe if recipe_of(entry, model) else None
-        if "override /model" in entry:
-            return recipe if entry["override /model"] == model else None
-    return recipe
+    """The recipe, if the model chosen is the recipe's, after which it is named; None for another one, as in
+    `+experiment=lego model=mlp`. A user's own, in another folder, may have any name."""
+    shipped = (conf_dir() / "recipe" / f"{recipe}.yaml").is_file()
+    return None if shipped and not str(recipe).startswith(f"{model}_") else recipe
 
 
 def register() -> None:
     """Registers the resolvers. Values from the command line are cached, so that jobs keep them."""
-
     OmegaConf.register_new_resolver("sweep_folder", lambda: sweep_folder(sys.argv[1:]), use_cache=True, replace=True)
     OmegaConf.register_new_resolver("fixed_keys", lambda: fixed_keys(sys.argv[1:]), use_cache=True, replace=True)
     OmegaConf.register_new_resolver("job_name", job_name, replace=True)

@@ -1,59 +1,30 @@
 """Quality of each view, as a table and as plain values."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
 
+import pandas as pd
 import torch
-from rich.table import Table
 
 from nerf_lightning.utils.files import known
 from nerf_lightning.utils.machine import describe_machine
 
-
-@dataclass(frozen=True)
-class ViewMetrics:
-    """How good one view is."""
-
-    view: int
-    psnr: float
-    ssim: float
-    """nan for views smaller than its window."""
-    lpips: float | None
-    seconds: float
-    """Of rendering."""
+DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "seconds": 3}
+"""Decimals of a view's figures. SSIM is nan for views smaller than its window, LPIPS where it cannot be computed."""
 
 
-def format_table(metrics: list[ViewMetrics]) -> Table:
+def format_table(views: pd.DataFrame) -> str:
     """All views, the worst marked, and their means."""
-    lowest = min(metrics, key=lambda one: one.psnr)
-    drawn = Table("view", "PSNR, dB", "SSIM", "LPIPS", "seconds", box=None)
-    for one in metrics:
-        mark = " <- worst" if one is lowest and len(metrics) > 1 else ""
-        drawn.add_row(*_format_row(str(one.view), vars(one), mark))
-    drawn.add_row(*_format_row("mean", average(metrics)))
-    return drawn
+    rows = pd.concat([views, views.mean(skipna=False).to_frame("mean").T])
+    table = pd.DataFrame({name: rows[name].map(f"{{:.{digits}f}}".format) for name, digits in DIGITS.items()})
+    worst = views["psnr"] == views["psnr"].min()
+    table[""] = ["<- worst" if mark and len(views) > 1 else "" for mark in (*worst, False)]
+    names = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS"}
+    return table.rename(columns=names).replace("nan", "-").to_string()
 
 
-def _format_row(name: str, figures: dict[str, float | None], mark: str = "") -> tuple[str, ...]:
-    digits = {"psnr": 2, "ssim": 4, "lpips": 4, "seconds": 3}
-    *cells, seconds = ("-" if known(figures[key]) is None else f"{figures[key]:.{n}f}" for key, n in digits.items())
-    return name, *cells, seconds + mark
-
-
-def average(metrics: list[ViewMetrics]) -> dict[str, float | None]:
-    """The mean of each figure over the views; None where a view lacks it."""
-    means: dict[str, float | None] = {}
-    for name in ("psnr", "ssim", "lpips", "seconds"):
-        values = [value for one in metrics if (value := known(getattr(one, name))) is not None]
-        means[name] = fmean(values) if len(values) == len(metrics) else None
-    return means
-
-
-def to_json(
-    metrics: list[ViewMetrics], source: Path, scene: dict[str, object], device: torch.device
-) -> dict[str, object]:
-    """The evaluation as plain values."""
-    views = [known(vars(one)) for one in metrics]
+def to_json(views: pd.DataFrame, source: Path, scene: dict[str, object], device: torch.device) -> dict[str, object]:
+    """The evaluation as plain values; the mean of a figure that some view lacks is None."""
     machine = {"device": str(device), "machine": describe_machine(device)}
-    return {"run": str(source), "scene": scene, **machine, "mean": average(metrics), "views": views}
+    records = views.reset_index(names="view").to_dict("records")
+    figures = {"mean": known(views.mean(skipna=False).to_dict()), "views": known(records)}
+    return {"run": str(source), "scene": scene, **machine, **figures}

@@ -27,9 +27,8 @@ def perceptual_distance() -> tuple[Distance | None, str]:
     """
     try:
         importlib.import_module("torchvision")
-    except ImportError as error:  # not there, or see utils/libraries.py
-        missing = "torchvision is not installed: pip install 'nerf_lightning[lpips]'"
-        return None, missing if str(error).startswith("No module") else str(error)
+    except ImportError:
+        return None, "torchvision is not installed: pip install 'nerf_lightning[lpips]'"
     weights = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS
     if not weights.exists():
         return None, f"{weights} is not there"

@@ -1,10 +1,8 @@
 """Meshes, point clouds and voxel grids for other programs, in the place and at the scale of the photos' own file."""
 
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,9 +17,9 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.export.shapes import encode_mesh, encode_ply, format_offset
 from nerf_lightning.export.smallest import MOST_VIEWS, some_cameras
 from nerf_lightning.export.surface import Surface, find_surface, lit_cells
-from nerf_lightning.export.volume import PLACES, Volume, volume_of
+from nerf_lightning.export.volume import PLACES, Volume
 from nerf_lightning.runs.data import data_again
-from nerf_lightning.runs.open import SceneRun, open_scene_run
+from nerf_lightning.runs.open import SceneRun
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.text import subsample
 
@@ -34,45 +32,11 @@ OFFSETS = {".stl": "offset {} subtracted, see the header", ".glb": "offset {} in
 """How messages state it, by format: single precision does not hold coordinates that are large for the mesh's size."""
 
 
-@dataclass(frozen=True)
-class Shape:
+class Shape(NamedTuple):
     """A file's content, and what it holds in words."""
 
     content: bytes
     words: str
-
-
-def export_shape(
-    source: Path,
-    device: torch.device,
-    kind: str,
-    suffix: str,
-    resolution: int | None = None,
-    box: Sequence[float] | None = None,
-    threshold: float | None = None,
-    photos: Path | None = None,
-) -> Shape:
-    """A run as a mesh, points or voxels.
-
-    Args:
-        source: the run.
-        kind, suffix: see `SUFFIXES`.
-        resolution: cells along the longest side; None takes about the photos' resolution.
-        box: lower and upper corner in the frame of the photos' own file; None takes all.
-        threshold: see `find_surface`.
-        photos: where the photos are, if they have moved.
-    """
-    run = open_scene_run(source, device)
-    corners = None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3)
-    volume = volume_of(run, resolution, corners)
-    if kind == "voxels":
-        shape = voxels_file(run, volume)
-    elif kind == "points":
-        shape = points_file(run, training_views(run, photos), volume, threshold)
-    else:
-        shape = mesh_file(run, training_views(run, photos), volume, threshold, suffix)
-    words = f"{len(shape.content) / 1e6:,.2f} MB, {shape.words}, cells of {volume.cell * run.scale:.4g}"
-    return Shape(shape.content, words)
 
 
 def training_views(run: SceneRun, photos: Path | None = None) -> Cameras:
@@ -102,13 +66,6 @@ def colours_at(system: NeRF3D, places: Float[Tensor, "N 3"], outwards: Float[Ten
     return to_bytes(torch.cat([torch.zeros(0, 3), *parts]))
 
 
-def upright(run: SceneRun) -> Float[ndarray, "4 4"]:
-    """The rotation from the photos' frame, whatever is up in it, to the scene's, whose z axis points up."""
-    turn = np.eye(4)
-    turn[:3, :3] = np.linalg.inv(run.to_source[:3, :3].numpy()) * run.scale
-    return turn
-
-
 def coloured_mesh(
     run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None
 ) -> tuple["trimesh.Trimesh", Surface]:
@@ -128,10 +85,10 @@ def coloured_mesh(
 def mesh_file(run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None, suffix: str) -> Shape:
     """A coloured mesh as .ply, .obj or .glb; its triangles alone as .stl."""
     mesh, surface = coloured_mesh(run, cameras, volume, threshold)
-    content, offset = encode_mesh(mesh, suffix, upright(run))
+    content, offset = encode_mesh(mesh, suffix, run.to_source[:3, :3].T.numpy() / run.scale)
     words = [
         f"{len(mesh.faces):,} triangles",
-        "watertight" if mesh.is_watertight else f"{open_edges(mesh)} open edges",
+        "watertight" if mesh.is_watertight else "with open edges",
         " x ".join(f"{side:.4g}" for side in mesh.extents) + " in the photos' unit",
         f"surface at opacity {surface.threshold:.2f}",
         *([f"{surface.floaters} floating pieces left out"] if surface.floaters else []),
@@ -172,9 +129,3 @@ def voxels_file(run: SceneRun, volume: Volume) -> Shape:
     np.savez_compressed(file, **arrays)
     shape = " x ".join(map(str, solid.shape))
     return Shape(file.getvalue(), f"{shape} cells, {len(index):,} of them not empty")
-
-
-def open_edges(mesh: "trimesh.Trimesh") -> int:
-    """Edges that do not lie between exactly two triangles."""
-    _, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
-    return int((counts != 2).sum())

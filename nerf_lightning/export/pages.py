@@ -1,7 +1,6 @@
 """Runs as web pages: of a scene, of an image, and of all runs of a folder side by side."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -21,7 +20,7 @@ from nerf_lightning.runs.folder import RunFolder, plain_config
 from nerf_lightning.runs.index import FIELD_PAGE, find_runs, read_run, varied
 from nerf_lightning.runs.open import open_run
 from nerf_lightning.system import NeRF2D, NeRF3D
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import write_text
 from nerf_lightning.utils.html import address_from
 from nerf_lightning.utils.text import subsample
 
@@ -29,34 +28,33 @@ MAX_PHOTOS = 100
 """To look through on a page."""
 
 
-@dataclass(frozen=True)
-class PageOptions:
-    """How a field is put into a page."""
-
-    cells: int | None = None
-    """Along a side of the voxels that replace another field; None chooses."""
-    precision: str | None = None
-    loss_db: float = 0.1
-    """See `smallest`."""
-    photos: Path | None = None
-    """Where the photos are, if they have moved."""
-
-
-def build_page(source: Path, device: torch.device, options: PageOptions) -> tuple[str, str]:
-    """A run as a web page, and what to say of it."""
+def build_page(
+    source: Path,
+    device: torch.device,
+    cells: int | None = None,
+    precision: str | None = None,
+    loss_db: float = 0.1,
+    photos: Path | None = None,
+) -> tuple[str, str]:
+    """A run as a web page, and what to say of it; options as in `cli.export.export_html`."""
     found = open_run(source, device)
-    if isinstance(found.system, NeRF2D):
-        return build_picture_page(source, found, options)
-    assert isinstance(found.system, NeRF3D) and found.orbit is not None  # a scene's run
-    if source.is_file() and not options.photos and is_drawable(found.system):  # the page holds that very file
-        content = without_folders(source.read_bytes())
+    if isinstance(found.system, NeRF3D) and source.is_file() and not photos and is_drawable(found.system):
+        assert found.orbit is not None  # a scene's run
+        content = without_folders(source.read_bytes())  # the page holds that very file
         facts = describe_run(source, found, [("size", f"{len(content) / 1000:,.1f} kB")])
         return field_page(content, found.system, found.orbit, found.scene["name"], facts), "without photos"
-    data = data_again(found.cfg, found.scene, options.photos)
-    assert isinstance(data, RayDataModule)  # of a scene's run
-    drawn = drawable(found.system, some_cameras(data), plain_config(found.cfg), options.cells)
+    data = data_again(found.cfg, found.scene, photos)
+    if isinstance(found.system, NeRF2D):
+        view = data.held_out(0).to(found.system.device)
+        assert isinstance(view, PictureBatch)  # what a NeRF2D is fed
+        rgb = found.system.colours(view.uv).view(view.height, view.width, 3)
+        quality = f"PSNR {held_out_psnr(found.system, data):.2f} dB"
+        facts = describe_run(source, found, [("quality", quality), ("size", f"{view.width} x {view.height} pixels")])
+        return picture_page(to_bytes(rgb.cpu()), data.scene.name, facts), quality
+    assert isinstance(data, RayDataModule) and isinstance(found.system, NeRF3D) and found.orbit is not None
+    drawn = drawable(found.system, some_cameras(data), plain_config(found.cfg), cells)
     seen = occupied_cells(drawn.system) if drawn.changes else None
-    compact = smallest(drawn.system, data, drawn.config, options.loss_db, options.precision, seen)
+    compact = smallest(drawn.system, data, drawn.config, loss_db, precision, seen)
     before = held_out_psnr(found.system, data) if drawn.changes else compact.before
     content, changes = without_folders(compact.content), "; ".join(drawn.changes)
     measured = [
@@ -65,29 +63,11 @@ def build_page(source: Path, device: torch.device, options: PageOptions) -> tupl
     ]
     if changes:
         measured.append(("drawn with", f"{changes}: {before - compact.psnr:.2f} dB lost"))
-    photos, chosen = data.scene.train, subsample(len(data.scene.train), MAX_PHOTOS)
-    page = field_page(
-        content,
-        drawn.system,
-        found.orbit,
-        data.scene.name,
-        describe_run(source, found, measured),
-        photos.cameras[torch.tensor(chosen)].to("cpu"),
-        [photos.name(i) for i in chosen],
-    )
+    train, chosen = data.scene.train, subsample(len(data.scene.train), MAX_PHOTOS)
+    cameras, names = train.cameras[torch.tensor(chosen)].to("cpu"), [train.name(i) for i in chosen]
+    facts = describe_run(source, found, measured)
+    page = field_page(content, drawn.system, found.orbit, data.scene.name, facts, cameras, names)
     return page, f"held-out PSNR {before:.2f} -> {compact.psnr:.2f} dB" + (f" ({changes})" if changes else "")
-
-
-def build_picture_page(source: Path, found: RunFolder, options: PageOptions) -> tuple[str, str]:
-    """The page of an image's field."""
-    assert isinstance(found.system, NeRF2D)  # chosen by the caller
-    data = data_again(found.cfg, found.scene, options.photos)
-    view = data.held_out(0).to(found.system.device)
-    assert isinstance(view, PictureBatch)  # what a NeRF2D is fed
-    rgb = found.system.colours(view.uv).view(view.height, view.width, 3)
-    quality = f"PSNR {held_out_psnr(found.system, data):.2f} dB"
-    facts = describe_run(source, found, [("quality", quality), ("size", f"{view.width} x {view.height} pixels")])
-    return picture_page(to_bytes(rgb.cpu()), data.scene.name, facts), quality
 
 
 def describe_run(source: Path, found: RunFolder, measured: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -102,8 +82,12 @@ def describe_run(source: Path, found: RunFolder, measured: Sequence[tuple[str, s
     return [("method", method), *measured, *training, ("made with", f"nerf_lightning {nerf_lightning.__version__}")]
 
 
-def write_gallery(folder: Path, output: Path, device: torch.device, options: PageOptions) -> int:
+def write_gallery(folder: Path, output: Path, build: Callable[[Path], tuple[str, str]]) -> int:
     """Writes the page of each run below a folder, where it has none yet, and one that shows them all side by side.
+
+    Args:
+        folder, output: of the runs, and the page.
+        build: makes the page of a run, see `build_page`.
 
     Returns:
         How many runs are shown.
@@ -117,17 +101,14 @@ def write_gallery(folder: Path, output: Path, device: torch.device, options: Pag
         page = run.folder / FIELD_PAGE
         try:
             if not page.exists():
-                with atomic(page) as temporary:
-                    temporary.write_text(build_page(run.folder, device, options)[0], encoding="utf-8")
+                write_text(page, build(run.folder)[0])
                 print(page)
         except InputError as error:
             print(f"left out: {error}")
             continue
         label = ", ".join(f"{key} {run.option(key)}" for key in keys) or run.folder.name
-        line = "no figure" if run.psnr is None else f"{run.psnr:.2f} dB"
-        pages.append((address_from(output.parent, page), label, line))
+        pages.append((address_from(output.parent, page), label, run.quality))
     if not pages:
         raise InputError(folder, "", "no run that can be shown", "a folder of finished runs", "see what was left out")
-    with atomic(output) as temporary:
-        temporary.write_text(gallery_page(folder.resolve().name, pages), encoding="utf-8")
+    write_text(output, gallery_page(folder.resolve().name, pages))
     return len(pages)

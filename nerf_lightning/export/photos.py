@@ -7,45 +7,14 @@ import imageio.v3 as imageio
 import numpy as np
 
 from nerf_lightning.cameras import Distortion, Projection, in_other_frame
-from nerf_lightning.dataset import RayDataModule, Scene, Views
+from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.dataset.formats.frames import opengl_to_opencv
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.data import data_again
-from nerf_lightning.runs.folder import load_config
-from nerf_lightning.runs.scene_file import load_scene
-from nerf_lightning.utils.files import atomic_folder, write_json
+from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.progress import tracked
 
 STATED = {Projection.PERSPECTIVE: ("k1", "k2", "k3", "p1", "p2"), Projection.FISHEYE: ("k1", "k2", "k3", "k4")}
 """Coefficients of a lens that the format knows."""
-
-
-def write_posed_photos(source: Path, output: Path, photos: Path | None = None) -> str:
-    """Writes a run's photos, as it saw them, and their cameras, as it corrected them, into a new folder.
-
-    Args:
-        source: the run's folder.
-        output: the new one.
-        photos: where they are, if they have moved.
-
-    Returns:
-        What was written, in words.
-
-    Raises:
-        InputError: for another kind of run, or an output that is there.
-    """
-    if not source.is_dir():
-        raise InputError(source, "", "a file", "a run's folder", "its compact file does not know corrected cameras")
-    if output.exists():
-        raise InputError(output, "", "something", "a folder that is not there yet", "give another -o, or remove it")
-    content = load_scene(source)
-    data = data_again(load_config(source), content, photos)
-    if not isinstance(data, RayDataModule):
-        raise InputError(source, "", "a picture's run", "a scene's run")
-    with atomic_folder(output) as temporary:
-        write_photos(data.scene, temporary)
-    count = len(data.scene.train) + len(data.scene.val)
-    return f"{count} photos and transforms.json, cameras as {'corrected' if 'corrected' in content else 'given'}"
 
 
 def write_photos(scene: Scene, folder: Path) -> None:

@@ -32,9 +32,8 @@ def occupied_cells(system: System) -> Cells | None:
 def seen_cells(system: System, cameras: Cameras) -> Cells | None:
     """The occupied cells that are visible to the cameras, and their neighbours."""
     occupied = occupied_cells(system)
-    if occupied is None:
+    if occupied is None or not isinstance(system, NeRF3D):
         return None
-    assert isinstance(system, NeRF3D)  # as it has cells
     return widened(visible_cells(system, cameras, len(occupied))) & occupied
 
 

@@ -10,7 +10,7 @@ from numpy import ndarray
 if TYPE_CHECKING:
     import trimesh
 
-Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """From z up, as scenes have it, to y up, as glTF wants it: written as the node's transform."""
 SINGLE = 2.0**-24
 """Largest relative error of a number rounded to single precision."""
@@ -43,26 +43,19 @@ def encode_ply(vertices: Float[ndarray, "V 3"], rgb: UInt8[ndarray, "V 3"], face
         rgb: of the vertices.
         faces: [F, 3] indices of vertices; None for points alone.
     """
-    vertex = np.empty(
-        len(vertices), [(name, "<f8") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    )
-    for column, name in enumerate("xyz"):
-        vertex[name] = vertices[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        vertex[name] = rgb[:, column]
+    colours = ("red", "green", "blue")
+    kinds = [(name, "<f8") for name in "xyz"] + [(name, "u1") for name in colours]
+    body = np.rec.fromarrays([*vertices.T, *rgb.T], dtype=kinds).tobytes()
     lines = ["ply", "format binary_little_endian 1.0", "comment nerf_lightning", f"element vertex {len(vertices)}"]
-    lines += [f"property double {name}" for name in "xyz"]
-    lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    body = vertex.tobytes()
+    lines += [*(f"property double {name}" for name in "xyz"), *(f"property uchar {name}" for name in colours)]
     if faces is not None:
-        face = np.empty(len(faces), [("count", "u1"), ("index", "<i4", 3)])
-        face["count"], face["index"] = 3, faces
+        kinds = [("count", "u1"), ("a", "<i4"), ("b", "<i4"), ("c", "<i4")]
+        body += np.rec.fromarrays([np.full(len(faces), 3), *faces.T], dtype=kinds).tobytes()
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-        body += face.tobytes()
     return "\n".join([*lines, "end_header", ""]).encode() + body
 
 
-def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, turn: Float[ndarray, "4 4"]) -> tuple[bytes, Float[ndarray, "3"]]:
+def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, turn: Float[ndarray, "3 3"]) -> tuple[bytes, Float[ndarray, "3"]]:
     """A coloured mesh as .ply, .obj, .stl or .glb.
 
     Args:
@@ -91,8 +84,11 @@ def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, turn: Float[ndarray, "4 4"
         return header[:STL_HEADER_BYTES] + content[STL_HEADER_BYTES:], offset
     import trimesh
 
-    scene, node = trimesh.Scene(), Y_UP @ turn
-    node[:3, 3] = Y_UP[:3, :3] @ offset  # a turn about an origin that is far away would move the mesh
+    scene, node = trimesh.Scene(), np.eye(4)
+    node[:3, :3], node[:3, 3] = (
+        Y_UP @ turn,
+        Y_UP @ offset,
+    )  # a turn about an origin that is far away would move the mesh
     scene.add_geometry(moved, transform=node)
     content = scene.export(file_type="glb")
     return content, offset

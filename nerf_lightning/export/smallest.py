@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -14,9 +13,6 @@ from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.reach import Cells, confined_to, occupied_cells, seen_cells
 from nerf_lightning.runs.compact import decode, encode
-from nerf_lightning.runs.data import data_again
-from nerf_lightning.runs.folder import plain_config
-from nerf_lightning.runs.open import open_run
 from nerf_lightning.runs.scene_file import scene_content
 from nerf_lightning.system import System
 from nerf_lightning.utils.progress import tracked
@@ -101,16 +97,3 @@ def smallest(
         ", or --precision half" if precision == "byte" else ""
     )
     raise InputError("export", "loss_db", found, f"at most {most_loss:g} dB", advice)
-
-
-def compact_run(
-    source: Path, device: torch.device, loss_db: float, precision: str | None = None, photos: Path | None = None
-) -> tuple[bytes, str]:
-    """A run as one small file, and what to say of it; see `smallest`."""
-    found = open_run(source, device)
-    data = data_again(found.cfg, found.scene, photos)
-    before = sum(tensor.numel() * tensor.element_size() for tensor in found.system.state_dict().values())
-    compact = smallest(found.system, data, plain_config(found.cfg), loss_db, precision)
-    size = f"{len(compact.content) / 1000:,.1f} kB of {before / 1000:,.1f} kB, {compact.precision} precision"
-    quality = f"held-out PSNR {compact.before:.2f} -> {compact.psnr:.2f} dB, {max(compact.loss, 0):.3f} dB lost"
-    return compact.content, f"{size}, {quality}"

@@ -93,9 +93,8 @@ def box_around(mask: Bool[ndarray, "X Y Z"]) -> Bool[ndarray, "X Y Z"]:
     """The cells of the smallest box that holds all marked ones: what is unlit beyond it, such as below a floor, is not inside
     anything."""
     box = np.zeros(mask.shape, bool)
-    marked = np.argwhere(mask)
-    if len(marked):
-        box[tuple(slice(low, high + 1) for low, high in zip(marked.min(0), marked.max(0), strict=True))] = True
+    for place in ndimage.find_objects(mask.astype(int)):
+        box[place] = True
     return box
 
 

@@ -22,8 +22,8 @@ PIXELS = 1.25
 PLACES = 4
 """Places evaluated in one call, for each sample rendered in one: bounds the memory."""
 
-CELL = 8
-"""Bytes of a cell: its density, and its opacity."""
+CELL = 32
+"""Bytes of a cell: its density, its opacity, its index and its centre."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class Volume:
     @property
     def centres(self) -> Float[Tensor, "X Y Z 3"]:
         """Where in the world the centres of all cells are."""
-        axes = [torch.arange(count) for count in self.density.shape]
-        return self.places(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).float())
+        axes = [torch.arange(count).float() for count in self.density.shape]
+        return self.places(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1))
 
 
 def region_of(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tensor, "4 4"]) -> Float[Tensor, "2 3"]:
@@ -109,13 +109,10 @@ def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] 
     low = corners.mean(0) - torch.tensor(shape, device=system.device) * (cell / 2)
     volume = Volume(torch.zeros(shape), low.cpu(), cell)
     occupied = occupied_cells(system)
-    asked_together = PLACES * system.chunk
-    slab = max(1, asked_together // (shape[1] * shape[2]))
-    starts = range(0, shape[0], slab)
-    for start in tracked(starts, len(starts), "cells"):
-        stop = min(start + slab, shape[0])
-        grid = torch.meshgrid(torch.arange(start, stop), torch.arange(shape[1]), torch.arange(shape[2]), indexing="ij")
-        places = volume.places(torch.stack(grid, dim=-1).view(-1, 3).float()).to(system.device)
+    together = PLACES * system.chunk
+    density = []
+    for part in tracked(volume.centres.view(-1, 3).split(together), math.ceil(cells / together), "cells"):
+        places = part.to(system.device)
         unit = bounds.to_unit(places)
         asked = ((unit >= 0) & (unit <= 1)).all(1)
         if occupied is not None:
@@ -123,9 +120,9 @@ def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] 
             x, y, z = (unit * n).long().clamp(0, n - 1).unbind(1)
             asked &= occupied[x, y, z]
         found = torch.zeros(len(places), device=system.device)
-        found[asked] = torch.cat([system.field.density(part) for part in places[asked].split(asked_together)])
-        volume.density[start:stop] = found.view(stop - start, *shape[1:]).cpu()
-    return replace(volume, density=volume.density.nan_to_num(0.0).clamp_min(0.0))
+        found[asked] = system.field.density(places[asked])
+        density.append(found.cpu())
+    return replace(volume, density=torch.cat(density).view(shape).nan_to_num(0.0).clamp_min(0.0))
 
 
 def cropped(volume: Volume, box: Float[Tensor, "2 3"], to_source: Float[Tensor, "4 4"]) -> Volume:

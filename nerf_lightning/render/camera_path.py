@@ -1,7 +1,6 @@
 """Camera paths: which views a video shows."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -35,8 +34,6 @@ def check_path(path: str, path_frame: str) -> None:
     words = ("orbit", "spiral", *SPLITS)
     if path not in words and not path.endswith(".json"):
         raise InputError("render", "path", repr(path), f"one of {', '.join(words)}, or a .json file")
-    if path.endswith(".json") and not user_path(path).is_file():
-        raise InputError(path, "", "nothing there", "a camera path in JSON")
     if path_frame != "auto" and not path.endswith(".json"):
         found = f"{path_frame!r} with path={path}"
         raise InputError("render", "path_frame", found, "auto; it is for a .json file of your own")
@@ -74,6 +71,6 @@ def build_path(
     elif path == "spiral":
         cameras = spiral_like(orbit, frames or SPIRAL_FRAMES)
     else:
-        cameras = read_path(Path(user_path(path)), orbit, to_source, path_frame)
+        cameras = read_path(user_path(path), orbit, to_source, path_frame)
         cameras = resample_path(cameras, frames or len(cameras), closed=False)
     return CameraPath(cameras, list(range(len(cameras))))

@@ -5,12 +5,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from nerf_lightning.drawing.frame import CHANNELS, ERROR_TIMES, Style, draw, error_picture
-from nerf_lightning.drawing.panels import panel
+from nerf_lightning.drawing.panels import panel, to_bytes
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.camera_path import CameraPath
 from nerf_lightning.render.video import Image
+from nerf_lightning.renderer import over
 from nerf_lightning.renderer.background import COLORS
 from nerf_lightning.system import NeRF3D
 
@@ -75,10 +77,9 @@ def draw_frame(system: NeRF3D, path: CameraPath, index: int, style: Style) -> Im
     if path.photos is None:
         return np.concatenate(list(draw(system, path.cameras, index, style).values()), axis=1)
     assert style.background is not None  # the command sees to it
-    photo = path.photos.image(index).numpy()
-    if photo.shape[-1] == 4:
-        alpha = photo[..., 3:] / 255.0
-        photo = np.rint(photo[..., :3] * alpha + 255 * (1 - alpha) * np.array(style.background)).astype(np.uint8)
+    pixels = path.photos.image(index)
+    background = torch.tensor(style.background).expand(pixels[..., 0].numel(), 3)
+    photo = to_bytes(over(pixels.flatten(0, 1), background).view(*pixels.shape[:2], 3))
     others = [name for name in style.channels if name != "rgb"]
     drawn = draw(system, path.cameras, index, replace(style, channels=("rgb", *others)))
     error, psnr = error_picture(drawn["rgb"], photo)

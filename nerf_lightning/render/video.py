@@ -26,8 +26,6 @@ PLAN = "frames.json"
 SUFFIXES = (".gif", ".mp4", ".webp")
 OPAQUE = (".gif", ".mp4")
 """Formats without partial transparency."""
-WEBP_BYTES_PER_PIXEL = 4
-"""Of all frames, which its writer keeps in memory."""
 CRF = 18
 """Of H.264: smaller is better, 18 looks like the original."""
 
@@ -53,7 +51,7 @@ def write_video(plan: dict[str, Any], draw: Callable[[int], Image], count: int, 
     Frames are in the folder itself, or beside a video in a folder of its own until it is written.
 
     Args:
-        plan: all that the frames depend on, as plain values; its `size` holds their widths and heights.
+        plan: all that the frames depend on, as plain values.
         draw: makes a frame.
         count: how many.
         output: a folder, or a file whose suffix says what kind of video.
@@ -65,10 +63,6 @@ def write_video(plan: dict[str, Any], draw: Callable[[int], Image], count: int, 
     Raises:
         InputError: where the folder holds something else.
     """
-    if output.suffix == ".webp":
-        pixels = sum(width * height for width, height in plan.get("size", []))
-        todo = "give less of --scale or --frames, or -o FILE.mp4"
-        check_memory("render", "frames", f"{count:,} frames", WEBP_BYTES_PER_PIXEL * pixels, todo)
     folder = output.with_name(f"{output.name}.frames") if output.suffix else output
     files = [folder / f"{index:05d}.png" for index in range(count)]
     prepare_folder(folder, plan, owned=bool(output.suffix))
@@ -76,6 +70,9 @@ def write_video(plan: dict[str, Any], draw: Callable[[int], Image], count: int, 
     for index in tracked(missing, len(missing), "frames"):
         image = draw(index)
         if index == missing[0]:  # nothing is left of a video of which not even a frame can be drawn
+            if output.suffix == ".webp":  # whose writer keeps all frames in memory
+                needed = 4 * count * image[..., 0].size
+                check_memory("render", "frames", f"{count:,} frames", needed, "give less, or -o FILE.mp4")
             write_json(folder / PLAN, plan)
         with atomic(files[index]) as temporary:
             imageio.imwrite(temporary, image, compress_level=1)

@@ -29,24 +29,22 @@ def read_checkpoint(path: Path, keys: Sequence[str] = RENDER_KEYS) -> dict[str, 
     """
     expected = "a whole checkpoint of tensors and plain values"
     existing_file(path, "a checkpoint", "the run may have ended before its first one")
-    best = path.with_name("best.ckpt")
-    todo = f"{best.name} may be whole: copy it over this one" if path != best and best.exists() else ""
     try:
         with zipfile.ZipFile(path) as archive:
             check_memory(path, "", "a checkpoint", sum(part.file_size for part in archive.infolist()))
             damaged = archive.testzip()
         if damaged is not None:
-            raise InputError(path, damaged, "other bytes than were written", expected, todo)
+            raise InputError(path, damaged, "other bytes than were written", expected)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about kinds of files that are refused below
             state = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, *DAMAGE_ERRORS) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(path, "", str(error).split(".")[0], expected, todo) from error
+        raise InputError(path, "", str(error).split(".")[0], expected) from error
     missing = [key for key in keys if not isinstance(state, dict) or key not in state]
     if missing:
-        raise InputError(path, missing[0], "nothing", expected, todo)
+        raise InputError(path, missing[0], "nothing", expected)
     return state
 
 

@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerf_lightning.config.build import build_system
 from nerf_lightning.dataset.formats.checks import require_keys
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, found_in
 from nerf_lightning.runs.checkpoint import check_finite
-from nerf_lightning.runs.folder import RunFolder, config_from, system_of
+from nerf_lightning.runs.folder import RunFolder, config_from
 from nerf_lightning.runs.scene_file import frame_from
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.parsing import VALUE_ERRORS, Headers, existing_file, parse_json, read_content, read_npz
 
 FORMAT, VERSION = "nerf_lightning compact", 1
@@ -114,9 +114,8 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
     try:
         frame, orbit, to_source = frame_from(header["scene"], f"{path}: header.scene")
         cfg = config_from(header["config"], path)
-        system = system_of(cfg, frame, device, path)
-        floats = sum(math.prod(one["shape"]) for one in header["arrays"].values())
-        check_memory(path, "", "weights", 4 * floats)
+        with found_in(path):
+            system = build_system(cfg, frame, device)
         tensors = {key: _decoded(key, arrays, one["code"], one["shape"]) for key, one in header["arrays"].items()}
         system.field.import_state(_of("field", tensors))
         if isinstance(system, NeRF3D):

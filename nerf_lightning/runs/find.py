@@ -11,6 +11,8 @@ OUTPUTS = Path("outputs")
 """Where training puts runs."""
 MARKER = ".nerf_lightning"
 """In a folder that was new or empty when a run was put there, so that all in it is this package's own."""
+CHECKPOINT = Path("checkpoints", "last.ckpt")
+"""In a run's folder."""
 LATEST = "latest"
 """The link beside the runs of one name to the one that began last."""
 log = logging.getLogger(__name__)
@@ -34,17 +36,12 @@ def find_run(path: str | os.PathLike[str] | None = None) -> Path:
     if not runs:
         found = "a folder without a run" if root.is_dir() else "nothing there"
         raise InputError(root, "", found, "a run: a folder with config.yaml and checkpoints/, or a compact file (.npz)")
-    return max(runs, key=_modified)
+    return max(runs, key=lambda run: (run / CHECKPOINT).stat().st_mtime)
 
 
 def is_run(folder: Path) -> bool:
     """Whether a folder holds a run that can be opened."""
-    return (folder / "config.yaml").is_file() and (folder / "checkpoints" / "last.ckpt").is_file()
-
-
-def _modified(folder: Path) -> float:
-    files = (folder / "config.yaml", folder / "results.json")
-    return max(file.stat().st_mtime for file in files if file.exists())
+    return (folder / "config.yaml").is_file() and (folder / CHECKPOINT).is_file()
 
 
 def link_latest(folder: Path) -> None:

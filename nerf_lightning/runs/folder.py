@@ -7,7 +7,11 @@ results.json           see callbacks/results.py
 snapshots/ orbit.gif   pictures
 """
 
+import functools
+import importlib
+import math
 import os
+import re
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -20,15 +24,16 @@ from torch import Tensor
 
 import nerf_lightning
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.config.build import Frame, build_system, resolved
+from nerf_lightning.config import conf_dir
+from nerf_lightning.config.build import build_system, resolved
+from nerf_lightning.config.literal import escape
 from nerf_lightning.config.options import RunOptions
 from nerf_lightning.errors import InputError, found_in
 from nerf_lightning.runs.checkpoint import check_finite, read_checkpoint
 from nerf_lightning.runs.scene_file import frame_from, load_scene
-from nerf_lightning.runs.trusted import check_config
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.files import atomic, user_path
+from nerf_lightning.utils.files import user_path, write_text
 from nerf_lightning.utils.options import check_options
 from nerf_lightning.utils.parsing import VALUE_ERRORS, existing_file, read_yaml
 
@@ -36,6 +41,17 @@ OF_COMMAND = ("overwrite", "version")
 """Keys of a configuration that are not those of the run that was made with it."""
 VERSION = ".".join(nerf_lightning.__version__.split(".")[:2])
 """Of this package, as runs are marked with: those of another one are refused."""
+TRUST = "NERF_LIGHTNING_TRUST"
+"""Environment variable: further packages, comma-separated, whose classes a run folder may name."""
+SWEEP_CALLBACK = "nerf_lightning.training.sweep.SweepReport"
+"""Hydra's, never in a run's configuration."""
+
+
+@functools.cache
+def shipped_targets() -> frozenset[str]:
+    """What the shipped configuration builds. Anything else could be called with a stranger's arguments."""
+    texts = "".join(file.read_text(encoding="utf-8") for file in conf_dir().rglob("*.yaml"))
+    return frozenset(re.findall(r"_target_: ([\w.]+)", texts)) - {SWEEP_CALLBACK}
 
 
 def plain_config(cfg: DictConfig) -> dict[str, Any]:
@@ -49,8 +65,7 @@ def plain_config(cfg: DictConfig) -> dict[str, Any]:
 
 def save_config(cfg: DictConfig, folder: Path) -> None:
     """Writes the resolved configuration."""
-    with atomic(folder / "config.yaml") as temporary:
-        temporary.write_text(yaml.safe_dump(plain_config(cfg), sort_keys=False), encoding="utf-8")
+    write_text(folder / "config.yaml", yaml.safe_dump(plain_config(cfg), sort_keys=False))
 
 
 def load_config(folder: Path) -> DictConfig:
@@ -66,29 +81,49 @@ def load_config(folder: Path) -> DictConfig:
 
 def config_from(plain: Any, path: Path | str) -> DictConfig:
     """As `load_config`, of what a file at `path` holds."""
-    checked = check_config(plain, path)
-    if (version := checked.get("version")) != VERSION:
+    if not isinstance(plain, dict):
+        raise InputError(path, "", type(plain).__name__, "a mapping")
+    check_config(path, "", plain)
+    if (version := plain.get("version")) != VERSION:
         found = "no version" if version is None else f"version {version}"
         todo = "train the run again, or use the version of nerf_lightning that made it"
         raise InputError(path, "version", found, f"version {VERSION}, which this one reads", todo)
     known = {field.name for field in fields(RunOptions)}
-    options = {key: value for key, value in checked.items() if key in known}
+    options = {key: value for key, value in plain.items() if key in known}
     check_options("", RunOptions, options, OF_COMMAND, source=str(path))
-    return OmegaConf.create(checked)
+    return OmegaConf.create(escape(plain))  # text from outside is never an interpolation
 
 
-def system_of(cfg: DictConfig, frame: Frame, device: torch.device, where: object) -> System:
-    """Builds the system that a run's configuration describes, without its weights.
+def check_config(path: Path | str, key: str, node: Any) -> None:
+    """Raises InputError for anything in a configuration from outside but plain finite values and trusted targets."""
+    if isinstance(node, dict):
+        for name, value in node.items():
+            if name == "_target_" and not _is_trusted(value):
+                expected = "a class of this package that configurations name"
+                raise InputError(path, f"{key}._target_", repr(value), expected, f"set {TRUST} to allow its package")
+            check_config(path, f"{key}.{name}" if key else str(name), value)
+    elif isinstance(node, list):
+        for index, value in enumerate(node):
+            check_config(path, f"{key}[{index}]", value)
+    elif node == "???" or not isinstance(node, str | int | float | None):
+        raise InputError(path, key, repr(node), "plain values")
+    elif isinstance(node, float) and not math.isfinite(node):
+        raise InputError(path, key, str(node), "a finite number")
 
-    Args:
-        cfg, frame, device: see `build_system`.
-        where: the configuration was read from, which messages name.
 
-    Raises:
-        InputError: where an option is missing or wrong.
-    """
-    with found_in(where):
-        return build_system(cfg, frame, device)
+def _is_trusted(target: Any) -> bool:
+    """Whether a target is on the list, or defined (not merely imported) in a package that the user trusts."""
+    if str(target) in shipped_targets():
+        return True
+    module, _, name = str(target).rpartition(".")
+    package = module.split(".")[0]
+    if not package or package not in os.environ.get(TRUST, "").split(","):
+        return False
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return False
+    return getattr(found, "__module__", "").split(".")[0] == package
 
 
 @dataclass(frozen=True)
@@ -113,7 +148,8 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device =
     """
     cfg, scene = load_config(folder), load_scene(folder)
     frame, orbit, to_source = frame_from(scene, folder / "scene.json")
-    system = system_of(cfg, frame, device, folder / "config.yaml")
+    with found_in(folder / "config.yaml"):
+        system = build_system(cfg, frame, device)
     path = folder / "checkpoints" / checkpoint
     state = read_checkpoint(path)
     try:

@@ -1,7 +1,6 @@
 """Run folders as tables and charts read them: tolerant of broken ones, never executing what they hold."""
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,6 +46,10 @@ class Run:
         return self.figure("psnr")
 
     @property
+    def quality(self) -> str:
+        return "no figure" if self.psnr is None else f"{self.psnr:.2f} dB"
+
+    @property
     def curve(self) -> list[tuple[float, float, float]]:
         """(training seconds, step, PSNR), as far as they are finite numbers."""
         points = self.results.get("curve")
@@ -88,13 +91,7 @@ def find_runs(root: Path) -> list[Run]:
     folders = {path.parent for name in ("results.json", "config.yaml") for path in root.rglob(name)}
     if not folders:
         raise InputError(root, "", "no run in it", "folders with a config.yaml and a results.json")
-    return [read_run(folder) for folder in sorted(folders, key=_in_order)]
-
-
-def _in_order(folder: Path) -> list[tuple[float, str]]:
-    """Sorts =2 before =10."""
-    words = re.split(r"(?<==)([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?=,|$)", str(folder))
-    return [(float(word), "") if place % 2 else (0.0, word) for place, word in enumerate(words)]
+    return [read_run(folder) for folder in sorted(folders)]
 
 
 def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -124,9 +121,3 @@ def varied(runs: Sequence[Run]) -> list[str]:
 def _is_set_by_recipe(key: str, options: Sequence[dict[str, Any]]) -> bool:
     """Whether runs of one recipe have one value at `key`."""
     return len({(one["recipe"], str(one[key])) for one in options}) == len({one["recipe"] for one in options})
-
-
-def failed_results(method: Any, seed: Any, diagnosis: str) -> dict[str, Any]:
-    """A results.json for a run that failed before it could write its own."""
-    empty: dict[str, Any] = {"psnr": None, "curve": [], "warnings": [], "recoveries": []}
-    return {"method": method, "seed": seed, "status": "failed", "diagnosis": diagnosis} | empty

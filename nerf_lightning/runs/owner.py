@@ -33,25 +33,22 @@ def owned(folder: Path) -> Iterator[None]:
 
     Raises:
         Taken: while another process writes into it.
-        InputError: where it cannot be written, or holds files of others and no run.
+        InputError: where it holds files of others and no run.
     """
     if not leads():
         yield
         return
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (is_empty(folder) or holds_run(folder) or (folder / MARKER).exists()):
+        raise InputError(folder, "", "other files in it", "a new or empty folder, or that of an earlier run")
+    lock = FileLock(folder / LOCK, timeout=0)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not (is_empty(folder) or holds_run(folder) or (folder / MARKER).exists()):
-            raise InputError(folder, "", "other files in it", "a new or empty folder, or that of an earlier run")
-        lock = FileLock(folder / LOCK, timeout=0)
         lock.acquire()
-        if is_empty(folder):
-            (folder / MARKER).touch()
     except Timeout as error:
         todo = "wait for its end, or give another folder"
         raise Taken(folder, "", "a run that is in progress", "a folder that no other process uses", todo) from error
-    except OSError as error:
-        found = error.strerror or str(error)
-        raise InputError(folder, "", found, "a folder that can be written") from error
+    if is_empty(folder):
+        (folder / MARKER).touch()
     try:
         yield
     finally:
@@ -111,5 +108,6 @@ def clear(folder: Path) -> None:
     if not holds_run(folder):
         return
     marked = (folder / MARKER).exists()
-    for path in [path for path in folder.iterdir() if path.name not in (LOCK, MARKER) and (marked or path.name in RUN)]:
-        remove(path)
+    for path in list(folder.iterdir()):
+        if path.name not in (LOCK, MARKER) and (marked or path.name in RUN):
+            remove(path)

@@ -96,18 +96,25 @@ def frame_from(scene: Mapping[str, Any], where: object) -> tuple[Frame, Cameras 
         red, green, blue = checks.parse_array(where, "background", scene["background"], 3).tolist()
         to_source = checks.check_similarity(where, "to_source", scene["to_source"])
         frame = SceneFrame(Bounds(aabb, bool(scene["unbounded"]), near, far, pixel), (red, green, blue))
-        return frame, _read_orbit(where, scene["orbit"]), torch.from_numpy(to_source)
+        return frame, read_cameras(where, "orbit.", scene["orbit"]), torch.from_numpy(to_source)
     except (LookupError, TypeError) as error:
         raise InputError(where, "", f"{type(error).__name__}: {error}", WHOLE) from error
 
 
-def _read_orbit(where: object, view: Mapping[str, Any]) -> Cameras:
-    width, height = checks.check_view_size(where, "orbit", view["width"], view["height"])
-    c2w = checks.check_poses(where, "orbit.c2w[{}]", view["c2w"])
-    K = view["K"]
-    if not len(c2w) or len(K) != len(c2w):
-        raise InputError(where, "orbit.K", f"{len(K)} matrices", f"as many as poses, {len(c2w)}, of at least one view")
+def read_cameras(where: object, key: str, views: Mapping[str, Any]) -> Cameras:
+    """Cameras from plain values: `width`, `height`, `K` (one or of each view, pixels) and `c2w` (OpenCV frame).
+
+    Raises:
+        InputError: for poses that are no rotations, intrinsics that cannot be, and no view at all.
+        LookupError: for a missing key.
+    """
+    width, height = checks.check_view_size(where, key, views["width"], views["height"])
+    c2w = checks.check_poses(where, f"{key}c2w[{{}}]", views["c2w"])
+    K = checks.parse_floats(where, f"{key}K", views["K"])
+    if not len(c2w) or K.shape not in ((3, 3), (len(c2w), 3, 3)):
+        found = f"shape {K.shape} for {len(c2w)} views"
+        raise InputError(where, f"{key}K", found, "shape (V, 3, 3), of at least one view")
     K = np.stack(
-        [checks.check_intrinsics(where, f"orbit.K[{number}]", one, width, height) for number, one in enumerate(K)]
+        [checks.check_intrinsics(where, f"{key}K", one, width, height) for one in np.broadcast_to(K, (len(c2w), 3, 3))]
     )
     return Cameras.of_size(torch.from_numpy(K).float(), torch.from_numpy(c2w).float(), width, height)

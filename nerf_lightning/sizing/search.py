@@ -36,7 +36,7 @@ from nerf_lightning.sizing.choose import (
     stop_growing,
 )
 from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.training.before import left_of
+from nerf_lightning.training.job import find_progress
 from nerf_lightning.training.train import prepare, train, warm_up
 from nerf_lightning.utils.files import atomic, write_json
 from nerf_lightning.utils.libraries import silence_lightning
@@ -248,7 +248,7 @@ def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Data,
     was interrupted continues."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
     print(f"{folder}: {', '.join(f'{key}={value}' for key, value in model.items())}, in full", flush=True)
-    done, checkpoint = left_of(read_run(folder), whole)
+    done, checkpoint = find_progress(read_run(folder), whole)
     if done is None:
         train(whole, checkpoint, folder)
     results, run = read_run(folder).results, load_run(folder, device=build.device_of(cfg))

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.errors import InputError, NoRoom, Unwritable
+from nerf_lightning.errors import InputError, NoRoom
 
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """A full disk, a quota, a limit on the size of files."""
@@ -24,7 +24,7 @@ def atomic(path: Path) -> Iterator[Path]:
     Raises:
         NoRoom: the disk is full; what was at `path` stays.
         InputError: a folder is there.
-        Unwritable: the folder cannot be written.
+        OSError: the folder cannot be written.
     """
     if path.is_dir():
         raise InputError(path, "", "a folder", "a file to write", "give another name")
@@ -48,14 +48,8 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 def _temporary_of(path: Path, create: Callable[[Path], None]) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
     try:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            create(temporary)
-        except OSError as error:
-            if error.errno in FULL:
-                raise
-            found = error.strerror or str(error)
-            raise Unwritable(path.parent, "", found, "a folder that can be written", "give another one") from error
+        path.parent.mkdir(parents=True, exist_ok=True)
+        create(temporary)
         yield temporary
     except Exception as error:
         if full_disk(error):
@@ -98,10 +92,15 @@ def no_room(where: object) -> NoRoom:
     return NoRoom(where, "", "no space left on the device", "space for it", "free some and continue: nothing was lost")
 
 
+def write_text(path: Path, text: str) -> None:
+    """Writes text, atomically."""
+    with atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def write_json(path: Path, content: object) -> None:
     """Writes strict JSON (no NaN), atomically."""
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def known(value: Any) -> Any:
@@ -117,16 +116,12 @@ def user_path(text: str | os.PathLike[str]) -> Path:
     """A path as a user writes it, with ~ expanded.
 
     Raises:
-        InputError: for the home of an unknown user, and for a name that no file can have.
+        InputError: for the home of an unknown user.
     """
     try:
-        path = Path(text).expanduser()
-        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
-            path.lstat()
-    except (RuntimeError, ValueError, OSError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise InputError(repr(str(text)[:60]), "", str(reason), "a path that a file or folder can have") from error
-    return path
+        return Path(text).expanduser()
+    except RuntimeError as error:
+        raise InputError(str(text), "", "the home of an unknown user", "a path") from error
 
 
 def output_path(text: str | os.PathLike[str]) -> Path:

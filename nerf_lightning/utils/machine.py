@@ -39,8 +39,6 @@ def accelerator(device: torch.device) -> str | None:
         return None
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
-    if device.type == "mps" and hasattr(torch.backends.mps, "get_name"):  # since PyTorch 2.8
-        return torch.backends.mps.get_name()
     return device.type
 
 

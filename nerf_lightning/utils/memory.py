@@ -2,7 +2,7 @@
 
 import ctypes
 import re
-import sys
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -11,38 +11,26 @@ import torch
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.device import CPU
 
-CONTAINERS = (
-    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-)
-"""Limit and use of a Linux container's memory, in version 2 and 1 of control groups."""
+CONTAINER = Path("/sys/fs/cgroup")
+"""Files on the memory of a Linux container."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # malloc.h of the GNU C library
 
 
 def free_memory(device: torch.device = CPU) -> float:
-    """Bytes that this process can still have: of an accelerator, or of the machine, its container and its own address space."""
+    """Bytes that this process can still have: of an accelerator, or of the machine and its container."""
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
     if device.type == "mps":
         return float(torch.mps.recommended_max_memory() - torch.mps.driver_allocated_memory())
-    free = [float(psutil.virtual_memory().available)]
-    for limit_file, use_file in (map(Path, files) for files in CONTAINERS):
-        try:
-            limit = limit_file.read_text(encoding="utf-8").strip()
-            if limit != "max":
-                cached = re.search(
-                    r"^inactive_file (\d+)", (limit_file.parent / "memory.stat").read_text("utf-8"), re.M
-                )
-                free.append(float(limit) - float(use_file.read_text("utf-8")) + float(cached[1] if cached else 0))
-        except OSError:  # no container of this kind
-            continue
-    if sys.platform != "win32":
-        import resource
-
-        address_space = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if address_space != resource.RLIM_INFINITY:
-            free.append(address_space - float(psutil.Process().memory_info().vms))
-    return max(min(free), 0.0)
+    free = float(psutil.virtual_memory().available)
+    try:
+        limit, used, details = ((CONTAINER / f"memory.{name}").read_text() for name in ("max", "current", "stat"))
+    except OSError:  # no container
+        return free
+    if limit.strip() == "max":
+        return free
+    cached = re.search(r"^inactive_file (\d+)", details, re.M)
+    return max(min(free, float(limit) - float(used) + float(cached[1] if cached else 0)), 0.0)
 
 
 def check_memory(
@@ -78,21 +66,13 @@ def out_of_memory(error: BaseException) -> InputError | None:
 def keep_freed_memory() -> None:
     """Has the GNU C library keep freed memory. Otherwise every tensor above 128 kB gets newly mapped memory, with a fault
     for each page: a fifth of a training step."""
-    if mallopt := _c_function("mallopt"):
+    with suppress(OSError, TypeError, AttributeError):  # Windows, macOS and musl do not have it
         # One arena, so that the next forward pass reuses what the backward pass's thread frees.
         for setting, value in ((_M_MMAP_THRESHOLD, 32 << 20), (_M_TRIM_THRESHOLD, 1 << 30), (_M_ARENA_MAX, 1)):
-            mallopt(setting, value)
+            ctypes.CDLL(None).mallopt(setting, value)
 
 
 def give_back_freed_memory() -> None:
     """Returns kept memory to the system, where the C library can: between kinds of work, which need it in other pieces."""
-    if trim := _c_function("malloc_trim"):
-        trim(0)
-
-
-def _c_function(name: str) -> "ctypes._NamedFuncPointer | None":
-    """A function of the C library; None on Windows, macOS and musl, which do not have it."""
-    try:
-        return getattr(ctypes.CDLL(None), name)
-    except (OSError, TypeError, AttributeError):
-        return None
+    with suppress(OSError, TypeError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -127,8 +127,6 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, list | tuple) and all(_fits(item, arguments[0]) for item in value)
     if hint is dict:
         return isinstance(value, Mapping)
-    if origin is dict:
-        return isinstance(value, Mapping) and all(_fits(item, arguments[1]) for item in value.values())
     if hint is float:
         return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_FLOAT
     if hint is int:
@@ -156,14 +154,5 @@ def _describe(hint: Any) -> str:
         return f"one of {', '.join(map(str, arguments))}"
     if origin in (list, Sequence):
         return f"a list, each {_describe(arguments[0])}"
-    if origin is dict:
-        return f"names, each with {_describe(arguments[1])}"
-    words = {
-        int: "a whole number",
-        float: "a number",
-        str: "text",
-        bool: "true or false",
-        dict: "options by name",
-        type(None): "null",
-    }
-    return words.get(hint, "a value")
+    words = {int: "a whole number", float: "a number", str: "text", bool: "true or false", dict: "options by name"}
+    return words.get(hint, "null" if hint is type(None) else "a value")

@@ -9,24 +9,21 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, Rays, upward
-from nerf_lightning.dataset.region import find_region
+from nerf_lightning.cameras import Bounds, Cameras, Rays, pivot_of, upward
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.utils.text import subsample
 
 OVERVIEW_FOV = math.radians(50)
 """Vertical field of view of the browser's camera at first."""
-OVERVIEW_ELEVATION = math.radians(25)
 MAX_POINTS, COLOUR_VIEWS = 40_000, 24
 """Points that are shown, and photos that give them colours."""
 
 
 @dataclass(frozen=True)
 class Frustum:
-    """A view as a pyramid from the camera's centre to its photo, which stands centred on the optical axis."""
+    """A view as a pyramid from the camera's centre to its photo, as if the optical axis met the photo's middle."""
 
     name: str
     c2w: Float[np.ndarray, "4 4"]
@@ -60,37 +57,14 @@ class Viewpoint:
     """Vertical, radians."""
 
 
-def frusta(views: Views, word: str, photo_side: int) -> Iterator[Frustum]:
-    """A frustum for each view.
-
-    Args:
-        views: the photos and their cameras.
-        word: names are this word and the view's number.
-        photo_side: longest side of the photos in pixels.
-    """
+def frusta(views: Views, photo_side: int) -> Iterator[Frustum]:
+    """A frustum for each view, named after its photo, which is reduced to `photo_side` pixels along its longest side."""
     cameras = views.cameras
-    for i, (K, c2w) in enumerate(zip(cameras.K.double().numpy(), cameras.c2w.numpy(), strict=True)):
-        fov, aspect, photo = _centred(views.image(i).numpy(), K, photo_side)
-        yield Frustum(f"{word} {i}", c2w, fov, aspect, photo)
-
-
-def _centred(
-    image: UInt8[np.ndarray, "H W C"], K: Float[np.ndarray, "3 3"], photo_side: int
-) -> tuple[float, float, UInt8[np.ndarray, "h w C2"]]:
-    """A photo, reduced, with the optical axis in its middle; the vertical field of view and the aspect that it then has."""
-    height, width = image.shape[:2]
-    w, h = fit_size(width, height, photo_side)
-    photo = area_resize(image, w, h)
-    # Viewers assume that the optical axis meets the middle of the picture: where it does not, add transparent margins.
-    half_x, half_y = max(K[0, 2], width - K[0, 2]), max(K[1, 2], height - K[1, 2])
-    left, right = ((half_x - side) * w / width for side in (K[0, 2], width - K[0, 2]))
-    above, below = ((half_y - side) * h / height for side in (K[1, 2], height - K[1, 2]))
-    margins = ((round(above), round(below)), (round(left), round(right)), (0, 0))
-    if np.any(margins):
-        opaque = np.full((h, w, 1), 255, np.uint8)
-        photo = np.pad(photo if photo.shape[2] == 4 else np.concatenate([photo, opaque], axis=2), margins)
-    tangent_x, tangent_y = half_x / K[0, 0], half_y / K[1, 1]
-    return 2 * math.atan(tangent_y), float(tangent_x / tangent_y), photo
+    for i, (K, c2w) in enumerate(zip(cameras.K.numpy(), cameras.c2w.numpy(), strict=True)):
+        width, height = cameras.size(i)
+        fov, aspect = 2 * math.atan(height / (2 * K[1, 1])), float(width / K[0, 0] * K[1, 1] / height)
+        photo = area_resize(views.image(i).numpy(), *fit_size(width, height, photo_side))
+        yield Frustum(views.name(i), c2w, fov, aspect, photo)
 
 
 def random_rays(cameras: Cameras, view: Int[Tensor, "R"], generator: Generator) -> Rays:
@@ -100,35 +74,28 @@ def random_rays(cameras: Cameras, view: Int[Tensor, "R"], generator: Generator) 
     return cameras.rays(view, row, col)
 
 
-def ray_figure(rays: Rays, bounds: Bounds, samples: int, stump: float, generator: Generator | None) -> RayFigure:
-    """Rays and the uniform sampler's positions along them.
+def ray_figure(rays: Rays, bounds: Bounds, samples: int, stump: float) -> RayFigure:
+    """Rays and samples in the middle of equal intervals along them.
 
     Args:
         rays: in the bounds' frame.
         bounds: where the content is.
-        samples: intervals on each ray that meets the bounds; their midpoints are drawn.
+        samples: intervals on each ray that meets the bounds.
         stump: how much of a ray that misses the bounds is drawn, world units.
-        generator: jitters the intervals, as in training; None leaves them equal.
     """
-    sampler = UniformSampler(bounds, samples, stratified=True)
-    positions = sampler(rays, _no_density, generator).positions(rays)
     near, far = bounds.near_far(rays)
     hit = far > near
 
-    def along(t: Float[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-        return rays.origins + t[:, None] * rays.directions
+    def along(t: Float[Tensor, "R S"]) -> Float[Tensor, "R S 3"]:
+        return rays.origins[:, None] + t[..., None] * rays.directions[:, None]
 
-    entry = along(torch.where(hit, near, torch.full_like(near, stump)))
+    shares = (torch.arange(samples) + 0.5) / samples
+    entry = torch.where(hit, near, torch.full_like(near, stump))
     return RayFigure(
-        torch.stack([rays.origins, entry], dim=1).numpy(),
-        torch.stack([along(near), along(far)], dim=1)[hit].numpy(),
-        positions.numpy(),
+        along(torch.stack([torch.zeros_like(near), entry], dim=1)).numpy(),
+        along(torch.stack([near, far], dim=1))[hit].numpy(),
+        along(near[:, None] + shares * (far - near)[:, None])[hit].flatten(0, 1).numpy(),
     )
-
-
-def _no_density(positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-    """Stands in for a field: the uniform sampler never asks for density."""
-    raise RuntimeError("a uniform sampler asked for density")
 
 
 def colour_points(
@@ -163,28 +130,24 @@ def path_segments(cameras: Cameras) -> Float[np.ndarray, "N 2 3"]:
     return segments if closed else segments[:-1]
 
 
-def scene_scale(scene: Scene) -> float:
-    """The cameras' distance to what they look at, in the scene's unit."""
-    return find_region(scene.train.cameras.c2w).unit
+def home_of(orbit: Cameras) -> tuple[Viewpoint, float]:
+    """The first view of an orbit, as a viewer's camera, and its distance from the subject."""
+    focus = pivot_of(orbit)
+    up = upward(orbit)
+    distance = float((orbit.centres - focus).norm(dim=1).mean())
+    fov = 2 * math.atan(orbit.height / (2 * float(orbit.K[0, 1, 1])))
+    home = Viewpoint(orbit.centres[0].numpy(), focus.numpy(), up.numpy(), fov)
+    return home, max(distance, 1e-6)
 
 
 def overview(scene: Scene) -> Viewpoint:
-    """A view of all cameras and the bounds: from behind the orbit's start, upright as the orbit's pictures."""
-    focus = find_region(scene.train.cameras.c2w).centre.float()
-    up = upward(scene.orbit)
-    if float(up.norm()) < 0.5:  # a path that rolls over: no direction is up
-        up = torch.tensor([0.0, 0.0, 1.0])
-    offset = scene.orbit.centres[0] - focus
-    side = offset - (offset @ up) * up
-    if float(side.norm()) < 1e-3 * float(offset.norm()):  # it starts right above
-        helper = torch.eye(3)[int(up.abs().argmin())]
-        side = helper - (helper @ up) * up
-    side = torch.nn.functional.normalize(side, dim=0)
-    points = torch.cat([scene.train.cameras.centres, scene.val.cameras.centres, scene.bounds.aabb])
-    reach = max(float((points - focus).norm(dim=1).max()), 1e-6)
-    distance = reach / math.sin(OVERVIEW_FOV / 2)
-    position = focus + distance * (math.cos(OVERVIEW_ELEVATION) * side + math.sin(OVERVIEW_ELEVATION) * up)
-    return Viewpoint(position.numpy(), focus.numpy(), up.numpy(), OVERVIEW_FOV)
+    """A view of all cameras and the bounds: from behind the orbit's start."""
+    home, _ = home_of(scene.orbit)
+    points = torch.cat([scene.train.cameras.centres, scene.val.cameras.centres, scene.bounds.aabb]).numpy()
+    reach = max(float(np.linalg.norm(points - home.look_at, axis=1).max()), 1e-6)
+    away = home.position - home.look_at
+    away *= reach / math.sin(OVERVIEW_FOV / 2) / max(float(np.linalg.norm(away)), 1e-6)
+    return Viewpoint(home.look_at + away, home.look_at, home.up, OVERVIEW_FOV)
 
 
 def through(frustum: Frustum, distance: float, up: Float[np.ndarray, "3"]) -> Viewpoint:

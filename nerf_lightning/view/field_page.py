@@ -4,19 +4,20 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 import viser
 from viser.transforms import SO3
 
-from nerf_lightning.cameras import Cameras, Rays, pivot_of, upward
+from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.frame import CHANNELS
 from nerf_lightning.drawing.ink import GREEN, GREY, VERMILLION, rgb
 from nerf_lightning.renderer.background import COLORS
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.view.drawing import Viewpoint, box_edges
+from nerf_lightning.view.drawing import box_edges, home_of
 from nerf_lightning.view.page import Page
 from nerf_lightning.view.painter import Painter, Wish
 
@@ -28,21 +29,17 @@ QUALITY = 80
 """Of the JPEG that is sent, out of 100."""
 
 
+@dataclass
 class Visitor:
-    """A browser that has the page open, and what it has been sent.
+    """A browser that has the page open, and what it has been sent."""
 
-    Args:
-        client: Viser's.
-    """
-
-    def __init__(self, client: viser.ClientHandle):
-        self.client = client
-        self.version = 0
-        """Goes up whenever what it wants changes."""
-        self.side = 0
-        """Pixels along the longer side of the picture it has of this version; 0 for none."""
-        self.painted = 0.0
-        """When it got its last picture, seconds of the monotonic clock."""
+    client: viser.ClientHandle
+    version: int = 0
+    """Goes up whenever what it wants changes."""
+    side: int = 0
+    """Pixels along the longer side of the picture it has of this version; 0 for none."""
+    painted: float = 0.0
+    """When it got its last picture, seconds of the monotonic clock."""
 
 
 class FieldPage(Page):
@@ -231,13 +228,3 @@ class FieldPage(Page):
             if not self.paint():
                 with self.changed:
                     self.changed.wait(timeout=0.5)
-
-
-def home_of(orbit: Cameras) -> tuple[Viewpoint, float]:
-    """The first view of an orbit, as a viewer's camera, and its distance from the subject."""
-    focus = pivot_of(orbit)
-    up = upward(orbit)
-    distance = float((orbit.centres - focus).norm(dim=1).mean())
-    fov = 2 * math.atan(orbit.height / (2 * float(orbit.K[0, 1, 1])))
-    home = Viewpoint(orbit.centres[0].numpy(), focus.numpy(), up.numpy(), fov)
-    return home, max(distance, 1e-6)

@@ -25,13 +25,6 @@ FRUSTUM_DEPTH = 0.12
 """Depth of a frustum at first, as a share of the cameras' distance to what they look at."""
 
 
-class _Server(viser.ViserServer):
-    """A server whose pages cannot ask for a tunnel to the internet."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        return None
-
-
 class Page:
     """Serves a page from a thread of its own until `stop`.
 
@@ -53,7 +46,7 @@ class Page:
         self.pyramids: list[tuple[Frustum, viser.CameraFrustumHandle]] = []
         logging.getLogger("websockets").setLevel(logging.WARNING)
         with _hushed():
-            self.server = _Server(host, port, verbose=False)
+            self.server = viser.ViserServer(host, port, verbose=False)
 
     @property
     def port(self) -> int:
@@ -90,7 +83,7 @@ class Page:
             group = word.replace(" ", "_")
             self.groups[word] = scene.add_frame(f"/{group}", show_axes=False, visible=visible)
             self.names.append(scene.add_frame(f"/{group}/names", show_axes=False, visible=False))
-            for i, frustum in enumerate(frusta(views, word, PHOTO_SIDE)):
+            for i, frustum in enumerate(frusta(views, PHOTO_SIDE)):
                 wxyz = SO3.from_matrix(frustum.c2w[:3, :3].astype(np.float64)).wxyz
                 position = frustum.c2w[:3, 3]
                 handle = scene.add_camera_frustum(
@@ -107,22 +100,13 @@ class Page:
                     cast_shadow=False,
                     receive_shadow=False,
                 )
-                handle.on_click(self._visit(frustum, i if word == "training" else None))
+                handle.on_click(self._visit(frustum))
                 self.pyramids.append((frustum, handle))
                 scene.add_label(f"/{group}/names/{i}", frustum.name, position=position, font_screen_scale=0.8)
 
-    def _visit(self, frustum: Frustum, view: int | None) -> Callable[[viser.SceneNodePointerEvent], None]:
+    def _visit(self, frustum: Frustum) -> Callable[[viser.SceneNodePointerEvent], None]:
         """A click on a frustum moves the browser's camera there."""
-
-        def visit(event: viser.SceneNodePointerEvent) -> None:
-            look_from(event.client, through(frustum, self.scale, self.home.up))
-            if view is not None:
-                self.visited(view)
-
-        return visit
-
-    def visited(self, view: int) -> None:
-        """Called when a training view is looked through."""
+        return lambda event: look_from(event.client, through(frustum, self.scale, self.home.up))
 
     def add_camera_switches(self) -> None:
         """Checkboxes for what to show of the cameras."""

@@ -13,7 +13,6 @@ from numpy import ndarray
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.drawing.frame import Style, colours, depth_range
 from nerf_lightning.drawing.panels import to_bytes
-from nerf_lightning.renderer import RenderOutput
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.device import synchronize
 from nerf_lightning.utils.text import subsample
@@ -84,6 +83,7 @@ class Painter:
 
     def paint(self, wish: Wish, side: int, wanted: Callable[[], bool]) -> UInt8[ndarray, "H W 3"] | None:
         """A picture of one size; None if it was no longer wanted before it was finished."""
+        style = Style((wish.channel,), wish.background, self.depths() if wish.channel == "depth" else (0.0, 1.0))
         device, together = self.system.device, SLICE * self.system.chunk_rays
         synchronize(device)  # do not count work that is still queued
         began = time.perf_counter()
@@ -93,12 +93,8 @@ class Painter:
         for start in range(0, len(rays), together):
             if not wanted():
                 return None
-            parts.append(self.system.render(rays[start : start + together], wish.near, wish.far, wish.background))
-        rendered = RenderOutput(
-            *(torch.cat([getattr(part, name) for part in parts]) for name in ("rgb", "opacity", "distance"))
-        )
-        depths = self.depths() if wish.channel == "depth" else (0.0, 1.0)
-        painted = colours(rendered, wish.channel, Style((wish.channel,), wish.background, depths))
-        picture = to_bytes(painted.view(cameras.height, cameras.width, 3))
+            rendered = self.system.render(rays[start : start + together], wish.near, wish.far, wish.background)
+            parts.append(colours(rendered, wish.channel, style))
+        picture = to_bytes(torch.cat(parts).view(cameras.height, cameras.width, 3))
         self.rate = 0.5 * self.rate + 0.5 * len(rays) / max(time.perf_counter() - began, 1e-4)
         return np.ascontiguousarray(picture)

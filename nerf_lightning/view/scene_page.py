@@ -7,15 +7,13 @@ from nerf_lightning.drawing.ink import GREEN, GREY, MAUVE, SKY, VERMILLION, rgb
 from nerf_lightning.view.drawing import (
     box_edges,
     colour_points,
+    home_of,
     overview,
     path_segments,
     random_rays,
     ray_figure,
-    scene_scale,
 )
 from nerf_lightning.view.page import Page
-
-ONE_EACH, MANY, NO_RAYS = "one from each camera", "many from one camera", "none"
 
 
 class ScenePage(Page):
@@ -27,7 +25,8 @@ class ScenePage(Page):
     """
 
     def __init__(self, scene: Scene, host: str, port: int):
-        super().__init__(scene.name, overview(scene), scene_scale(scene), host, port)
+        _, distance = home_of(scene.orbit)
+        super().__init__(scene.name, overview(scene), distance, host, port)
         self.scene = scene
         self.seed = 0
         """Of the random pixels."""
@@ -37,9 +36,6 @@ class ScenePage(Page):
             self._add_surroundings()
             self._add_controls()
             self.draw_rays()
-
-    def visited(self, view: int) -> None:
-        self.camera.value = view  # type: ignore[misc]  # settable, whatever its annotations say
 
     def _add_surroundings(self) -> None:
         scene = self.server.scene
@@ -64,12 +60,9 @@ class ScenePage(Page):
                 self.switch(word, self.server.scene.get_handle_by_name(f"/{word}"))
             self.add_camera_switches()
         with gui.add_folder("rays", expand_by_default=False):
-            self.which = gui.add_dropdown("rays", (NO_RAYS, ONE_EACH, MANY))
-            self.camera = gui.add_slider("camera", 0, len(self.scene.train) - 1, 1, 0, hint="which training camera")
-            self.count = gui.add_slider("how many", 1, 256, 1, 32, hint="rays from one camera")
+            self.rays = gui.add_slider("rays", 0, 64, 1, 0, hint="from each training camera")
             self.samples = gui.add_slider("samples", 1, 256, 1, 64, hint="on each ray")
-            self.jitter = gui.add_checkbox("jitter", False, hint="stratified samples, as in training")
-            for control in (self.which, self.camera, self.count, self.samples, self.jitter):
+            for control in (self.rays, self.samples):
                 control.on_update(lambda _: self.draw_rays())
             button = gui.add_button("other rays", hint="through new random pixels")
             button.on_click(lambda _: self.draw_rays(again=True))
@@ -78,16 +71,13 @@ class ScenePage(Page):
         """Draws the rays that the controls ask for; the same pixels as before unless `again`."""
         with self.redrawing, self.server.atomic():
             self.seed += again
-            self.ray_group.visible = self.which.value != NO_RAYS
+            self.ray_group.visible = self.rays.value > 0
             if not self.ray_group.visible:
                 return
-            generator = torch.Generator().manual_seed(self.seed)
             cameras = self.scene.train.cameras
-            many = self.which.value == MANY
-            views = torch.full((self.count.value,), self.camera.value) if many else torch.arange(len(cameras))
-            rays = random_rays(cameras, views, generator)
-            jitter = generator if self.jitter.value else None
-            figure = ray_figure(rays, self.scene.bounds, self.samples.value, self.scale, jitter)
+            views = torch.arange(len(cameras)).repeat_interleave(self.rays.value)
+            rays = random_rays(cameras, views, torch.Generator().manual_seed(self.seed))
+            figure = ray_figure(rays, self.scene.bounds, self.samples.value, self.scale)
             self.lines("/rays/approach", figure.approach, rgb(SKY))
             self.lines("/rays/inside", figure.inside, rgb(GREEN))
             self.points("/rays/samples", figure.samples, rgb(VERMILLION), 0.006)

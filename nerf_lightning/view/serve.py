@@ -1,6 +1,5 @@
 """Where a page is served, who can see it, and whether it can be served at all. Imports nothing heavy."""
 
-import ipaddress
 import socket
 
 from nerf_lightning.errors import InputError
@@ -21,8 +20,7 @@ def resolve_host(host: str) -> str:
     try:
         if not host:  # would mean every address
             raise OSError("nothing")
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.create_server((host, 0), family=family) as server:
+        with socket.create_server((host, 0)) as server:
             return server.getsockname()[0]
     except OSError as error:
         todo = "127.0.0.1 for this machine alone, 0.0.0.0 to share the page with the network"
@@ -38,9 +36,8 @@ def announce(name: str, host: str, wanted: int, port: int) -> str:
         host: where it is served.
         wanted, port: the port that was asked for, 0 for any, and the one that it has.
     """
-    address = resolve_host(host)
-    shared = not ipaddress.ip_address(address).is_loopback
-    seen = "127.0.0.1" if address == "0.0.0.0" else "[::1]" if address == "::" else f"[{host}]" if ":" in host else host
+    seen = "127.0.0.1" if host == "0.0.0.0" else host
     taken = f" (port {wanted} is taken)" if port != wanted != 0 else ""
+    shared = not resolve_host(host).startswith("127.")
     network = f"; shared with the network (--host {host}): all who reach this machine can see it" if shared else ""
     return f"{name}: http://{seen}:{port}{taken}{network}"

@@ -19,12 +19,9 @@ def test_slug_of_long_text_is_cut_and_stays_distinct():
 @pytest.mark.parametrize(
     ("arguments", "folder"),
     [
-        (["-m", "+experiment=lego", "seed=0,1"], "outputs/lego/sweep_seed=0,1"),
-        (["seed=0,1", "--multirun", "+experiment=lego", "hydra/launcher=joblib"], "outputs/lego/sweep_seed=0,1"),
+        (["seed=0,1", "-m", "+experiment=lego", "hydra/launcher=joblib"], "outputs/lego/sweep_seed=0,1"),
         (["-m", "model.width=1,2", "name=mine", "+experiment=lego"], "outputs/mine/sweep_model.width=1,2"),
         (["+experiment=study_grid"], "outputs/study_grid/sweep"),
-        (["-m", "+experiment=lego,fox", "seed=0"], "outputs/lego,fox/sweep_seed=0"),
-        (["-m", "+new.key=2", "seed=0,1"], "outputs/run/sweep_new.key=2_seed=0,1"),
         (["-m", "overwrite=true", "seed=0,1"], "outputs/run/sweep_seed=0,1"),
         (["-m", "~callbacks.orbit", "seed=0,1"], "outputs/run/sweep_seed=0,1_-callbacks.orbit="),
     ],

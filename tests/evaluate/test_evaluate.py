@@ -8,6 +8,7 @@ import types
 from pathlib import Path
 
 import imageio.v3 as imageio
+import pandas as pd
 import pytest
 import torch
 
@@ -15,10 +16,11 @@ from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.evaluate import perceptual
-from nerf_lightning.evaluate.metrics import ViewMetrics, average, format_table
+from nerf_lightning.evaluate.metrics import DIGITS, format_table, to_json
 from nerf_lightning.evaluate.perceptual import perceptual_distance
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.training.train import train
+from nerf_lightning.utils.device import CPU
 
 
 @pytest.fixture
@@ -63,11 +65,11 @@ def test_pictures_too(tmp_path: Path):
     assert view["psnr"] == pytest.approx(results["psnr"], abs=0.02)
 
 
-def test_means_are_of_what_could_be_told():
-    metrics = [ViewMetrics(0, 20.0, math.nan, None, 1.0), ViewMetrics(1, 30.0, 0.5, None, 3.0)]
-    assert average(metrics) == {"psnr": 25.0, "ssim": None, "lpips": None, "seconds": 2.0}
-    broken = format_table([ViewMetrics(0, math.nan, math.nan, None, 1.0)])
-    assert [list(column.cells)[0] for column in broken.columns] == ["0", "-", "-", "-", "1.000"]
+def test_figures_that_a_view_lacks_have_no_mean():
+    views = pd.DataFrame([(20.0, math.nan, math.nan, 1.0), (30.0, 0.5, math.nan, 3.0)], columns=list(DIGITS))
+    mean = to_json(views, Path("run"), {}, CPU)["mean"]
+    assert mean == {"psnr": 25.0, "ssim": None, "lpips": None, "seconds": 2.0}
+    assert format_table(views).splitlines()[1].split() == ["0", "20.00", "-", "-", "1.000", "<-", "worst"]
 
 
 def test_lpips_is_told_where_its_weights_are_and_nothing_is_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

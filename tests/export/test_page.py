@@ -309,17 +309,6 @@ def test_picture_page_holds_the_image_without_loss():
     assert text.count("<img") == 1
 
 
-def test_picture_page_shows_the_whole_image(browser: Any, tmp_path: Path):
-    (tmp_path / "field.html").write_text(picture_page(np.zeros((30, 60, 3), np.uint8), "made", []), encoding="utf-8")
-    page = browser.new_page(viewport={"width": 300, "height": 300})
-    page.goto((tmp_path / "field.html").as_uri())
-    page.wait_for_selector("#picture[style]")
-    assert page.locator("#picture").bounding_box() == {"x": 0, "y": 42, "width": 300, "height": 150}, (
-        "above the toolbar"
-    )
-    page.close()
-
-
 def test_voxels_like_has_the_same_density():
     cfg = composed(["recipe=mlp_small"], Path("unused"))
     frame, orbit, _ = frame_from(scene_of(False), "made")

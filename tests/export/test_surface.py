@@ -50,12 +50,6 @@ def test_small_pieces_float_and_are_left_out_but_others_stay():
     assert trimesh.Trimesh(surface.vertices, surface.faces).body_count == 2
 
 
-def test_what_the_box_cuts_is_closed_there():
-    mesh = mesh_of(volume(((0.0, 0.0, -1.0), 0.8)), 0.5)
-    assert mesh.is_watertight
-    assert mesh.bounds[0, 2] >= -1.0 - CELL
-
-
 def test_the_threshold_stands_between_the_thin_and_the_dense():
     generator = np.random.default_rng(0)
     thin, dense = generator.normal(0.15, 0.03, 4000), generator.normal(0.9, 0.02, 1000)

@@ -1,13 +1,11 @@
 """The photos of a run read back: those it was trained on or none, from anywhere, and never from the network."""
 
-import shutil
 import urllib.request
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-import yaml
 
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
@@ -65,7 +63,7 @@ def test_downloaded_scene_is_found_from_any_folder(published: Path, tmp_path: Pa
 
 def test_built_in_scene_is_not_replaced_by_a_download(tmp_path: Path):
     run = a_run(tmp_path / "run", f"dataset.folder={tmp_path}")
-    assert again(run).name == "bricks"
+    assert again(run).name == "bricks", "and the network is not asked"
     save_npz(bricks(size=16, train_views=4, val_views=2), tmp_path / "published.npz")
     with pytest.raises(
         InputError, match="found the scene 'published', expected 'bricks', which the run was trained on"

@@ -31,16 +31,13 @@ def outputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "outputs"
 
 
-def test_find_run_takes_runs_and_files_as_they_are(outputs: Path):
+def test_find_run_takes_runs_and_files_as_they_are_and_the_newest_of_a_folder(outputs: Path):
     Path("small.npz").touch()
     assert find_run(Path("outputs/lego/2")) == Path("outputs/lego/2")
     assert find_run("small.npz") == Path("small.npz")
-
-
-def test_find_run_takes_the_newest_of_a_folder_and_of_all(outputs: Path):
     assert find_run(Path("outputs/lego")) == Path("outputs/lego/1")
     assert find_run() == Path("outputs/chair/sweep/seed=0")
-    os.utime("outputs/lego/2/results.json", (500, 500))
+    os.utime("outputs/lego/2/checkpoints/last.ckpt", (500, 500))
     assert find_run() == Path("outputs/lego/2")
 
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,8 +12,7 @@ import yaml
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
-from nerf_lightning.runs.folder import load_config, load_run
-from nerf_lightning.runs.trusted import SWEEP_CALLBACK, TRUST, shipped_targets
+from nerf_lightning.runs.folder import SWEEP_CALLBACK, TRUST, load_config, load_run, shipped_targets
 
 
 @pytest.fixture
@@ -38,11 +36,9 @@ def test_load_config_takes_what_conf_names(config: dict, tmp_path: Path):
     "target",
     [
         "os.system",
-        "builtins.eval",
         "nerf_lightning.utils.files.os.system",  # reachable through the package, but not of it
         "nerf_lightning.dataset.save_npz",  # of the package, but writes wherever it is told to
         "nerf_lightning.training.sweep.SweepReport",
-        "from_bricks",
         ["nerf_lightning.callbacks.Orbit"],
     ],
 )
@@ -120,38 +116,25 @@ CONFIG, SCENE, CHECKPOINT = "config.yaml", "scene.json", "checkpoints/last.ckpt"
 DAMAGES: list[tuple[str, Callable[[Path], object], str]] = [
     (CONFIG, Path.unlink, "nothing there"),
     (CONFIG, cut_before_schedule, "nothing"),
-    (CONFIG, lambda path: path.write_text("[" * 5000), "no YAML"),
-    (CONFIG, lambda path: path.write_text("- 1\n- 2"), "mapping"),
-    (CONFIG, lambda path: path.write_text("\x00"), "no YAML"),
     (CONFIG, lambda path: path.write_text(f"!!python/object/apply:os.mkdir ['{path.parent}/run']"), "no YAML"),
     (CONFIG, change(version="9.9"), "version 9.9"),
-    (CONFIG, change(version=None), "no version"),
     (CONFIG, change(dataset="lego"), "options by name"),
-    (CONFIG, change(callbacks=[1]), "callbacks"),
     (CONFIG, change(logger=[0, float("nan")]), "finite"),
     (CONFIG, change(model__hue=3), "unknown option"),
-    (CONFIG, change(model__width="???"), "???"),
     (CONFIG, change(optimizer__betas=[]), "optimizer"),
     (SCENE, Path.unlink, "nothing there"),
     (SCENE, cut, "broken JSON"),
     (SCENE, lambda path: path.write_text("[]"), "list"),
     (SCENE, change(orbit=None), "KeyError"),
     (SCENE, change(orbit__width=10**6, orbit__height=10**6), "pixels"),
-    (SCENE, change(orbit__c2w=[]), "c2w"),
-    (SCENE, change(orbit=[]), "scene of a run"),
     (SCENE, change(aabb=[[0, 0, 0], [1, 1, float("nan")]]), "nan"),
-    (SCENE, change(near="close"), "near"),
     (SCENE, change(background=[1, 1]), "background"),
     (SCENE, change(to_source=[[0] * 4] * 4), "to_source"),
     (CHECKPOINT, Path.unlink, "nothing there"),
     (CHECKPOINT, cut, "whole checkpoint"),
     (CHECKPOINT, flip_bit, "other bytes"),
-    (CHECKPOINT, lambda path: path.write_text("text"), "whole checkpoint"),
-    (CHECKPOINT, lambda path: path.write_bytes(pickle.dumps(Payload(path.parent / "run"), 2)), "whole checkpoint"),
     (CHECKPOINT, save(lambda path: {"state_dict": Payload(path.parent / "run")}), "whole checkpoint"),
-    (CHECKPOINT, save(lambda path: [1]), "state_dict"),
     (CHECKPOINT, save(lambda path: {"state_dict": {}}), "state_dict"),
-    (CHECKPOINT, save(lambda path: {"state_dict": [1]}), "state_dict"),
     (CHECKPOINT, lambda path: change(model__width=128)(path.parents[1] / CONFIG), "this run's model"),
     (CHECKPOINT, with_nan, "nan or infinity"),
 ]
@@ -177,11 +160,10 @@ def test_read_checkpoint_to_resume_needs_more_than_weights(small_run: Path, tmp_
         read_checkpoint(tmp_path / "a.ckpt", RESUME_KEYS)
 
 
-@pytest.mark.parametrize("part", ["state_dict", "optimizer_states"])
-def test_resuming_from_a_state_of_another_run_is_one_line(part: str, small_run: Path, inside, tmp_path: Path):
+def test_resuming_from_a_state_of_another_run_is_one_line(small_run: Path, inside, tmp_path: Path):
     folder = Path(shutil.copytree(small_run, tmp_path / "run"))
     state = torch.load(folder / CHECKPOINT, weights_only=True)
-    state[part] = {} if part == "state_dict" else [{"state": {}, "param_groups": []}]
+    state["optimizer_states"] = [{"state": {}, "param_groups": []}]
     torch.save(state, folder / CHECKPOINT)
     before = {path: path.read_bytes() for path in folder.glob("*.json")}
     code, _, err = inside(f"resume={folder}", "budget.steps=12")

@@ -32,9 +32,7 @@ def test_read_run_reads_results_and_options(tmp_path: Path):
     [
         (None, "unfinished", "no results.json"),
         ('{"psnr": 3', "unreadable", "results.json"),
-        ("[" * 5000, "unreadable", "RecursionError"),
         ("[1, 2]", "unreadable", "list"),
-        ("{}", "unreadable", ""),
         ({"psnr": None, "status": "failed", "diagnosis": "out of memory", "curve": None}, "failed", "out of memory"),
         ({"psnr": "high", "status": "finished", "curve": [[1, 2], "x", [1, 2, "y"]]}, "finished", ""),
     ],
@@ -45,21 +43,11 @@ def test_read_run_of_broken_results_has_no_figures(results: object, status: str,
     assert run.psnr is None and run.curve == []
 
 
-@pytest.mark.parametrize(
-    "text", ["[" * 5000, "a: &a [*a]", "a: [1", "- 1\n- 2", "!!python/object/apply:os.getcwd []", ""]
-)
+@pytest.mark.parametrize("text", ["a: &a [*a]", "- 1\n- 2", "!!python/object/apply:os.getcwd []", ""])
 def test_read_run_of_a_broken_configuration_has_none(text: str, tmp_path: Path):
     folder = made(tmp_path, "a", None, {"status": "finished"})
     (folder / "config.yaml").write_text(text)
     assert read_run(folder).config == {}
-
-
-def test_find_runs_sorts_by_numbers(tmp_path: Path):
-    for value in ("10", "2", "1e-3", "0.05"):
-        made(tmp_path, f"deep/lr={value},x=1", None, {"status": "finished"})
-    (tmp_path / "notes").mkdir()
-    names = [run.folder.name for run in find_runs(tmp_path)]
-    assert names == [f"lr={value},x=1" for value in ("1e-3", "0.05", "2", "10")]
 
 
 def test_find_runs_refuses_a_folder_without_runs(tmp_path: Path):

@@ -47,12 +47,9 @@ def test_csv(inside, tmp_path: Path):
     results = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
     folder = tmp_path / "run" / "csv" / "version_0"
     with (folder / "metrics.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    figures = {key: float(value) for row in rows for key, value in row.items() if value}
+        figures = {key: float(value) for row in csv.DictReader(file) for key, value in row.items() if value}
     assert [figures["val/psnr"], figures["final/psnr"]] == pytest.approx([results["psnr"]] * 2, abs=1e-4)
-    assert figures["final/artifact_bytes"] == results["artifact_bytes"] and figures["step"] == 3
-    options = yaml.safe_load((folder / "hparams.yaml").read_text(encoding="utf-8"))
-    assert (options["seed"], options["budget"]["steps"]) == (3, 3)
+    assert yaml.safe_load((folder / "hparams.yaml").read_text(encoding="utf-8"))["seed"] == 3
 
 
 @pytest.mark.parametrize("extra", ["wandb", "mlflow"])
@@ -63,20 +60,6 @@ def test_a_service_whose_package_is_missing_is_told_in_a_line(
     code, _, err = inside(*SMALL, f"logger={extra}")
     assert code == 2 and err.count("\n") == 1 and f"pip install 'nerf_lightning[{extra}]', or logger=csv" in err
     assert not list(tmp_path.iterdir())
-
-
-def test_where_services_are_asked_to_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = SimpleNamespace(WandbLogger=lambda *a, **k: (a, k), MLFlowLogger=lambda *a, **k: (a, k))
-    for name in ("wandb", "mlflow"):
-        monkeypatch.setitem(sys.modules, name, ModuleType(name))
-    for name, make in vars(made).items():
-        monkeypatch.setattr(loggers, name, make)
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    wandb, mlflow = (getattr(loggers, name).__wrapped__ for name in ("wandb", "mlflow"))
-    assert wandb(tmp_path, "mine", "first", True) == (("first", tmp_path), {"project": "mine", "offline": True})
-    assert mlflow(tmp_path, "mine", "first") == (("mine", "first"), {"tracking_uri": "sqlite:///mlflow.db"})
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://tracking.example")
-    assert mlflow(tmp_path)[1] == {"tracking_uri": "http://tracking.example"}
 
 
 def test_each_training_has_a_run_of_its_own_at_weights_and_biases(monkeypatch: pytest.MonkeyPatch):

@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -23,9 +21,7 @@ from nerf_lightning.runs.owner import LOCK, MARKER
 from nerf_lightning.synthetic.objects import MARBLE, make_scene
 from nerf_lightning.system import NeRF2D
 from nerf_lightning.utils.device import CPU, devices, synchronize, the_device
-from nerf_lightning.utils.machine import accelerator, device_in_words
-
-ROOT = Path(__file__).resolve().parents[2]
+from nerf_lightning.utils.machine import device_in_words
 
 
 @pytest.fixture
@@ -70,57 +66,19 @@ def test_auto_is_the_best_device(monkeypatch: pytest.MonkeyPatch, plain_torch: N
     assert the_device("auto") == the_device("mps") == torch.device("mps")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert the_device("auto") == torch.device("cuda") and the_device("cpu") == CPU
-
-
-@pytest.mark.parametrize("name", ["cuda", "mps", "gpu", "privateuseone"])
-def test_the_device_missing_says_what_is_there(name: str, plain_torch: None):
-    with pytest.raises(InputError, match=f"found '{name}', expected auto, or what is there: cpu") as refused:
-        the_device(name)
-    assert ("install PyTorch for CUDA" in str(refused.value)) == (name == "cuda")
-
-
-REGISTERED = """
-import types, torch
-from nerf_lightning.utils.device import devices, synchronize, the_device
-from nerf_lightning.errors import InputError
-
-def missing():
-    try:
-        the_device("pretend")
-    except InputError:
-        return True
-
-torch.utils.rename_privateuse1_backend("pretend")
-assert missing(), "a name without a module"
-waited = []
-module = types.SimpleNamespace(is_available=lambda: False, synchronize=lambda: waited.append(1))
-torch._register_device_module("pretend", module)
-assert missing()
-module.is_available = lambda: True
-assert the_device("pretend").type == "pretend" and devices()[-1] == "pretend" != the_device("auto").type
-synchronize(torch.device("pretend"))
-assert waited
-"""
-
-
-def test_registered_backend_is_found():
-    """In a process of its own: it is registered for good."""
-    done = subprocess.run([sys.executable, "-c", REGISTERED], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
+    with pytest.raises(InputError, match="found 'gpu', expected auto, or what is there: cuda, mps, cpu"):
+        the_device("gpu")
 
 
 def test_trainer_uses_the_device(tmp_path: Path, plain_torch: None):
-    for given in (["device=cpu"], ["trainer.accelerator=cpu"], ["device=cuda", "trainer.accelerator=cpu"], []):
+    for given in ([], ["device=cuda", "trainer.accelerator=cpu"]):
         cfg = composed([*given, "callbacks=picture", "~logger"], tmp_path)
         assert device_of(cfg) == CPU
         assert build_trainer(cfg, tmp_path, CPU).strategy.root_device == CPU
     assert composed(["device=mps"], tmp_path).trainer.accelerator == "mps"
 
 
-@pytest.mark.parametrize(
-    ("device", "batch", "chunk"),
-    [("cpu", 1, 32768), ("cuda", 4, 524288), ("mps", 4, 131072), ("xpu", 1, 32768)],
-)
+@pytest.mark.parametrize(("device", "batch", "chunk"), [("cuda", 4, 524288), ("xpu", 1, 32768)])
 def test_limits_follow_device_and_run(device: str, batch: int, chunk: int):
     where = torch.device(device)
 
@@ -146,15 +104,6 @@ def test_chunk_follows_the_device(tmp_path: Path):
     assert isinstance(flat, NeRF2D) and flat.chunk == 5
 
 
-def test_batch_follows_limits(inside, tmp_path: Path):
-    given = ["+experiment=smoke_2d", "dataset.max_side=16", "dataset.pixels=10", "budget.steps=3", "~logger"]
-    plain = ["callbacks.training_gif=null", "callbacks.charts=null", "callbacks.baselines=null"]
-    assert inside(*given, *plain, "limits.batch=7")[0] == 0
-    (path,) = tmp_path.rglob("last.ckpt")
-    told = torch.load(path, weights_only=True)["callbacks"]["Throughput"]
-    assert told["rays"] == 3 * 70
-
-
 def test_resumed_batch_is_scaled_to_the_device():
     picture = PixelDataModule(Picture("sunset", "test", builtin_picture(8)), pixels=10)
     picture.enlarge(4)
@@ -173,26 +122,16 @@ def test_resumed_batch_is_scaled_to_the_device():
     assert other.rays == 100
 
 
-def test_accelerators_are_named(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "H100")
-    monkeypatch.setattr(torch.backends.mps, "get_name", lambda: "Apple M9", raising=False)
-    told = {name: accelerator(torch.device(name)) for name in ("cpu", "cuda:1", "mps", "xpu")}
-    assert told == {"cpu": None, "cuda:1": "H100", "mps": "Apple M9", "xpu": "xpu"}
-    words = [device_in_words(torch.device(name)) for name in ("cpu", "cuda:1", "mps", "xpu")]
-    assert words == ["cpu", "cuda (H100)", "mps (Apple M9)", "xpu"]
-
-
-def test_peak_memory_is_that_of_the_device(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 5)
-    monkeypatch.setattr(torch.mps, "driver_allocated_memory", lambda: 7)
-    assert (peak_memory_bytes(torch.device("cuda:1")), peak_memory_bytes(torch.device("mps"))) == (5, 7)
-    assert (peak_memory_bytes(CPU) or 0) > 1000
-
-
-def test_synchronize_waits_for_the_device(monkeypatch: pytest.MonkeyPatch):
+def test_accelerators_are_named_measured_and_waited_for(monkeypatch: pytest.MonkeyPatch):
     waited = []
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda: waited.append("cuda"))
-    monkeypatch.setattr(torch.mps, "synchronize", lambda: waited.append("mps"))
+    for kind, name, memory in ((torch.cuda, "get_device_name", "max_memory_allocated"), (torch.mps, "", "")):
+        monkeypatch.setattr(kind, "synchronize", lambda kind=kind: waited.append(kind))
+        if name:
+            monkeypatch.setattr(kind, name, lambda device: "H100")
+            monkeypatch.setattr(kind, memory, lambda device: 5)
+    words = [device_in_words(torch.device(name)) for name in ("cpu", "cuda:1", "xpu")]
+    assert words == ["cpu", "cuda (H100)", "xpu"]
+    assert peak_memory_bytes(torch.device("cuda:1")) == 5 and (peak_memory_bytes(CPU) or 0) > 1000
     for name in ("cpu", "cuda", "mps"):
         synchronize(torch.device(name))
-    assert waited == ["cuda", "mps"]
+    assert waited == [torch.cuda, torch.mps]

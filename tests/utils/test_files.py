@@ -35,19 +35,13 @@ def test_atomic_replaces_the_file_at_the_end(tmp_path: Path):
 
 
 @pytest.mark.parametrize("kind", [atomic, atomic_folder])
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_failed_write_leaves_nothing(kind, error: type[BaseException], tmp_path: Path):
-    (tmp_path / "a.txt").write_text("old")
-    with pytest.raises(error), kind(tmp_path / "b.txt"):
-        raise error
-    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
-
-
-def test_atomic_folder_replaces_the_folder(tmp_path: Path):
+def test_failed_write_leaves_what_was_there(kind, tmp_path: Path):
     for name in ("first", "second"):
         with atomic_folder(tmp_path / "made") as folder:
             (folder / name).touch()
-    assert [path.name for path in (tmp_path / "made").iterdir()] == ["second"] and len(list(tmp_path.iterdir())) == 1
+    with pytest.raises(KeyboardInterrupt), kind(tmp_path / "made.txt"):
+        raise KeyboardInterrupt
+    assert [str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")] == ["made", "made/second"]
 
 
 def test_full_disk_keeps_what_was_there(tmp_path: Path):
@@ -94,13 +88,8 @@ def test_write_json_is_strict(tmp_path: Path):
 def test_user_path_expands_home(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("HOME", "/home/me")
     assert user_path("~/photos") == Path("/home/me/photos") and user_path("a/b") == Path("a/b")
-
-
-@pytest.mark.parametrize("name", ["~nosuchuser/a", "a" * 5000, "a\0b"])
-def test_user_path_refuses_impossible_names(name: str):
-    with pytest.raises(InputError, match="expected a path") as refused:
-        user_path(name)
-    assert len(str(refused.value)) < 200
+    with pytest.raises(InputError, match="~nosuchuser/a: found the home of an unknown user"):
+        user_path("~nosuchuser/a")
 
 
 def test_output_path_takes_new_folders_and_refuses_files_and_read_only_ones(tmp_path: Path, monkeypatch):

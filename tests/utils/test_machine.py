@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nerf_lightning.utils.machine import Load, crowding, describe_machine
+from nerf_lightning.utils.machine import crowding, describe_machine
 
 
 def test_describe_machine_names_the_processor():
@@ -20,16 +20,3 @@ def test_crowding_is_the_share_that_others_take_of_the_run(cores: int, threads: 
     assert crowding(results) == pytest.approx(share)
     for changes in ({"load": None}, {"machine": "mine"}, {"threads": "two"}, {"load": {}}):
         assert crowding(results | changes) is None
-
-
-def test_load_counts_between_start_and_stop(monkeypatch: pytest.MonkeyPatch):
-    clocks = iter([(5.0, 5.0, 10.0), (5.2, 5.2, 10.4), (14.2, 6.2, 29.4), (16.0, 8.0, 31.5)])
-    monkeypatch.setattr(Load, "_now", staticmethod(lambda: next(clocks)))
-    load = Load()
-    load.stop()
-    load.start()
-    load.stop()
-    assert load.cores() is None, "too short to tell"
-    load.start()
-    load.stop()
-    assert load.cores() == {"own": 1.0, "others": 0.25}

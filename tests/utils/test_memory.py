@@ -34,7 +34,6 @@ def test_field_larger_than_memory_is_refused_before_training(tmp_path, monkeypat
     ("size", "error"),
     [
         ("5200 bytes", RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 5200 bytes.")),
-        ("7.45 GiB", MemoryError("Unable to allocate 7.45 GiB for an array with shape (1000000000,)")),
         ("20.00 GiB", torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total")),
         ("a tensor", MemoryError()),
     ],

@@ -24,8 +24,3 @@ def test_first_draws_of_consecutive_steps_are_independent():
     assert abs(float(values.mean()) - 0.5) < 0.03 and abs(float(values.std()) - 12**-0.5) < 0.02
     correlation = torch.corrcoef(torch.stack([values[:-1], values[1:]]))[0, 1]
     assert abs(float(correlation)) < 0.08
-
-
-def test_step_generator_takes_any_whole_number():
-    for seed, step in ((-5, 0), (2**63, 2**31), (0, 10**12)):
-        assert len(draw(seed, Stream.STEP, step)) == 3

@@ -2,14 +2,10 @@
 
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from nerf_lightning.utils.files import atomic, atomic_folder
 from nerf_lightning.utils.signals import (
     SIGNALS,
     Interrupted,
@@ -19,7 +15,6 @@ from nerf_lightning.utils.signals import (
     raise_if_signalled,
     received_signal,
 )
-from tests.helpers.command_line import ROOT
 
 
 @pytest.fixture(params=SIGNALS, ids=lambda signum: signum.name)
@@ -45,12 +40,6 @@ def test_deferred_signal_is_raised_after_the_outer_block(signum: int, capfd: pyt
             signal.raise_signal(signum)
         done.append("outer block")
     assert done and capfd.readouterr().err.count("\n") == 1, "says at once that it has heard"
-
-
-def test_deferred_signal_does_not_replace_an_error(signum: int):
-    with handle_signals(), pytest.raises(KeyError), defer_signals():
-        signal.raise_signal(signum)
-        raise KeyError
 
 
 def test_part_of_a_deferring_block_may_be_interrupted(signum: int):
@@ -88,17 +77,3 @@ def test_command_line_exits_with_a_line(error: type[Exception] | None, signum: i
     assert end.value.code == 128 + signum
     line = capsys.readouterr().err
     assert signal.Signals(signum).name in line and line.count("\n") == 1 and ("resume it" in line) == (error is None)
-
-
-@pytest.mark.parametrize("kind", [atomic, atomic_folder])
-def test_interrupted_write_leaves_nothing(kind, signum: int, tmp_path: Path):
-    with handle_signals(), pytest.raises(Interrupted), kind(tmp_path / "new"):
-        signal.raise_signal(signum)
-    assert not list(tmp_path.iterdir())
-
-
-def test_import_leaves_handlers_alone():
-    probe = "import signal; before = signal.getsignal(signal.SIGTERM); import nerf_lightning.cli.app;"
-    probe += "assert signal.getsignal(signal.SIGTERM) is before"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    subprocess.run([sys.executable, "-c", probe], env=environment, check=True)

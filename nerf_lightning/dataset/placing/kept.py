@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.errors import InputError, Unwritable
+from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.utils.files import atomic_folder, cache_folder, write_json
 from nerf_lightning.utils.parsing import read_json
 
@@ -53,17 +53,17 @@ def kept_folder(
         log.info("%s was made of other files, or is not whole: it is made again", folder)
     try:
         return _filled(beside, sources, fill)
-    except (OSError, Unwritable) as error:
+    except (OSError, NoRoom) as error:
         log.warning("%s cannot be written (%s): %s is, instead", beside, _reason(error), cached)
     try:
         return _filled(cached, sources, fill)
-    except (OSError, Unwritable) as error:
+    except (OSError, NoRoom) as error:
         todo = "set NERF_LIGHTNING_CACHE to one that can"
         raise InputError(cached, "", _reason(error), "a folder that can be written", todo) from error
 
 
-def _reason(error: OSError | Unwritable) -> str:
-    return error.found if isinstance(error, Unwritable) else str(error.strerror)
+def _reason(error: OSError | NoRoom) -> str:
+    return error.found if isinstance(error, NoRoom) else str(error.strerror)
 
 
 def _filled(folder: Path, sources: dict[str, Any], fill: Callable[[Path], None]) -> Path:

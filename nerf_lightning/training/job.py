@@ -1,0 +1,103 @@
+"""One job of a sweep: skipped if it is done, resumed if it was stopped, and recorded if it fails."""
+
+import sys
+import traceback
+from contextlib import suppress
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from nerf_lightning.config.options import check_run_options
+from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
+from nerf_lightning.runs.folder import plain_config, save_config
+from nerf_lightning.runs.index import FINISHED, Run, find_runs, read_run
+from nerf_lightning.runs.owner import Taken, already, holds_run, leads, owned
+from nerf_lightning.training.sweep import ERROR, write_table
+from nerf_lightning.training.train import train
+from nerf_lightning.utils.files import full_disk, remove, write_json, write_text
+from nerf_lightning.utils.signals import handle_signals
+
+
+def run_job(cfg: DictConfig) -> float | None:
+    """Trains one job of a sweep in Hydra's folder.
+
+    Returns:
+        The held-out PSNR in dB; None for a job that failed.
+
+    Raises:
+        NoRoom, OSError: for a full disk, which would end the other jobs too.
+    """
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    root = Path(HydraConfig.get().sweep.dir)
+    try:
+        with handle_signals(), owned(folder):  # this may be a process of a launcher
+            try:
+                return continue_job(cfg, folder)
+            except Exception as error:  # noqa: BLE001  (recorded with its traceback; the other jobs must go on)
+                if leads():
+                    record_error(folder, cfg, error)
+                if full_disk(error):  # and for the jobs after it
+                    raise
+                return None
+    except Taken as error:  # as by the same command a second time: what it does is not done twice
+        print(f"{folder.name}: {error}", file=sys.stderr, flush=True)
+        return None
+    finally:
+        with suppress(InputError):  # interrupted before any job wrote something, or a full disk, which has been told
+            if leads():
+                write_table(root, find_runs(root))
+
+
+def continue_job(cfg: DictConfig, folder: Path) -> float | None:
+    """The held-out PSNR of a job in a folder that this process owns, from now, from before, or from its last checkpoint on."""
+    check_run_options(cfg, HydraConfig.get().runtime.choices)
+    before = read_run(folder)
+    other = holds_run(folder) and before.config != plain_config(cfg)
+    if other and before.status != "failed" and not cfg.overwrite:
+        raise already(folder)
+    done, checkpoint = find_progress(before, cfg)
+    if leads():
+        for name in (ERROR,) if done is not None else (ERROR, "results.json"):
+            remove(folder / name)
+    if done is not None:
+        print(f"{folder.name}: done before ({done.status}, {done.quality})", flush=True)
+        return done.psnr
+    print(f"{folder.name}: {'starts' if checkpoint is None else 'continues from its last checkpoint'}", flush=True)
+    return train(cfg, checkpoint)
+
+
+def find_progress(run: Run, cfg: DictConfig) -> tuple[Run | None, Path | None]:
+    """How far a run is, if it has this configuration.
+
+    Returns:
+        The run, if it is finished; otherwise its last checkpoint, if there is one to continue from.
+    """
+    if run.config != plain_config(cfg):
+        return None, None
+    if run.status in FINISHED:
+        return run, None
+    last = run.folder / "checkpoints" / "last.ckpt"
+    try:
+        read_checkpoint(last, RESUME_KEYS)
+    except InputError:  # none yet, or a broken one: from the start
+        return None, None
+    return None, last
+
+
+def record_error(folder: Path, cfg: DictConfig, error: Exception) -> None:
+    """Writes what went wrong: to results.json, unless the run wrote one itself or an earlier run's must stay, and with its
+    traceback to error.txt; on a full disk as much of it as there is room for."""
+    diagnosis = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    diagnosis = " ".join(diagnosis.split())
+    print(f"{folder.name}: failed: {diagnosis}", file=sys.stderr, flush=True)
+    with suppress(NoRoom):
+        if not (folder / "config.yaml").exists():
+            with suppress(OmegaConfBaseException):  # the configuration itself may be what failed
+                save_config(cfg, folder)
+        if not isinstance(error, Taken) and read_run(folder).status != "failed":
+            results = {"method": cfg.get("method"), "seed": cfg.get("seed"), "status": "failed", "diagnosis": diagnosis}
+            write_json(folder / "results.json", results | {"psnr": None, "curve": [], "warnings": [], "recoveries": []})
+        write_text(folder / ERROR, "".join(traceback.format_exception(error)))
