@@ -12,7 +12,7 @@ from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.cameras.paths import orbit_like
 from nerf_lightning.dataset.extent import visible_cube
 from nerf_lightning.dataset.formats.decode import read_pixels
-from nerf_lightning.dataset.lens import Lens, Rectification, rectify
+from nerf_lightning.dataset.lens import Lens, rectify
 from nerf_lightning.dataset.posed import NEAR
 from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.resize import fit_size
@@ -23,12 +23,6 @@ from nerf_lightning.errors import InputError
 SUBJECT_WIDTH_FRACTION = 0.5
 """The box's share of the width that photos show at the subject. The tags around an object may lie outside the box, where a
 field has less detail the farther out."""
-
-
-def rectify_photo(path: Path, rectification: Rectification, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-    """A photo, upright, its distortion undone, averaged down to a size."""
-    image = rectification.apply(np.ascontiguousarray(read_pixels(path, upright=True)[..., :3]))
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def pack(
@@ -61,7 +55,12 @@ def pack(
         raise InputError(source, "", f"{len(paths)} placed photos", "at least 2: one to train on, one to hold out")
     rectification = rectify(lens)
     width, height = fit_size(lens.width, lens.height, longest)
-    images = torch.from_numpy(np.stack([rectify_photo(path, rectification, width, height) for path in paths]))
+
+    def rectify_photo(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+        image = rectification.apply(np.ascontiguousarray(read_pixels(path, upright=True)[..., :3]))
+        return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+    images = torch.from_numpy(np.stack([rectify_photo(path) for path in paths]))
     K = torch.from_numpy(rectification.K).float().repeat(len(paths), 1, 1)
     cameras = Cameras.of_size(K, torch.from_numpy(c2w).float(), lens.width, lens.height).resized((width, height))
     held = torch.zeros(len(paths), dtype=torch.bool)
