@@ -45,11 +45,7 @@ def measure_accuracy(folder: Path, seed: int) -> list[dict[str, Any]]:
         truth = write_capture(place, layout, LENS, SHEET_PHOTOS, views, FLAWS, seed, hide=hide)
         found = capture_scene(place / "calibration", place / "photos", SIZE, place / "scene.npz")
         sheet = found.calibration.solved
-        groups = {
-            "sheet": [
-                (inverse(sheet.w2c[i]), s.name) for i, s in zip(sheet.placed, found.calibration.used, strict=True)
-            ]
-        }
+        groups = {"sheet": [(inverse(w2c), photo) for photo, w2c in sheet.w2c.items()]}
         for by in ("tags", "texture") if hide else ("tags",):
             groups[by] = [(p.c2w, p.name) for p in found.photos if p.c2w is not None and (p.by or "tags") == by]
         for by, poses in groups.items():

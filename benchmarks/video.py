@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import shutil
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -14,13 +15,13 @@ from jaxtyping import Float, UInt8
 from benchmarks.cameras import similarity
 from benchmarks.capture import SHEETS
 from benchmarks.synthetic.photos import Flaws, render_photo
-from benchmarks.synthetic.video import FPS, place_cameras, with_blurs, write_video
+from benchmarks.synthetic.video import place_cameras, with_blurs, write_video
 from benchmarks.tables import Row, Rows
 from nerf_lightning.cameras import Distortion, in_other_frame
 from nerf_lightning.capture.poses.geometry import angle_between, inverse
 from nerf_lightning.dataset.intrinsics import Intrinsics
-from nerf_lightning.dataset.placing.frames import frames_of
-from nerf_lightning.dataset.placing.place import place
+from nerf_lightning.dataset.sfm.frames import write_frames
+from nerf_lightning.dataset.sfm.photos import place_photos
 from nerf_lightning.synthetic.tracer import map_shadow
 
 LENS = Intrinsics(480, 360, 420.0, 420.0, 242.0, 178.0, Distortion(k1=-0.1, k2=0.02))
@@ -42,8 +43,12 @@ def measure(args: argparse.Namespace) -> Rows:
     rows: Rows = []
     for count in COUNTS:
         started = time.perf_counter()
-        photos = frames_of(file, folder / f"frames_{count}", count)
-        taken = [round(float(photo.stem.removesuffix("s")) * FPS) for photo in photos]
+        frames = folder / f"frames_{count}"
+        shutil.rmtree(frames, ignore_errors=True)
+        frames.mkdir()
+        write_frames(file, frames, count)
+        photos = sorted(frames.glob("*.jpg"))
+        taken = [int(photo.stem) for photo in photos]
         blurred = range(1, len(c2w), 3)
         row: Row = {
             "frames": len(c2w),
@@ -55,7 +60,7 @@ def measure(args: argparse.Namespace) -> Rows:
         }
         if count == max(COUNTS):
             started = time.perf_counter()
-            row |= _errors(place(photos[0].parent), c2w, len(taken))
+            row |= _errors(place_photos(photos[0].parent), c2w, len(taken))
             row["placing_seconds"] = time.perf_counter() - started
         rows.append(row)
     return rows
@@ -83,7 +88,7 @@ def _errors(folder: Path, c2w: Float[np.ndarray, "N 4 4"], chosen: int) -> Row:
 
     model = pycolmap.Reconstruction(folder)
     images = [image for image in model.images.values() if image.has_pose]
-    truth = np.stack([c2w[round(float(image.name.removesuffix("s.jpg")) * FPS)] for image in images])
+    truth = np.stack([c2w[int(Path(image.name).stem)] for image in images])
     last = [[0.0, 0.0, 0.0, 1.0]]
     found = np.stack([inverse(np.concatenate([image.cam_from_world().matrix(), last])) for image in images])
     moved = aligned(found, truth)

@@ -10,8 +10,8 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import output_path, user_path
 from nerf_lightning.utils.options import AtLeast, AtMost
 
-TagSize = Annotated[float, AtLeast(1e-4), AtMost(10)]
-"""Metres: printers make no smaller dots, and photos hold no larger tags."""
+TagSize = Annotated[float, AtLeast(1e-4), AtMost(1)]
+"""Metres: printers make no smaller dots, and larger numbers are in another unit."""
 Squares = Annotated[int, AtLeast(3), AtMost(1000)]
 """Along a side of a chessboard with inner corners."""
 

@@ -6,13 +6,13 @@ from pathlib import Path
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.colmap import MODEL_FOLDERS, PHOTO_FOLDERS, find_models, load_colmap
 from nerf_lightning.dataset.formats.llff import POSES, load_llff
+from nerf_lightning.dataset.formats.names import list_images
 from nerf_lightning.dataset.formats.npz import load_npz
 from nerf_lightning.dataset.formats.transforms import load_blender, load_transforms
-from nerf_lightning.dataset.placing.frames import kept_frames
-from nerf_lightning.dataset.placing.photos import has_photos
-from nerf_lightning.dataset.placing.place import place as place_photos
-from nerf_lightning.dataset.placing.video import VIDEOS
 from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.sfm.frames import extract_frames
+from nerf_lightning.dataset.sfm.photos import place_photos
+from nerf_lightning.dataset.sfm.video import VIDEOS
 from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import user_path
@@ -72,10 +72,10 @@ def _open(place: Path, name: str | None, options: PhotoLoadOptions) -> Scene:
     if (place / POSES).is_file():
         return load_llff(place, name, options)
     if place.suffix.lower() in VIDEOS and place.is_file():
-        return _placed(kept_frames(place), name or place.stem, options)
+        return _placed(extract_frames(place), name or place.stem, options)
     placed_already = any((place / below).is_dir() for below in MODEL_FOLDERS if below)
     for below in () if placed_already else ("", *PHOTO_FOLDERS):  # a damaged model is not made again in silence
-        if has_photos(place / below):
+        if (place / below).is_dir() and list_images(place / below):
             return _placed(place / below, name or place.resolve().name, options)
     if place.is_dir():
         names = sorted(item.name for item in place.iterdir())

@@ -69,8 +69,8 @@ def test_calibrate_with_board_finds_lens_and_poses():
     seen = [Sighting(Path(f"{i}.png"), LENS.width, LENS.height, detect(grey)) for i, grey in enumerate(photos)]
     found = calibrate(Path("board"), seen, None)
     assert abs(found.lens.fx / LENS.fx - 1) < 0.003 and found.rms < 0.2
-    for i, c2w in enumerate(c2ws):
-        assert angle_between(inverse(found.solved.w2c[i]), c2w) < np.radians(0.5)
+    for w2c, c2w in zip(found.solved.w2c.values(), c2ws, strict=True):
+        assert angle_between(inverse(w2c), c2w) < np.radians(0.5)
     assert detect(np.full((480, 640), 128, np.uint8)) == {}  # no board
 
 

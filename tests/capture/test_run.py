@@ -1,8 +1,8 @@
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import imageio.v3 as imageio
 import numpy as np
 import pytest
@@ -11,18 +11,19 @@ import yaml
 from PIL import Image
 
 from benchmarks.capture import home
-from benchmarks.synthetic.photos import Truth
+from benchmarks.synthetic.photos import Flaws, Truth, render_photo
 from benchmarks.synthetic.tabletop import Tabletop
 from nerf_lightning.cameras import transform
 from nerf_lightning.capture.poses.calibrate import calibrate
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
 from nerf_lightning.capture.run import Capture, capture_scene
 from nerf_lightning.capture.tags.detect import detect_in_photos, guess_family, tag_detector
-from nerf_lightning.capture.tags.layout import flat_pose, read_layout
+from nerf_lightning.capture.tags.layout import read_layout
 from nerf_lightning.cli.capture import capture
 from nerf_lightning.dataset import open_scene
-from nerf_lightning.dataset.placing.photos import find_photos
+from nerf_lightning.dataset.sfm.photos import find_photos
 from nerf_lightning.errors import InputError
+from tests.helpers.exif_tags import tags
 from tests.helpers.tag_views import SIX, SIZE, SMALL
 
 
@@ -40,6 +41,10 @@ def test_capture_scene_of_synthetic_photos_finds_their_cameras(made: tuple[Path,
         angles.append(angle_between(solved, exact))
     assert np.median(shifts) < 0.02 and np.median(angles) < np.radians(0.6)
     assert abs(found.calibration.lens.fx / SMALL.fx - 1) < 0.02
+    assert sorted(file.name for file in folder.iterdir()) == ["calibration.yaml", "cameras.json", "scene.npz"]
+    content = yaml.safe_load((folder / "calibration.yaml").read_text())
+    assert content["fx"] == pytest.approx(found.calibration.lens.fx) and content["standard_deviations"]["focal"] > 0
+    assert content["photos_used"] and set(content["tags"]["to_world"]) <= set(range(6))
 
 
 def test_capture_scene_writes_scene_with_subject_in_box(packed: tuple[Path, Capture]):
@@ -62,16 +67,6 @@ def test_capture_scene_writes_scene_with_subject_in_box(packed: tuple[Path, Capt
     assert 0.8 * distances.min() < of_orbit.min() and of_orbit.max() < 1.2 * distances.max()
 
 
-def test_capture_scene_writes_calibration(packed: tuple[Path, Capture]):
-    folder, found = packed
-    assert sorted(file.name for file in folder.iterdir()) == ["calibration.yaml", "cameras.json", "scene.npz"]
-    content = yaml.safe_load((folder / "calibration.yaml").read_text())
-    assert content["fx"] == pytest.approx(found.calibration.lens.fx)
-    assert content["tags"]["dictionary"] == "DICT_4X4_50"
-    assert len(content["tags"]["to_world"]) >= 3 and set(content["tags"]["to_world"]) <= set(range(6))
-    assert content["photos_used"] and content["standard_deviations"]["focal"] > 0
-
-
 def test_detect_in_photos_corners_have_no_offset(made: tuple[Path, Truth]):
     """Pixel centres at +0.5: the mean of all corner errors vanishes."""
     folder, truth = made
@@ -85,23 +80,16 @@ def test_detect_in_photos_corners_have_no_offset(made: tuple[Path, Truth]):
     assert len(flat) > 100 and np.abs(np.median(flat, axis=0)).max() < 0.05 and np.abs(flat).max() < 2
 
 
-def test_detect_in_photos_reads_all_formats_upright(made: tuple[Path, Truth], tmp_path: Path):
+def test_detect_in_photos_turns_photos_upright(made: tuple[Path, Truth], tmp_path: Path):
     original = made[0] / "calibration" / "000.png"
-    photo = imageio.imread(original)
-    paths = [original, *(tmp_path / f"a{suffix}" for suffix in (".png", ".jpg", ".tiff"))]
-    for path in paths[1:]:
-        cv2.imwrite(str(path), photo[..., ::-1])
     # EXIF orientation 6: to be turned clockwise by 90 degrees.
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    tilted = Image.fromarray(np.ascontiguousarray(np.rot90(photo)))
-    tilted.save(tmp_path / "phone.jpg", quality=98, exif=exif)
-    plain, *others = detect_in_photos([*paths, tmp_path / "phone.jpg"], tag_detector("DICT_4X4_50", SIZE))
-    assert len(plain.marks) == 6
-    for seen in others:
-        assert (seen.width, seen.height) == (SMALL.width, SMALL.height) and sorted(seen.marks) == sorted(plain.marks)
-        for tag, mark in seen.marks.items():
-            np.testing.assert_allclose(mark.pixels, plain.marks[tag].pixels, atol=0.1)
+    tilted = Image.fromarray(np.ascontiguousarray(np.rot90(imageio.imread(original))))
+    tilted.save(tmp_path / "phone.jpg", quality=98, exif=tags(6))
+    plain, turned = detect_in_photos([original, tmp_path / "phone.jpg"], tag_detector("DICT_4X4_50", SIZE))
+    assert len(plain.marks) == 6 and sorted(turned.marks) == sorted(plain.marks)
+    assert (turned.width, turned.height) == (SMALL.width, SMALL.height)
+    for tag, mark in turned.marks.items():
+        np.testing.assert_allclose(mark.pixels, plain.marks[tag].pixels, atol=0.1)
 
 
 def test_guess_family_finds_the_printed_one(made: tuple[Path, Truth], tmp_path: Path):
@@ -126,14 +114,14 @@ def test_capture_writes_scene_and_report(few: dict[str, Path], tmp_path: Path, c
     output = tmp_path / "it's mine, ü" / "scene.npz"
     found = capture(**few, tag_size=SIZE, output=output, resize=120)
     assert open_scene(str(output)).resolution == (120, 90) and len(found.photos) == 3
-    assert len(list((output.parent / "scene_report").glob("*.png"))) == 4
+    assert len(list((output.parent / "scene_report").glob("*.png"))) == 3
     assert "3 of 3 photos placed" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"tag_size": 6.0}, "tag_size.*0.03 to 30 m"),
+        ({"tag_size": 6.0}, "tag_size.*at most 1"),
         ({"dictionary": "DICT_9X9"}, "dictionary"),
         ({"output": Path("scene.txt")}, ".npz"),
         ({"calibration": Path("nowhere")}, "nowhere"),
@@ -161,30 +149,42 @@ def test_capture_with_bad_photo_names_it(few: dict[str, Path], tmp_path: Path, p
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_read_layout_gives_corners_in_metres(tmp_path: Path):
+def test_read_layout_gives_corners_in_metres_or_names_file(tmp_path: Path):
     file = tmp_path / "sheet.yaml"
     file.write_text("tags: {0: {x: 0.0, y: 0.0}, 3: {x: 0.09, y: -0.02, turn: 90}}")
     layout = read_layout(file, "DICT_4X4_50", SIZE)
     np.testing.assert_allclose(layout.corners(0), SIZE / 2 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]))
     np.testing.assert_allclose(layout.corners(3)[0], [0.09 - SIZE / 2, -0.02 - SIZE / 2, 0], atol=1e-12)
-    assert np.array_equal(flat_pose(0, 0), np.eye(4))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "tags: [1, 2]",
+    for text in (
+        "tags: [1]",
         "tags: {0: {x: 0}}",
         "tags: {0: {x: 0, y: 0, z: 1}}",
-        "tags: {0: {x: 0, y: .inf}}",
+        "tags: {0: {x: .inf, y: 0}}",
         "tags: [",
-    ],
-)
-def test_read_layout_of_malformed_file_names_it(tmp_path: Path, text: str):
-    file = tmp_path / "sheet.yaml"
-    file.write_text(text)
-    with pytest.raises(InputError, match=r"sheet\.yaml"):
-        read_layout(file, "DICT_4X4_50", SIZE)
+    ):
+        file.write_text(text)
+        with pytest.raises(InputError, match=r"sheet\.yaml"):
+            read_layout(file, "DICT_4X4_50", SIZE)
+
+
+def test_capture_scene_with_hidden_tags_places_photos_by_texture(made: tuple[Path, Truth], tmp_path: Path):
+    shown, truth = made
+    shutil.copytree(shown, tmp_path, dirs_exist_ok=True)
+    hidden = ["003.png", "005.png"]
+    for name in hidden:
+        photo = render_photo(SIX, SMALL, truth.photos[name], True, Flaws(), seed=0, samples=2, hidden=True)
+        imageio.imwrite(tmp_path / "photos" / name, photo)
+    given = tmp_path / "calibration", tmp_path / "photos", SIZE, tmp_path / "scene.npz"
+    found = capture_scene(*given, dictionary="DICT_4X4_50", longest=100)
+    assert [photo.name for photo in found.photos if photo.by == "texture"] == hidden
+    for photo in found.photos:
+        if photo.by:
+            solved, exact = home(found.solved, SIX) @ photo.c2w, truth.photos[photo.name]
+            assert np.linalg.norm(solved[:3, 3] - exact[:3, 3]) < 0.02 * np.linalg.norm(exact[:3, 3])
+            assert angle_between(solved, exact) < np.radians(1)
+            assert 0 < photo.reprojection_px < 2
+    entries = {entry["name"]: entry for entry in json.loads((tmp_path / "cameras.json").read_text())["photos"]}
+    assert [name for name, entry in entries.items() if entry.get("by") == "texture"] == hidden
 
 
 @pytest.mark.real_data

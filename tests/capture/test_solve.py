@@ -6,8 +6,8 @@ import pytest
 
 from nerf_lightning.cameras import Distortion
 from nerf_lightning.capture.poses.calibrate import calibrate
-from nerf_lightning.capture.poses.geometry import angle_between, inverse
-from nerf_lightning.capture.poses.solve import place_tags, solve
+from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
+from nerf_lightning.capture.poses.solve import place_tags, solve, solve_without_misfits
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import SQUARE
 from nerf_lightning.dataset.intrinsics import Intrinsics
@@ -25,29 +25,36 @@ def worst_tag(tags: dict[int, np.ndarray], reference: int) -> float:
 
 def test_solve_of_unknown_layout_finds_tags_and_cameras():
     c2w = cameras(10)
-    solved = solve(LENS, [s.marks for s in sightings(SIX, c2w)], None)
+    solved = solve(LENS, sightings(SIX, c2w), None)
     assert sorted(solved.tags) == list(range(6)) and len(solved.w2c) == 10
     (reference,) = (tag for n, tag in enumerate(solved.tags) if n in solved.fixed)
     assert np.array_equal(solved.tags[reference], np.eye(4))
     assert worst_tag(solved.tags, reference) < 3e-4
-    off = [angle_between(w2c, inverse(c2w[i]) @ SIX.poses[reference]) for i, w2c in solved.w2c.items()]
+    truth = [inverse(pose) @ SIX.poses[reference] for pose in c2w]
+    off = [angle_between(*pair) for pair in zip(solved.w2c.values(), truth, strict=True)]
     assert np.median(off) < np.radians(0.1)
+    known = solve(LENS, sightings(SIX, c2w), SIX.poses)  # keeps its frame
+    for w2c, exact in zip(known.w2c.values(), c2w, strict=True):
+        assert np.abs(inverse(w2c) - exact).max() < 3e-3
 
 
-def test_solve_of_known_layout_keeps_its_frame():
-    c2w = cameras(6)
-    solved = solve(LENS, [s.marks for s in sightings(SIX, c2w)], SIX.poses)
-    for i, w2c in solved.w2c.items():
-        assert np.abs(inverse(w2c) - c2w[i]).max() < 3e-3
-
-
-def test_solve_leaves_out_unlinked_photos():
-    seen = [s.marks for s in sightings(SIX, cameras(6))]
-    seen[1] = {}
-    seen[4] = {17: seen[4][0]}  # a tag that no other photo shows
-    solved = solve(LENS, seen, None)
-    assert solved.placed == [0, 2, 3, 5]
-    assert solve(LENS, [{}, {}], None) is None
+def test_solve_without_misfits_leaves_out_unlinked_photos():
+    seen = sightings(SIX, cameras(6))
+    seen[1] = replace(seen[1], marks={})
+    seen[4] = replace(seen[4], marks={17: seen[4].marks[0]})  # a tag that no other photo shows
+    solved, photos = solve_without_misfits(seen, {}, lambda left: solve(LENS, left, None))
+    assert solved.photos == ("000.png", "002.png", "003.png", "005.png")
+    assert photos[1].reason == "no tag found" and "not linked" in photos[4].reason
+    for i, photo in enumerate(photos):
+        assert photo.name == seen[i].name and (photo.c2w is None) == bool(photo.reason)
+        for tag, rest in photo.residuals.items():
+            again = project(LENS, inverse(photo.c2w) @ solved.tags[tag], seen[i].marks[tag].points)
+            np.testing.assert_allclose(seen[i].marks[tag].pixels + rest, again, atol=0.2)
+        if photo.residuals:
+            squares = np.concatenate(list(photo.residuals.values())) ** 2
+            assert photo.reprojection_px == pytest.approx(np.sqrt(squares.sum(1).mean()))
+    with pytest.raises(InputError, match="tags that fit no camera"):
+        solve(LENS, [seen[1]], None)
 
 
 def test_place_tags_follows_most_agreed_links():
@@ -69,7 +76,7 @@ def test_calibrate_with_one_tag_finds_focal():
 def test_calibrate_with_unknown_layout_finds_lens():
     found = calibrate(FOLDER, sightings(SIX, cameras(15)), None)
     assert abs(found.lens.fx / LENS.fx - 1) < 0.0015
-    assert abs(found.lens.distortion[0] + 0.2) < 0.01
+    assert abs(found.lens.distortion.k1 + 0.2) < 0.01
     assert 0 < found.deviations["focal"] < 3
     assert found.warnings == []
 

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from nerf_lightning.dataset.formats.decode import draft_scale, image_header, read_pixels
-from nerf_lightning.dataset.placing.lenses import Shot, shot
 from nerf_lightning.dataset.resize import area_resize
+from nerf_lightning.dataset.sfm.colmap import lens_tags
 from nerf_lightning.errors import InputError
 from tests.helpers.exif_tags import tags
 
@@ -123,7 +123,7 @@ def test_read_pixels_heic_is_upright(tmp_path: Path):
     for upright in (True, False):
         found = read_pixels(tmp_path / "a.HEIC", upright)
         np.testing.assert_allclose(found.astype(int), np.rot90(picture, -1), atol=12)
-    assert shot(tmp_path / "a.HEIC", 48, 64) == Shot(48, 64, "Apple", focal_35mm=26.0)
+    assert b"Apple" in lens_tags(tmp_path / "a.HEIC")
 
 
 @installed

@@ -8,10 +8,9 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from benchmarks.synthetic.video import FPS, with_blurs, write_video
-from nerf_lightning.dataset.placing import frames as module
-from nerf_lightning.dataset.placing.choose import MOST, choose, suitable_count
-from nerf_lightning.dataset.placing.frames import frames_of, kept_frames
+from benchmarks.synthetic.video import with_blurs, write_video
+from nerf_lightning.dataset.sfm import frames as module
+from nerf_lightning.dataset.sfm.frames import MAX_FRAMES, extract_frames, select_frames, write_frames
 from nerf_lightning.errors import InputError
 
 PAUSE = 24
@@ -44,60 +43,58 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_frames_of_video_takes_sharp_evenly_spread_frames(video: Path, tmp_path: Path):
-    photos = frames_of(video, tmp_path / "photos", 30)
-    indices = [round(float(photo.stem.removesuffix("s")) * FPS) for photo in photos]
-    assert indices == sorted(indices) and 28 <= len(indices) <= 30
-    assert sum(index % 3 == 1 for index in indices) <= 0.05 * len(SHIFTS) / 3
+def test_write_frames_takes_sharp_evenly_spread_frames(video: Path, tmp_path: Path):
+    write_frames(video, tmp_path, 22)
+    photos = sorted(tmp_path.iterdir())
+    indices = [int(photo.stem) for photo in photos]
+    assert indices == sorted(indices) and len(indices) == 22
+    assert not [index for index in indices if index % 3 == 1]
     assert sum(31 <= index < 31 + PAUSE for index in indices) <= 2
-    assert max(np.diff(SHIFTS[indices])) <= 4 * 4
+    assert max(np.diff(SHIFTS[indices])) <= 4 * 5
     first, pictures = imageio.imread(photos[0]).astype(int), list(pan(SHIFTS))
     assert np.argmin([np.abs(first - picture).mean() for picture in pictures]) == indices[0]
 
 
-def test_suitable_count_follows_the_motion(video: Path, tmp_path: Path):
-    motions, _ = module.measure(video)
-    assert suitable_count(motions) == (1 + np.count_nonzero(np.diff(SHIFTS))) // 3
-    assert suitable_count(np.full(100_000, 0.01)) == MOST
-    assert suitable_count(np.zeros(900)) == 3
-    assert suitable_count(np.full(50, 0.002)) == 10
+def test_select_frames_count_follows_motion(video: Path):
+    moving = 1 + np.count_nonzero(np.diff(SHIFTS))
+    assert abs(len(select_frames(*module.measure(video))) - moving // 3) <= 2
+    for motion, count in ((np.full(5000, 0.01), MAX_FRAMES), (np.zeros(900), 3), (np.full(50, 0.002), 10)):
+        assert len(select_frames(motion, np.zeros_like(motion))) == count
 
 
-def test_choose_fast_stretch_offers_a_choice():
-    motions, sharp = np.concatenate([np.full(60, 0.001), np.full(12, 0.1)]), np.zeros(72)
-    sharp[1::3] = -0.2
-    chosen = choose(motions, sharp, 12)
-    assert len(chosen) == 12 and not [index for index in chosen if index % 3 == 1]
-    assert 3 <= sum(index >= 60 for index in chosen) <= 5
-    assert choose(np.zeros(9), np.zeros(9), 3) == [1, 4, 7]
-    assert choose(np.zeros(4), np.zeros(4), 4) == [0, 1, 2, 3]
+def test_select_frames_of_fast_stretch_takes_sharp_ones():
+    motion, sharpness = np.concatenate([np.full(60, 0.001), np.full(12, 0.1)]), np.zeros(72)
+    sharpness[1::3] = -0.2
+    chosen = select_frames(motion, sharpness, 12)
+    assert len(chosen) >= 5 and not [index for index in chosen if index % 3 == 1]
+    assert select_frames(np.zeros(9), np.eye(9)[4], 3)[1] == 4
 
 
 @pytest.mark.parametrize("turns", [1, 2])
-def test_frames_of_rotated_video_are_upright(turns: int, tmp_path: Path):
+def test_write_frames_of_rotated_video_are_upright(turns: int, tmp_path: Path):
     picture = np.zeros((64, 96, 3), np.uint8)
     picture[:32, 48:], picture[32:, :48] = (255, 0, 0), (0, 0, 255)
     write_video(tmp_path / "a.mp4", [picture] * 3, turns)
-    upright = imageio.imread(frames_of(tmp_path / "a.mp4", tmp_path / "photos")[0])
+    upright = imageio.imread(next(extract_frames(tmp_path / "a.mp4").glob("*.jpg")))
     assert np.abs(upright.astype(int) - np.rot90(picture, turns)).mean() < 5
 
 
-def test_kept_frames_are_made_once(tmp_path: Path, monkeypatch, caplog):
+def test_extract_frames_twice_decodes_once(tmp_path: Path, monkeypatch, caplog):
     video = tmp_path / "wall.mp4"
     write_video(video, pan(SHIFTS[:12]))
-    folder = kept_frames(video)
+    folder = extract_frames(video)
     assert folder == tmp_path / "wall_frames" and len(list(folder.glob("*.jpg"))) == 4
     next(folder.glob("*.jpg")).unlink()
     with monkeypatch.context() as patched:
         patched.setattr(module, "measure", None)  # whoever deletes a frame does not get it back
-        assert len(list(kept_frames(video).glob("*.jpg"))) == 3
+        assert len(list(extract_frames(video).glob("*.jpg"))) == 3
     write_video(video, pan(SHIFTS[:15]))
     with caplog.at_level(logging.INFO):
-        assert len(list(kept_frames(video).glob("*.jpg"))) == 5
+        assert len(list(extract_frames(video).glob("*.jpg"))) == 5
     assert "made of other files" in caplog.text
     (folder / "made_of.json").unlink()
     with pytest.raises(InputError, match="wall_frames: found a folder without made_of.json"):
-        kept_frames(video)
+        extract_frames(video)
 
 
 def of_sound(file: Path) -> None:
@@ -124,11 +121,10 @@ def cut(file: Path) -> None:
         (lambda file: write_video(file, pan(SHIFTS[:1])), "found 1 frame, expected at least 3"),
     ],
 )
-def test_frames_of_broken_video_raises(make, message: str, tmp_path: Path):
+def test_extract_frames_of_broken_video_raises(make, message: str, tmp_path: Path):
     video = tmp_path / "broken.mp4"
     make(video)
-    for attempt in (kept_frames, lambda video: frames_of(video, tmp_path / "photos")):
-        with pytest.raises(InputError, match=message) as raised:
-            attempt(video)
-        assert str(video) in str(raised.value) and "\n" not in str(raised.value)
+    with pytest.raises(InputError, match=message) as raised:
+        extract_frames(video)
+    assert str(video) in str(raised.value) and "\n" not in str(raised.value)
     assert [path for path in tmp_path.iterdir() if path != video] == []

@@ -1,19 +1,25 @@
-"""Lens, camera poses and tag poses together: reprojection residuals and their derivatives."""
+"""Bundle adjustment: lens, camera poses and tag poses together, so that all marks project to where they were seen."""
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Complex, Float
+from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
+from scipy.spatial.transform import Rotation
 
 from nerf_lightning.cameras import Distortion
-from nerf_lightning.capture.poses.geometry import to_matrix
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.dataset.intrinsics import Intrinsics
 
 LENS_PARAMETERS = ("focal", "aspect", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """fx = focal, fy = focal * aspect; distortion in OpenCV's order."""
+OUTLIER_PX = 1.0
+"""Beyond which a residual counts roughly linearly instead of squared."""
+MAX_DENSE_UNKNOWNS = 600
+"""Up to which the normal equations are solved exactly."""
+COMPLEX_STEP = 1e-30
+Numbers = Float[np.ndarray, "..."] | Complex[np.ndarray, "..."]
 
 
 @dataclass(frozen=True)
@@ -33,13 +39,42 @@ class Bundle:
     """How far the corners of each tag stand out of its plane, alternately up and down, metres: paper is seldom flat."""
 
 
+@dataclass(frozen=True)
+class Refined:
+    """A bundle after refinement, and how well it explains the photos."""
+
+    bundle: Bundle
+    residuals: list[Float[np.ndarray, "_ 2"]]
+    """Projected minus seen, pixels, by photo."""
+    deviations: dict[str, float]
+    """Standard deviations of the lens parameters that were free, from the normal equations and the residuals' own size."""
+    bic: float
+    """Bayesian information criterion (Schwarz 1978): lower is better; it charges for every parameter."""
+
+    @property
+    def rms(self) -> Float[np.ndarray, "P"]:
+        """Root mean square distance in pixels, by photo."""
+        return np.array([rms_length(r) for r in self.residuals])
+
+    @property
+    def total_rms(self) -> float:
+        """Root mean square distance in pixels over all points."""
+        return rms_length(np.concatenate(self.residuals))
+
+
+def rms_length(residuals: Float[np.ndarray, "_ 2"]) -> float:
+    """Root mean square length."""
+    return float(np.sqrt((residuals**2).sum(1).mean()))
+
+
 def lens_vector(lens: Intrinsics) -> Float[np.ndarray, "9"]:
+    """The numbers that `LENS_PARAMETERS` names."""
     return np.array([lens.fx, lens.fy / lens.fx, lens.cx, lens.cy, *lens.opencv])
 
 
 def lens_with(lens: Intrinsics, vector: Float[np.ndarray, "9"]) -> Intrinsics:
-    focal, aspect, cx, cy, *distortion = (float(v) for v in vector)
-    k1, k2, p1, p2, k3 = distortion
+    """A lens of other numbers, for photos of the same size."""
+    focal, aspect, cx, cy, k1, k2, p1, p2, k3 = vector.tolist()
     return replace(
         lens, fx=focal, fy=focal * aspect, cx=cx, cy=cy, distortion=Distortion(k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
     )
@@ -50,169 +85,150 @@ def simplified(lens: Intrinsics, free: tuple[str, ...]) -> Intrinsics:
     if not free:
         return lens
     plain = np.array([lens.fx, 1.0, lens.width / 2, lens.height / 2, 0, 0, 0, 0, 0])
-    kept = np.array([name in free for name in LENS_PARAMETERS])
-    return lens_with(lens, np.where(kept, lens_vector(lens), plain))
+    return lens_with(lens, np.where([name in free for name in LENS_PARAMETERS], lens_vector(lens), plain))
 
 
-def _warp(points: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M"]:
-    """How high a twist by 1 lifts each point: x y, 1 at the corners. Only this bend of a square lifts its corners out of their
-    common plane."""
-    extent = np.abs(points[:, :2]).max(0)
-    return points[:, 0] * points[:, 1] / (extent[0] * extent[1])
+def refine(
+    bundle: Bundle,
+    free_lens: tuple[str, ...] = (),
+    fixed_tags: frozenset[int] = frozenset({0}),
+    free_twists: bool = False,
+) -> Refined:
+    """Minimises the reprojection error over everything that is free, with a robust loss.
 
-
-def _rotations(vectors: Float[np.ndarray, "B 3"]) -> tuple[Float[np.ndarray, "B 3 3"], Float[np.ndarray, "B 3 3 3"]]:
-    """Matrices of rotation vectors, and their derivatives with respect to each of the three numbers."""
-    matrices, derivatives = np.empty((len(vectors), 3, 3)), np.empty((len(vectors), 3, 3, 3))
-    for index, vector in enumerate(vectors):
-        matrices[index], derivative = cv2.Rodrigues(vector)
-        # OpenCV 4 and 5 give the derivative of the nine entries in rows or in columns of three.
-        by_number = derivative if derivative.shape == (3, 9) else derivative.T
-        derivatives[index] = by_number.reshape(3, 3, 3)
-    return matrices, derivatives
-
-
-def _moved(
-    motions: Float[np.ndarray, "B 6"], which: Int[np.ndarray, "N"], points: Float[np.ndarray, "N 3"]
-) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3 6"], Float[np.ndarray, "N 3 3"]]:
-    """Points moved by motion `which`, the derivatives with respect to its six numbers, and its rotation matrix."""
-    turns, derivatives = _rotations(motions[:, :3])
-    jacobian = np.empty((len(points), 3, 6))
-    jacobian[:, :, :3] = np.einsum("nkrc,nc->nrk", derivatives[which], points)
-    jacobian[:, :, 3:] = np.eye(3)
-    turn = turns[which]
-    return np.einsum("nrc,nc->nr", turn, points) + motions[which, 3:], jacobian, turn
-
-
-def _turned(motion: Float[np.ndarray, "6"], pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """A pose turned further, at its new place."""
-    out = to_matrix(motion)
-    out[:3, :3] = out[:3, :3] @ pose[:3, :3]
-    return out
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """All points seen, photo by photo and mark by mark."""
-
-    photo: Int[np.ndarray, "N"]
-    tag: Int[np.ndarray, "N"]
-    points: Float[np.ndarray, "N 3"]
-    """In the tag's own frame, metres."""
-    warp: Float[np.ndarray, "N"]
-    pixels: Float[np.ndarray, "N 2"]
-
-    @staticmethod
-    def of(marks: list[dict[int, Mark]]) -> "_Seen":
-        flat = [(photo, tag, mark) for photo, found in enumerate(marks) for tag, mark in found.items()]
-        counts = [len(mark.points) for _, _, mark in flat]
-        return _Seen(
-            np.repeat([photo for photo, _, _ in flat], counts),
-            np.repeat([tag for _, tag, _ in flat], counts),
-            np.concatenate([mark.points for _, _, mark in flat]).astype(np.float64),
-            np.concatenate([_warp(mark.points) for _, _, mark in flat]),
-            np.concatenate([mark.pixels for _, _, mark in flat]).astype(np.float64),
-        )
+    Args:
+        bundle: where to start; every photo holds at least one mark.
+        free_lens: names out of `LENS_PARAMETERS`; the others keep their value.
+        fixed_tags: numbers of the tags that do not move: at least one, which holds the world in place.
+        free_twists: whether tags may be twisted.
+    """
+    problem = Problem(bundle, free_lens, fixed_tags, free_twists)
+    start = problem.start[problem.free]
+    dense = len(start) <= MAX_DENSE_UNKNOWNS
+    solution = least_squares(
+        problem.residuals,
+        start,
+        lambda x: problem.jacobian(x).toarray() if dense else problem.jacobian(x),
+        method="trf",
+        loss="soft_l1",  # Huber's, smoothed: at its kink the solver gets stuck
+        f_scale=OUTLIER_PX,
+        x_scale="jac",
+        tr_solver="exact" if dense else "lsmr",
+        max_nfev=100,
+    )
+    flat = problem.residuals(solution.x)
+    # Outliers must not pass for noise: the spread is that of the middle of the distribution.
+    sigma = max(1.4826 * float(np.median(np.abs(flat))), 1e-6)
+    deviations = {}
+    if free_lens:
+        slopes = problem.jacobian(solution.x)
+        variances = np.diag(np.linalg.pinv((slopes.T @ slopes).toarray(), hermitian=True)) * sigma**2
+        names = [name for name in LENS_PARAMETERS if name in free_lens]
+        deviations = {name: float(np.sqrt(max(v, 0.0))) for name, v in zip(names, variances, strict=False)}
+    cost = 2 * float(solution.cost)  # the robust one, so that an outlier does not buy parameters
+    bic = len(flat) * np.log(max(cost / len(flat), 1e-12)) + len(start) * np.log(len(flat))
+    ends = np.cumsum([sum(len(mark.pixels) for mark in photo.values()) for photo in bundle.marks])
+    by_photo = np.split(flat.reshape(-1, 2), ends[:-1])
+    return Refined(problem.bundle_of(solution.x), by_photo, deviations, float(bic))
 
 
 class Problem:
-    """Residuals and their derivatives for `least_squares`. The unknowns are the free lens parameters, the poses of all photos
-    and of the free tags, and, if `free_twists`, the twists of all tags."""
+    """Residuals and their derivatives for `least_squares`.
 
-    def __init__(self, bundle: Bundle, free_lens: Bool[np.ndarray, "9"], fixed_tags: set[int], free_twists: bool):
+    All numbers stand in one vector: the lens, six of each photo, six of each tag, and the tags' twists. Six numbers of a pose
+    are its rotation from the start, see `rotate`, and its translation. `free` tells which are unknown; the others keep their
+    value in `start`.
+    """
+
+    def __init__(self, bundle: Bundle, free_lens: tuple[str, ...], fixed_tags: frozenset[int], free_twists: bool):
         self.bundle = bundle
-        self.free_lens = free_lens
-        self.moving = np.array([tag not in fixed_tags for tag in range(len(bundle.tags))])
-        self.lens_start = lens_vector(bundle.lens)
-        self.first_pose = int(free_lens.sum())
-        self.first_tag = self.first_pose + 6 * len(bundle.w2c)
-        self.first_twist = self.first_tag + 6 * int(self.moving.sum())
-        self.free_twists = free_twists
-        self._twisting = len(bundle.tags) * free_twists
-        self.unknowns = self.first_twist + self._twisting
-        self.seen = _Seen.of(bundle.marks)
-        self._last: tuple[np.ndarray, tuple[np.ndarray, csr_matrix]] | None = None
-        columns = self._column_of_each_entry()
-        self._there = columns >= 0
-        self._columns = columns[self._there]
-        self._ends = np.concatenate([[0], np.cumsum(self._there.sum(2).reshape(-1))])
+        first_tag = 9 + 6 * len(bundle.w2c)
+        first_twist = first_tag + 6 * len(bundle.tags)
+        self.ends = [9, first_tag, first_twist]
+        poses = np.pad(np.concatenate([bundle.w2c, bundle.tags])[:, :3, 3], ((0, 0), (3, 0)))
+        self.start = np.concatenate([lens_vector(bundle.lens), poses.reshape(-1), bundle.twists])
+        self.free = np.ones(len(self.start), bool)
+        self.free[:9] = [name in free_lens for name in LENS_PARAMETERS]
+        self.free[first_tag:first_twist] = np.repeat([tag not in fixed_tags for tag in range(len(bundle.tags))], 6)
+        self.free[first_twist:] = free_twists
+        seen = [(photo, tag, mark) for photo, marks in enumerate(bundle.marks) for tag, mark in marks.items()]
+        counts = [len(mark.pixels) for _, _, mark in seen]
+        photo, tag = (np.repeat([entry[i] for entry in seen], counts) for i in (0, 1))
+        self.columns = np.column_stack(
+            [
+                np.tile(np.arange(9), (len(photo), 1)),
+                9 + 6 * photo[:, None] + np.arange(6),
+                first_tag + 6 * tag[:, None] + np.arange(6),
+                first_twist + tag,
+            ]
+        )
+        """Of the 22 numbers that each point depends on, in the vector of all."""
+        self.pixels = np.concatenate([mark.pixels for _, _, mark in seen])
+        self.points = np.concatenate([mark.points for _, _, mark in seen])
+        self.lifts = np.concatenate([_lift(mark.points) for _, _, mark in seen])
+        self.photo_turns, self.tag_turns = bundle.w2c[photo, :3, :3], bundle.tags[tag, :3, :3]
 
-    def _column_of_each_entry(self) -> Int[np.ndarray, "N 2 E"]:
-        """Columns of a point's entries in the Jacobian, ascending, in the order of `_evaluate`; -1 for those of fixed tags."""
-        count = len(self.seen.photo)
-        first = self.first_tag + 6 * (np.cumsum(self.moving) - 1)[self.seen.tag]
-        tags = np.where(self.moving[self.seen.tag][:, None], first[:, None] + np.arange(6), -1)
-        columns = [
-            np.tile(np.arange(self.first_pose), (count, 1)),
-            self.first_pose + 6 * self.seen.photo[:, None] + np.arange(6),
-            tags,
-            self.first_twist + self.seen.tag[:, None][:, : int(self.free_twists)],
-        ]
-        return np.repeat(np.concatenate(columns, axis=1)[:, None], 2, axis=1)
-
-    def start(self) -> Float[np.ndarray, "X"]:
-        shifts = [*self.bundle.w2c[:, :3, 3], *self.bundle.tags[self.moving, :3, 3]]
-        # Rotations are relative to the start: rotation vectors have a seam at half a turn.
-        motions = [np.concatenate([np.zeros(3), shift]) for shift in shifts]
-        return np.concatenate([self.lens_start[self.free_lens], *motions, self.bundle.twists[: self._twisting]])
-
-    def twists_of(self, x: Float[np.ndarray, "X"]) -> Float[np.ndarray, "T"]:
-        return x[self.first_twist :] if self.free_twists else self.bundle.twists
-
-    def lens_of(self, x: Float[np.ndarray, "X"]) -> Float[np.ndarray, "9"]:
-        vector = self.lens_start.copy()
-        vector[self.free_lens] = x[: self.first_pose]
+    def vector(self, x: Float[np.ndarray, "X"]) -> Float[np.ndarray, "V"]:
+        """All numbers, from the unknown ones."""
+        vector = self.start.copy()
+        vector[self.free] = x
         return vector
 
-    def tags_of(self, x: Float[np.ndarray, "X"]) -> Float[np.ndarray, "T 6"]:
-        """Rotation from the start, and translation, of each tag."""
-        motions = np.zeros((len(self.bundle.tags), 6))
-        motions[:, 3:] = self.bundle.tags[:, :3, 3]
-        motions[self.moving] = x[self.first_tag : self.first_twist].reshape(-1, 6)
-        return motions
+    def residuals(self, x: Float[np.ndarray, "X"]) -> Float[np.ndarray, "R"]:
+        """Projected minus seen, two a point, pixels."""
+        return (self.project(self.vector(x)[self.columns]) - self.pixels).reshape(-1)
 
-    def poses_of(self, x: Float[np.ndarray, "X"]) -> Float[np.ndarray, "P 6"]:
-        """Rotation from the start, and translation, of each photo."""
-        return x[self.first_pose : self.first_tag].reshape(-1, 6)
+    def jacobian(self, x: Float[np.ndarray, "X"]) -> csr_matrix:
+        """Derivatives of the residuals, exact, by a complex step (Squire and Trapp 1998)."""
+        which = np.flatnonzero(self.free[self.columns].any(0))
+        steps = 1j * COMPLEX_STEP * np.eye(self.columns.shape[1])[which, None]
+        slopes = self.project(self.vector(x)[self.columns] + steps).imag / COMPLEX_STEP
+        values = np.moveaxis(slopes, 0, -1).reshape(-1, len(which))
+        columns = np.repeat(self.columns[:, which], 2, axis=0)
+        ends = np.arange(len(values) + 1) * values.shape[1]
+        every = csr_matrix((values.reshape(-1), columns.reshape(-1), ends), shape=(len(values), len(self.start)))
+        return every[:, self.free]
 
-    def unpack(self, x: Float[np.ndarray, "X"]) -> Bundle:
-        w2c = [_turned(motion, pose) for motion, pose in zip(self.poses_of(x), self.bundle.w2c, strict=True)]
-        tags = [_turned(motion, pose) for motion, pose in zip(self.tags_of(x), self.bundle.tags, strict=True)]
-        lens = lens_with(self.bundle.lens, self.lens_of(x))
-        return replace(self.bundle, lens=lens, w2c=np.stack(w2c), tags=np.stack(tags), twists=self.twists_of(x).copy())
+    def project(self, numbers: Numbers) -> Numbers:
+        """Pixels of all points, each given the numbers that it depends on: (..., N, 22) to (..., N, 2)."""
+        lens, photo, tag, twist = np.split(numbers, [9, 15, 21], axis=-1)
+        local = self.points + twist * self.lifts
+        world = rotate(tag[..., :3], np.einsum("nrc,...nc->...nr", self.tag_turns, local)) + tag[..., 3:]
+        there = rotate(photo[..., :3], np.einsum("nrc,...nc->...nr", self.photo_turns, world)) + photo[..., 3:]
+        focal, aspect, cx, cy, k1, k2, p1, p2, k3 = np.moveaxis(lens, -1, 0)
+        x, y = there[..., 0] / there[..., 2], there[..., 1] / there[..., 2]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        column = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        row = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.stack([focal * column + cx, focal * aspect * row + cy], axis=-1)
 
-    def by_photo(self, residuals: Float[np.ndarray, "R"]) -> list[Float[np.ndarray, "_ 2"]]:
-        ends = np.searchsorted(self.seen.photo, np.arange(1, len(self.bundle.marks)))
-        return np.split(residuals.reshape(-1, 2), ends)
+    def bundle_of(self, x: Float[np.ndarray, "X"]) -> Bundle:
+        """The bundle that the unknowns stand for."""
+        lens, photos, tags, twists = np.split(self.vector(x), self.ends)
+        w2c = _turned(photos.reshape(-1, 6), self.bundle.w2c)
+        moved = _turned(tags.reshape(-1, 6), self.bundle.tags)
+        return replace(self.bundle, lens=lens_with(self.bundle.lens, lens), w2c=w2c, tags=moved, twists=twists)
 
-    def evaluate(self, x: Float[np.ndarray, "X"]) -> tuple[Float[np.ndarray, "R"], csr_matrix]:
-        """Residuals, two a point, and their Jacobian."""
-        # The solver asks for the two one after the other.
-        if self._last is None or not np.array_equal(self._last[0], x):
-            self._last = (x.copy(), self._evaluate(x))
-        return self._last[1]
 
-    def _evaluate(self, x: Float[np.ndarray, "X"]) -> tuple[Float[np.ndarray, "R"], csr_matrix]:
-        seen, lens = self.seen, self.lens_of(x)
-        focal, aspect = lens[0], lens[1]
-        K = np.array([[focal, 0, lens[2]], [0, focal * aspect, lens[3]], [0, 0, 1]])
-        tag_start, pose_start = self.bundle.tags[seen.tag, :3, :3], self.bundle.w2c[seen.photo, :3, :3]
-        local = seen.points.copy()
-        local[:, 2] += self.twists_of(x)[seen.tag] * seen.warp
-        points, by_tag, tag_turn = _moved(self.tags_of(x), seen.tag, np.einsum("nrc,nc->nr", tag_start, local))
-        there, by_pose, turn = _moved(self.poses_of(x), seen.photo, np.einsum("nrc,nc->nr", pose_start, points))
-        pixels, jacobian = cv2.projectPoints(there[:, None], np.zeros(3), np.zeros(3), K, lens[4:])
-        jacobian = jacobian.reshape(len(there), 2, -1)
-        by_there = jacobian[:, :, 3:6]
-        by_lens = np.concatenate(
-            [jacobian[:, :, 6:7] + aspect * jacobian[:, :, 7:8], focal * jacobian[:, :, 7:8], jacobian[:, :, 8:15]],
-            axis=2,
-        )
-        by_point = by_there @ turn @ pose_start
-        entries = [by_lens[:, :, self.free_lens], by_there @ by_pose, by_point @ by_tag]
-        if self.free_twists:
-            lifted = seen.warp[:, None] * (tag_turn @ tag_start)[:, :, 2]
-            entries.append(by_point @ lifted[:, :, None])
-        values = np.concatenate(entries, axis=2)[self._there], self._columns, self._ends
-        residuals = (pixels.reshape(-1, 2) - seen.pixels).reshape(-1)
-        return residuals, csr_matrix(values, shape=(len(residuals), self.unknowns))
+def rotate(vectors: Numbers, points: Numbers) -> Numbers:
+    """Points turned by quaternions proportional to (v / 2, 1): near 0, v is a rotation vector, and all is smooth there."""
+    half = vectors / 2
+    across = np.cross(half, points)
+    return points + 2 * (across + np.cross(half, across)) / (1 + (half * half).sum(-1, keepdims=True))
+
+
+def _turned(numbers: Float[np.ndarray, "P 6"], poses: Float[np.ndarray, "P 4 4"]) -> Float[np.ndarray, "P 4 4"]:
+    """Poses turned further as `rotate` does, at their new places."""
+    quaternions = np.pad(numbers[:, :3] / 2, ((0, 0), (0, 1)), constant_values=1.0)
+    out = poses.copy()
+    out[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix() @ poses[:, :3, :3]
+    out[:, :3, 3] = numbers[:, 3:]
+    return out
+
+
+def _lift(points: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M 3"]:
+    """Where a twist by 1 moves each point: up by x y, 1 at the corners. Only this bend of a square lifts its corners out of
+    their common plane."""
+    extent = np.abs(points[:, :2]).max(0)
+    return np.pad((points[:, :1] * points[:, 1:2]) / extent.prod(), ((0, 0), (2, 0)))

@@ -1,7 +1,7 @@
 """The lens of a camera from photos of tags: focal length, principal point, distortion, and their standard deviations."""
 
-import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 
 from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS
-from nerf_lightning.capture.poses.solve import Pose, Solved, misfits, packed, select_model, solve
-from nerf_lightning.capture.tags.detect import Mark, Sighting
+from nerf_lightning.capture.poses.pose import Pose
+from nerf_lightning.capture.poses.solve import PlacedPhoto, Solved, select_model, solve, solve_without_misfits
+from nerf_lightning.capture.tags.detect import Sighting, find_wrong_sizes
 from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.errors import InputError
-
-log = logging.getLogger(__name__)
 
 MIN_PHOTOS = 3
 MODELS: tuple[tuple[int, tuple[str, ...]], ...] = (
@@ -33,11 +32,11 @@ With few photos the principal point would absorb the effect of bent paper, and s
 """
 ROUNDS = 3
 """Times that the poses are solved before the lens model is chosen."""
-FIRST_FOCAL = (0.7, 1.0, 1.5, 2.2)
+FIRST_FOCAL_FRACTIONS = (0.7, 1.0, 1.5, 2.2)
 """First guesses of the focal length, in longest sides of the photo."""
-UNSURE, MAX_UNCERTAINTY = 0.01, 0.05
-"""Relative standard deviations of the focal length above which there is a warning, and an error."""
-MIN_FOCAL, MAX_FOCAL = 0.35, 12.0
+MAX_UNCERTAINTY, GOOD_UNCERTAINTY = 0.05, 0.01
+"""Relative standard deviations of the focal length above which there is an error, and a warning."""
+MIN_FOCAL_FRACTION, MAX_FOCAL_FRACTION = 0.35, 12.0
 """Focal lengths in longest sides of the photo: from a very wide angle to a long telephoto lens."""
 GOOD_COVERAGE = 0.4
 """Share of the picture that corners should span."""
@@ -56,15 +55,69 @@ class Calibration:
     rms: float
     """Root mean square reprojection error, pixels."""
     solved: Solved
-    used: list[Sighting]
-    """In the order of `solved.placed`."""
-    dropped: dict[str, str]
-    """Photos left out, and why."""
+    photos: list[PlacedPhoto]
+    """All that were given."""
     coverage: float
     """Share of the picture within the hull of all corners."""
     tilt: float
     """Largest angle from the frontal view of a tag, radians."""
     warnings: list[str]
+
+    @property
+    def used(self) -> list[Sighting]:
+        """What the photos behind it show, in the order of `solved.photos`."""
+        return [photo.sighting for photo in self.photos if not photo.reason]
+
+    @property
+    def dropped(self) -> dict[str, str]:
+        """Photos left out, and why."""
+        return {photo.name: photo.reason for photo in self.photos if photo.reason}
+
+
+def calibrate(folder: Path, sightings: Sequence[Sighting], layout: dict[int, Pose] | None) -> Calibration:
+    """Fits the lens. Photos without tags, of another size than most, and those that contradict the others, are left out.
+
+    Args:
+        folder: where the photos are, for messages.
+        sightings: all photos.
+        layout: tag to world; None solves it from these photos.
+
+    Raises:
+        InputError: too few photos with tags, or photos that do not determine the focal length.
+    """
+    wrong = find_wrong_sizes(folder, sightings)
+    used = [s for s in sightings if s.marks and s.name not in wrong]
+    if len(used) < MIN_PHOTOS:
+        found = f"{len(used)} photos with tags of {len(sightings)}"
+        advice = "take more photos of the tags, sharp, from different angles; check the dictionary"
+        raise InputError(folder, "", found, f"at least {MIN_PHOTOS}", advice)
+    tilt = max(_tilt(s) for s in used)
+    if tilt < MIN_TILT_RAD:
+        found = f"photos that all look straight at the tags (tilted by {np.degrees(tilt):.0f} degrees at most)"
+        raise InputError(folder, "", found, "tags seen from different angles", TILT_ADVICE)
+    first = first_lens(used)
+    solved, photos = solve_without_misfits(
+        sightings, wrong, lambda left: _solve_with_lens(first, left, layout), MIN_PHOTOS
+    )
+    lens, refined = solved.lens, solved.refined
+    corners = [mark.pixels for photo in photos if not photo.reason for mark in photo.sighting.marks.values()]
+    hull = cv2.convexHull(np.concatenate(corners).astype(np.float32))
+    coverage = float(cv2.contourArea(hull)) / (lens.width * lens.height)
+    uncertainty = refined.deviations.get("focal", 0.0) / lens.fx
+    focal_fraction = lens.fx / max(lens.width, lens.height)
+    if not uncertainty < MAX_UNCERTAINTY or not MIN_FOCAL_FRACTION < focal_fraction < MAX_FOCAL_FRACTION:
+        found = f"focal length {lens.fx:.0f} pixels, uncertain by {100 * uncertainty:.0f} %"
+        raise InputError(folder, "", found, "tags seen from different angles", TILT_ADVICE)
+    warnings = {
+        f"the focal length is uncertain by {100 * uncertainty:.1f} %: take more photos from other angles": (
+            uncertainty > GOOD_UNCERTAINTY
+        ),
+        f"the tags are tilted by {np.degrees(tilt):.0f} degrees at most: {TILT_ADVICE}": tilt < GOOD_TILT_RAD,
+        f"the tags cover {100 * coverage:.0f} % of the picture: bring them near its borders in some photos, else"
+        " distortion there is a guess": coverage < GOOD_COVERAGE,
+    }
+    applying = [text for text, applies in warnings.items() if applies]
+    return Calibration(lens, refined.deviations, refined.total_rms, solved, photos, coverage, tilt, applying)
 
 
 def first_lens(sightings: Sequence[Sighting]) -> Intrinsics:
@@ -76,131 +129,34 @@ def first_lens(sightings: Sequence[Sighting]) -> Intrinsics:
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
     flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     found: list[tuple[float, float]] = []
-    for guess in FIRST_FOCAL:
-        focal = guess * max(width, height)
+    for fraction in FIRST_FOCAL_FRACTIONS:
+        focal = fraction * max(width, height)
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-        try:
+        with suppress(cv2.error):  # no start from there
             error, K, *_ = cv2.calibrateCamera(points, pixels, (width, height), K, np.zeros(5), flags=flags)
-        except cv2.error as problem:
-            log.debug("no start from a focal length of %g: %s", focal, problem)
-            continue
-        if np.isfinite(K).all() and 0.2 < K[0, 0] / max(width, height) < 20:
-            found.append((error, float(K[0, 0])))
+            if 0.2 < K[0, 0] / max(width, height) < 20:
+                found.append((error, float(K[0, 0])))
     focal = min(found)[1] if found else 1.2 * max(width, height)
     return Intrinsics(width, height, focal, focal, width / 2, height / 2)
 
 
-def calibrate(folder: Path, sightings: Sequence[Sighting], layout: dict[int, Pose] | None) -> Calibration:
-    """Fits the lens. Photos without tags, and photos that contradict the others, are dropped by name.
-
-    Args:
-        folder: where the photos are, for messages.
-        sightings: all photos of one size.
-        layout: tag to world; None solves it from these photos.
-
-    Raises:
-        InputError: too few photos with tags, or photos that do not determine the focal length.
-    """
-    used = [s for s in sightings if s.marks]
-    if len(used) < MIN_PHOTOS:
-        found = f"{len(used)} photos with tags of {len(sightings)}"
-        advice = "take more photos of the tags, sharp, from different angles; check the dictionary"
-        raise InputError(folder, "", found, f"at least {MIN_PHOTOS}", advice)
-    tilt = _max_tilt(used)
-    if tilt < MIN_TILT_RAD:
-        found = f"photos that all look straight at the tags (tilted by {np.degrees(tilt):.0f} degrees at most)"
-        raise InputError(folder, "", found, "tags seen from different angles", TILT_ADVICE)
-    solved, used, dropped = _fit_consistent(folder, used, layout)
-    dropped |= {s.name: "no tag found" for s in sightings if not s.marks}
-    lens, refined = solved.lens, solved.refined
-    corners = np.concatenate([mark.pixels for s in used for mark in s.marks.values()]).astype(np.float32)
-    coverage = float(cv2.contourArea(cv2.convexHull(corners))) / (lens.width * lens.height)
-    uncertainty = refined.deviations.get("focal", 0.0) / lens.fx
-    longest_sides = lens.fx / max(lens.width, lens.height)
-    if not uncertainty < MAX_UNCERTAINTY or not MIN_FOCAL < longest_sides < MAX_FOCAL:
-        found = f"focal length {lens.fx:.0f} pixels, uncertain by {100 * uncertainty:.0f} %"
-        raise InputError(folder, "", found, "tags seen from different angles", TILT_ADVICE)
-    warnings = _warnings(uncertainty, tilt, coverage)
-    return Calibration(lens, refined.deviations, refined.total_rms, solved, used, dropped, coverage, tilt, warnings)
-
-
-def _fit_consistent(
-    folder: Path, used: list[Sighting], layout: dict[int, Pose] | None
-) -> tuple[Solved, list[Sighting], dict[str, str]]:
-    """Fits until no photo contradicts the others.
-
-    Returns:
-        The fit, the photos behind it, and why each of the others was dropped, by name.
-    """
-    dropped: dict[str, str] = {}
-    lens = first_lens(used)
-    while True:
-        solved = _fit(folder, lens, used, layout)
-        lens = solved.lens
-        off = misfits(solved)
-        lost = {i for i in range(len(used)) if i not in solved.w2c}
-        left = [drop_tag(s, off.marks.get(i)) for i, s in enumerate(used) if i not in lost | set(off.photos)]
-        if not (off.photos or off.marks or lost) or len(left) < MIN_PHOTOS:
-            return solved, used, dropped
-        dropped |= {used[i].name: reprojection_message(error, off.usual) for i, error in off.photos.items()}
-        dropped |= {used[i].name: "its tags could not be placed" for i in lost}
-        used = left
-
-
-def _warnings(uncertainty: float, tilt: float, coverage: float) -> list[str]:
-    warnings = []
-    if uncertainty > UNSURE:
-        text = f"the focal length is uncertain by {100 * uncertainty:.1f} %: take more photos from other angles"
-        warnings.append(text)
-    if tilt < GOOD_TILT_RAD:
-        warnings.append(f"the tags are tilted by {np.degrees(tilt):.0f} degrees at most: {TILT_ADVICE}")
-    if coverage < GOOD_COVERAGE:
-        text = (
-            f"the tags cover {100 * coverage:.0f} % of the picture: bring them near its borders in some photos, else "
-        )
-        warnings.append(text + "distortion there is a guess")
-    return warnings
-
-
-def drop_tag(sighting: Sighting, tag: int | None) -> Sighting:
-    """A sighting without a tag that is half hidden, bent, or mistaken for another; the same for None."""
-    if tag is None:
-        return sighting
-    text = "%s: tag %d is ignored: it lies elsewhere than in the other photos, or is half hidden"
-    log.warning(text, sighting.name, tag)
-    return replace(sighting, marks={t: mark for t, mark in sighting.marks.items() if t != tag})
-
-
-def reprojection_message(error: float, usual: float) -> str:
-    """The reason for leaving out a photo."""
-    return f"reprojection error {error:.1f} pixels (median {usual:.2f} pixels)"
-
-
-def _fit(folder: Path, lens: Intrinsics, used: list[Sighting], layout: dict[int, Pose] | None) -> Solved:
+def _solve_with_lens(lens: Intrinsics, used: Sequence[Sighting], layout: dict[int, Pose] | None) -> Solved:
     """Poses and layout from the first guess of the lens, then the best lens model that the number of photos allows."""
-    marks: list[dict[int, Mark]] = [s.marks for s in used]
     rough = MODELS[1][1] if len(used) >= MODELS[1][0] else MODELS[0][1]
+    solved = solve(lens, used, layout, rough)
     # Without distortion the flipped pose of a tag can look better: with each estimate of it, poses are chosen again.
-    for _ in range(ROUNDS):
-        solved = solve(lens, marks, layout, rough)
-        if solved is None:
-            raise InputError(folder, "", "tags that no camera could have seen so", "photos of flat, undamaged tags")
-        lens = solved.lens
-    assert solved is not None  # ROUNDS is at least 1
-    models = [free for needed, free in MODELS if len(solved.placed) >= needed]
-    refined = select_model(solved.refined.bundle, models, solved.fixed)
-    return packed(refined, list(solved.tags), solved.placed, solved.fixed)
+    for _ in range(ROUNDS - 1):
+        solved = solve(solved.lens, used, layout, rough)
+    models = [free for needed, free in MODELS if len(solved.photos) >= needed]
+    return replace(solved, refined=select_model(solved.refined.bundle, models, solved.fixed))
 
 
-def _max_tilt(used: Sequence[Sighting]) -> float:
-    """The largest angle from the frontal view, by foreshortening: a frontal square stays a square at any focal length. Each
-    photo is judged by its mark nearest to the middle, where distortion is least."""
-    angles = []
-    for s in used:
-        middle = np.array([s.width / 2, s.height / 2])
-        mark = min(s.marks.values(), key=lambda m: float(np.linalg.norm(m.pixels.mean(0) - middle)))
-        flat = np.c_[mark.points[:, :2], np.ones(len(mark.points))]
-        affine = np.linalg.lstsq(flat, mark.pixels, rcond=None)[0][:2]
-        long, short = np.linalg.svd(affine, compute_uv=False)
-        angles.append(float(np.arccos(np.clip(short / long, 0, 1))))
-    return max(angles)
+def _tilt(sighting: Sighting) -> float:
+    """The angle from the frontal view by foreshortening, radians: a frontal square stays a square at any focal length. Judged
+    by the mark nearest to the middle, where distortion is least."""
+    middle = np.array([sighting.width / 2, sighting.height / 2])
+    mark = min(sighting.marks.values(), key=lambda m: float(np.linalg.norm(m.pixels.mean(0) - middle)))
+    flat = np.c_[mark.points[:, :2], np.ones(len(mark.points))]
+    affine = np.linalg.lstsq(flat, mark.pixels, rcond=None)[0][:2]
+    long, short = np.linalg.svd(affine, compute_uv=False)
+    return float(np.arccos(np.clip(short / long, 0, 1)))

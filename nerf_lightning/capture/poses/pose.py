@@ -7,21 +7,14 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from nerf_lightning.capture.poses.geometry import (
-    angle_between,
-    inverse,
-    move,
-    normalised,
-    project,
-    to_matrix,
-    to_vector,
-)
+from nerf_lightning.capture.poses.geometry import angle_between, inverse, move, project, to_matrix
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.dataset.intrinsics import Intrinsics
 
-SAME = np.radians(1.0)
+Pose = Float[np.ndarray, "4 4"]
+MIN_DIFFERENCE_RAD = np.radians(1.0)
 """Solutions that differ by less count as one."""
-HYPOTHESES = 2
+MAX_HYPOTHESES = 2
 """Solutions kept a photo."""
 
 
@@ -29,37 +22,39 @@ HYPOTHESES = 2
 class Hypothesis:
     """One place where a camera may have stood."""
 
-    pose: Float[np.ndarray, "4 4"]
+    pose: Pose
     """World (or tag) to camera."""
     squares: float
     """Sum of squared reprojection distances, pixels^2."""
 
 
-def squares_of(lens: Intrinsics, pose: Float[np.ndarray, "4 4"], points: np.ndarray, pixels: np.ndarray) -> float:
-    """Sum of squared distances between projected points and their pixels; infinite where one is behind the camera."""
+def rate(
+    lens: Intrinsics, pose: Pose, points: Float[np.ndarray, "M 3"], pixels: Float[np.ndarray, "M 2"]
+) -> Hypothesis:
+    """A pose with its reprojection error, which is infinite where a point is behind the camera."""
     if (move(pose, points)[:, 2] <= 0).any():
-        return float("inf")
-    return float(((project(lens, pose, points) - pixels) ** 2).sum())
+        return Hypothesis(pose, float("inf"))
+    return Hypothesis(pose, float(((project(lens, pose, points) - pixels) ** 2).sum()))
 
 
-def polished(lens: Intrinsics, pose: Float[np.ndarray, "4 4"], points: np.ndarray, pixels: np.ndarray) -> Hypothesis:
+def polish(
+    lens: Intrinsics, pose: Pose, points: Float[np.ndarray, "M 3"], pixels: Float[np.ndarray, "M 2"]
+) -> Hypothesis:
     """The nearest minimum of the reprojection error (Levenberg-Marquardt)."""
-    vector = to_vector(pose)
-    turn, shift = cv2.solvePnPRefineLM(
-        points, pixels, lens.K, lens.opencv, vector[:3, None].copy(), vector[3:, None].copy()
+    rotation, translation = cv2.solvePnPRefineLM(
+        points, pixels, lens.K, lens.opencv, cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
     )
-    better = to_matrix(np.concatenate([turn.reshape(3), shift.reshape(3)]))
-    candidates = [Hypothesis(p, squares_of(lens, p, points, pixels)) for p in (better, pose)]
-    return min(candidates, key=lambda h: h.squares)
+    better = to_matrix(rotation.reshape(3), translation.reshape(3))
+    return min(rate(lens, better, points, pixels), rate(lens, pose, points, pixels), key=lambda h: h.squares)
 
 
 def distinct(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best ones, best first, without repeats."""
     kept: list[Hypothesis] = []
-    for hypothesis in sorted(hypotheses, key=lambda h: h.squares):
-        if np.isfinite(hypothesis.squares) and all(angle_between(hypothesis.pose, k.pose) > SAME for k in kept):
-            kept.append(hypothesis)
-    return kept[:HYPOTHESES]
+    for one in sorted(hypotheses, key=lambda h: h.squares):
+        if np.isfinite(one.squares) and all(angle_between(one.pose, k.pose) > MIN_DIFFERENCE_RAD for k in kept):
+            kept.append(one)
+    return kept[:MAX_HYPOTHESES]
 
 
 def mark_poses(lens: Intrinsics, mark: Mark) -> list[Hypothesis]:
@@ -68,34 +63,30 @@ def mark_poses(lens: Intrinsics, mark: Mark) -> list[Hypothesis]:
     A flat target seen from afar looks the same from two sides (Collins and Bartoli 2014, "Infinitesimal plane-based pose
     estimation"), and its own reprojection error often cannot tell which one is right.
     """
-    tangents = normalised(lens, mark.pixels)
-    found, turns, shifts, _ = cv2.solvePnPGeneric(mark.points, tangents, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-    if not found:
-        return []
-    poses = [to_matrix(np.concatenate([r.reshape(3), t.reshape(3)])) for r, t in zip(turns, shifts, strict=True)]
-    return distinct([polished(lens, pose, mark.points, mark.pixels) for pose in poses])
+    distortion = lens.opencv
+    found, turns, shifts, _ = cv2.solvePnPGeneric(mark.points, mark.pixels, lens.K, distortion, flags=cv2.SOLVEPNP_IPPE)
+    poses = [to_matrix(r.reshape(3), t.reshape(3)) for r, t in zip(turns, shifts, strict=True)] if found else []
+    return distinct([polish(lens, pose, mark.points, mark.pixels) for pose in poses])
 
 
-def photo_poses(
-    lens: Intrinsics, marks: dict[int, Mark], tags: dict[int, Float[np.ndarray, "4 4"]]
-) -> list[Hypothesis]:
+def photo_poses(lens: Intrinsics, marks: dict[int, Mark], tags: Mapping[int, Pose]) -> list[Hypothesis]:
     """World to camera from all marks of a photo together, best first.
 
     Args:
         marks: by tag; those without a place in `tags` are left out.
         tags: tag to world.
     """
-    if not any(tag in tags for tag in marks):
+    known = {tag: mark for tag, mark in marks.items() if tag in tags}
+    if not known:
         return []
-    points, pixels = points_and_pixels(marks, tags)
-    alone = {tag: mark_poses(lens, mark) for tag, mark in marks.items() if tag in tags}
-    starts = [hypothesis.pose @ inverse(tags[tag]) for tag, found in alone.items() for hypothesis in found]
-    rough = distinct([Hypothesis(start, squares_of(lens, start, points, pixels)) for start in starts])
-    return distinct([polished(lens, hypothesis.pose, points, pixels) for hypothesis in rough])
+    points, pixels = points_and_pixels(known, tags)
+    starts = [h.pose @ inverse(tags[tag]) for tag, mark in known.items() for h in mark_poses(lens, mark)]
+    rough = distinct([rate(lens, start, points, pixels) for start in starts])
+    return distinct([polish(lens, hypothesis.pose, points, pixels) for hypothesis in rough])
 
 
 def points_and_pixels(
-    marks: dict[int, Mark], tags: Mapping[int, Float[np.ndarray, "4 4"]]
+    marks: Mapping[int, Mark], tags: Mapping[int, Pose]
 ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M 2"]]:
     """Points of a photo's known tags in the world, and where the photo shows them."""
     known = {tag: mark for tag, mark in marks.items() if tag in tags}

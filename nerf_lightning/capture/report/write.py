@@ -1,15 +1,13 @@
-"""The report of a capture: four pictures that show whether to trust it."""
+"""The report of a capture: three pictures that show whether to trust it."""
 
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from nerf_lightning.capture.photo_status import calibration_statuses, photo_statuses
 from nerf_lightning.capture.poses.geometry import move
+from nerf_lightning.capture.report.charts import error_chart
 from nerf_lightning.capture.report.contact_sheet import tag_sheet
-from nerf_lightning.capture.report.coverage_chart import coverage_chart
-from nerf_lightning.capture.report.error_chart import error_chart
 from nerf_lightning.capture.run import Capture
 from nerf_lightning.drawing.camera_map import camera_map
 from nerf_lightning.drawing.ink import pixels_of
@@ -20,8 +18,7 @@ def write_report(capture: Capture, folder: Path) -> list[Path]:
     """Writes the pictures to look at after a capture.
 
     - `tags.png`: the photos of both folders with their tags, and why some were left out;
-    - `errors.png`: the reprojection error by photo, and where in the picture corners are off, in which direction;
-    - `coverage.png`: where in the picture the calibration saw corners, and the lens's distortion;
+    - `errors.png`: the reprojection error by photo, where in the picture corners were seen and how they are off, and the lens;
     - `cameras.png`: the cameras, the tags, the box and the orbit of the scene, from above and from the side.
 
     Returns:
@@ -31,12 +28,11 @@ def write_report(capture: Capture, folder: Path) -> list[Path]:
         InputError: a photo can no longer be read: all are read again.
     """
     lens = capture.calibration.lens
-    folders = {"calibration": calibration_statuses(capture), "photos": photo_statuses(capture)}
+    folders = {"calibration": capture.calibration.photos, "photos": capture.photos}
     numbered = [(number, photo.c2w) for number, photo in enumerate(capture.photos, 1) if photo.c2w is not None]
     figures = {
         "tags": tag_sheet(folders, lens.width / lens.height),
-        "errors": pixels_of(error_chart(folders, lens)),
-        "coverage": pixels_of(coverage_chart(capture.calibration)),
+        "errors": pixels_of(error_chart(folders, capture.calibration)),
         "cameras": pixels_of(camera_map(numbered, capture.scene, tag_corners(capture), "metres")),
     }
     files = [folder / f"{name}.png" for name in figures]
@@ -47,5 +43,5 @@ def write_report(capture: Capture, folder: Path) -> list[Path]:
 
 def tag_corners(capture: Capture) -> dict[int, Float[np.ndarray, "M 3"]]:
     """Corners in the world of the tags that placed photos show, by id; metres."""
-    points = {tag: mark.points for sighting in capture.sightings for tag, mark in sighting.marks.items()}
+    points = {tag: mark.points for photo in capture.photos for tag, mark in photo.sighting.marks.items()}
     return {tag: move(pose, points[tag]) for tag, pose in capture.solved.tags.items() if tag in points}

@@ -12,26 +12,17 @@ from jaxtyping import Float, UInt8
 
 from nerf_lightning.capture.tags.layout import SQUARE
 from nerf_lightning.dataset.formats.decode import read_pixels
+from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.progress import tracked
 from nerf_lightning.utils.text import subsample
 
-COMMON = (
-    "DICT_4X4_50",
-    "DICT_5X5_50",
-    "DICT_6X6_50",
-    "DICT_7X7_50",
-    "DICT_4X4_1000",
-    "DICT_5X5_1000",
-    "DICT_6X6_1000",
-    "DICT_7X7_1000",
-    "DICT_ARUCO_ORIGINAL",
-    "DICT_APRILTAG_36h11",
-    "DICT_APRILTAG_25h9",
-    "DICT_APRILTAG_16h5",
+COMMON_FAMILIES = (
+    *(f"DICT_{side}X{side}_{count}" for count in (50, 1000) for side in (4, 5, 6, 7)),
+    *("DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11", "DICT_APRILTAG_25h9", "DICT_APRILTAG_16h5"),
 )
 """What `auto` tries, small families first: the small one of a kind holds the first patterns of the large one."""
-QUICK_SIDE = 1600
+GUESS_SIDE = 1600
 """Longest side in pixels at which `auto` looks for a family."""
 THREADS = 2
 
@@ -73,7 +64,7 @@ def family(name: str) -> "cv2.aruco.Dictionary":
     """
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if number is None:
-        raise InputError("capture", "dictionary", name, f"auto, or a name such as {', '.join(COMMON[:4])}")
+        raise InputError("capture", "dictionary", name, f"auto, or a name such as {', '.join(COMMON_FAMILIES[:4])}")
     return cv2.aruco.getPredefinedDictionary(number)
 
 
@@ -124,32 +115,47 @@ def detect_in_photos(paths: Sequence[Path], detector: Detector) -> list[Sighting
         return list(tracked(pool.map(look, paths), len(paths), "looking for tags"))
 
 
+def find_wrong_sizes(folder: Path, photos: Sequence[Sighting], size: tuple[int, int] | None = None) -> dict[str, str]:
+    """Photos that do not have the commonest size (or `size`, that of the calibration), and what is wrong with each.
+
+    Raises:
+        InputError: no photo is of that size.
+    """
+    width, height = size or Counter((p.width, p.height) for p in photos).most_common(1)[0][0]
+    expected = f"{width}x{height} is what {'was calibrated' if size else 'most have'}"
+    wrong = {}
+    for photo in photos:
+        if (photo.width, photo.height) != (width, height):
+            turned = "held the other way" if (photo.height, photo.width) == (width, height) else "of another size"
+            wrong[photo.name] = f"{photo.width}x{photo.height} pixels, {turned}: {expected}"
+    if len(wrong) == len(photos):
+        name, reason = next(iter(wrong.items()))
+        advice = "take both with one camera, held one way, without zooming"
+        raise InputError(folder / name, "", reason, "photos of the size and orientation of the calibration", advice)
+    return wrong
+
+
 def guess_family(paths: Sequence[Path], photos: int = 4) -> str:
     """The family with most tags in a few of the photos.
 
     Raises:
         InputError: where none of the common families is found.
     """
-    chosen = [paths[i] for i in subsample(len(paths), photos)]
     small = []
-    for path in chosen:
-        grey = read_grey(path)
-        scale = min(1.0, QUICK_SIDE / max(grey.shape))
-        small.append(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey)
+    for i in subsample(len(paths), photos):
+        grey = read_grey(paths[i])
+        size = fit_size(grey.shape[1], grey.shape[0], GUESS_SIDE)
+        small.append(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
     counts = {}
-    for name in COMMON:
+    for name in COMMON_FAMILIES:
         # Without error correction: a few wrong bits turn clutter into tags of the larger families.
         parameters = cv2.aruco.DetectorParameters()
         parameters.errorCorrectionRate = 0.0
         detector = cv2.aruco.ArucoDetector(family(name), parameters)
         counts[name] = sum(len(detector.detectMarkers(grey)[0]) for grey in small)
-    best = max(COMMON, key=counts.__getitem__)
+    best = max(COMMON_FAMILIES, key=counts.__getitem__)
     if not counts[best]:
-        raise InputError(
-            paths[0].parent,
-            "",
-            f"no tag of a common family in {len(chosen)} of {len(paths)} photos",
-            "sharp photos of printed ArUco tags with a white rim",
-            "name the family with dictionary if it is an unusual one",
-        )
+        found = f"no tag of a common family in {len(small)} of {len(paths)} photos"
+        advice = "name the family with dictionary if it is an unusual one"
+        raise InputError(paths[0].parent, "", found, "sharp photos of printed ArUco tags with a white rim", advice)
     return best

@@ -13,7 +13,7 @@ from nerf_lightning.utils.parsing import read_yaml
 SQUARE = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) / 2
 """Corners of a tag of side 1 in its own frame, in OpenCV's order: the printed top left first, then clockwise."""
 
-MOST_TAGS = 2320
+MAX_TAGS = 2320
 """In the largest of OpenCV's families, DICT_APRILTAG_36h10."""
 
 SHEETS = Path(__file__).parent / "sheets"
@@ -66,13 +66,10 @@ def read_layout(path: Path, dictionary: str, size: float) -> TagLayout:
         raise InputError(path, "tags", repr(tags), "a mapping from each tag's id to its x and y in metres")
     poses = {}
     for tag, entry in tags.items():
-        if not isinstance(tag, int) or not 0 <= tag < MOST_TAGS:
-            raise InputError(path, f"tags.{tag}", repr(tag), f"a whole number below {MOST_TAGS}, the tag's id")
-        given = entry if isinstance(entry, dict) else {}
-        unknown = sorted(set(given) - {"x", "y", "turn"})
-        numbers = [given.get("x"), given.get("y"), given.get("turn", 0.0)]
-        plain = [isinstance(n, int | float) and not isinstance(n, bool) and abs(n) <= FARTHEST for n in numbers]
-        if unknown or not all(plain):
-            raise InputError(path, f"tags.{tag}", repr(entry), "x and y in metres, and optionally turn in degrees")
-        poses[tag] = flat_pose(*numbers)
+        given = {"turn": 0.0} | (entry if isinstance(entry, dict) else {})
+        plain = [type(number) in (int, float) and abs(number) <= FARTHEST for number in given.values()]
+        if type(tag) is not int or not 0 <= tag < MAX_TAGS or set(given) != {"x", "y", "turn"} or not all(plain):
+            expected = f"an id below {MAX_TAGS} with x and y in metres, and optionally turn in degrees"
+            raise InputError(path, f"tags.{tag}", repr(entry), expected)
+        poses[tag] = flat_pose(given["x"], given["y"], given["turn"])
     return TagLayout(dictionary, size, poses)

@@ -1,1 +1,0 @@
-"""From a video or plain photos to photos with known cameras."""

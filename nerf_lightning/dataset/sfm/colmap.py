@@ -1,0 +1,254 @@
+"""Structure from motion with COLMAP (Schoenberger and Frahm 2016): photos -> lenses, cameras and points of the scene."""
+
+import itertools
+import logging
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from nerf_lightning.dataset.formats.decode import THREADS, read_pixels
+from nerf_lightning.dataset.formats.header import DAMAGED, DETAILS, read_header
+from nerf_lightning.dataset.intrinsics import Intrinsics
+from nerf_lightning.dataset.resize import fit_size
+from nerf_lightning.utils.progress import counted, tracked
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+MIN_PHOTOS = 3
+"""Of which a scene can be made."""
+COPY_SIDE = 1600
+"""Longest side in pixels of the copies in which COLMAP looks for features."""
+MIN_OPENCV_PHOTOS = 6
+"""Photos of a lens from which the lens model OPENCV is found; fewer photos get a simpler one."""
+MAX_EXHAUSTIVE = 150
+"""Photos up to which each is compared with each; beyond, with those near it in order."""
+NEIGHBOURS, LANDMARKS = 20, 60
+"""In order, on either side; and photos, evenly chosen, that are compared with each other too, so that a round closes."""
+PAIRS_PER_CALL = 300
+"""Pairs that are matched in one call: few enough that the bar moves."""
+MAX_ERROR_FRACTION = 0.004
+"""Reprojection distance up to which a match with photos of known pose holds, in longest sides: 4 pixels at 1000."""
+MIN_POINTS = 15
+"""That must agree on a pose: five times as many as determine one, so that chance matches do not."""
+MAKE, MODEL, FOCAL, FOCAL_35MM = 0x010F, 0x0110, 0x920A, 0xA405
+"""Numbers of the EXIF tags from which COLMAP takes the focal length, in millimetres."""
+
+
+def reconstruct(photos: Sequence[Path], workspace: Path) -> "pycolmap.Reconstruction | None":
+    """The largest model that COLMAP makes of photos; None where it makes none.
+
+    Its cameras and pixels are those of the upright, full-size photos, its images have the photos' names. Photos of one size,
+    camera and focal length share a lens, which starts from the focal length that they tell.
+
+    Args:
+        photos: of any sizes and cameras, in the order in which they were taken.
+        workspace: an empty folder for copies and matches.
+
+    Raises:
+        InputError: a photo cannot be read.
+    """
+    import pycolmap
+
+    database, copies, sizes = match_photos(photos, workspace)
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_PHOTOS, random_seed=0)
+    (workspace / "models").mkdir()
+    with counted(len(photos), "placing photos") as step:
+        models = pycolmap.incremental_mapping(
+            database,
+            copies,
+            workspace / "models",
+            options,
+            initial_image_pair_callback=lambda: step(2),
+            next_image_callback=lambda: step(1),
+        )
+    model = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    if model is not None:
+        _make_full_size(model, photos, sizes)
+    return model
+
+
+def register(
+    photos: Sequence[Path], lens: Intrinsics, known: Mapping[int, Float[np.ndarray, "4 4"]], workspace: Path
+) -> dict[int, tuple[Float[np.ndarray, "4 4"], float]]:
+    """Places photos against those whose poses are known, which stay as they are, and so do the lens, the scale and the frame.
+
+    COLMAP triangulates points from the known poses and registers the other photos one after the other.
+
+    Args:
+        photos: all, of one lens, in the order in which they were taken.
+        known: world to camera, by the photo's index.
+        workspace: an empty folder for copies and matches.
+
+    Returns:
+        World to camera, and the root mean square reprojection error in pixels, of the others that agree, by index.
+    """
+    import pycolmap
+
+    parameters = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.opencv, 0.0, 0.0, 0.0]
+    camera = pycolmap.Camera(model="FULL_OPENCV", width=lens.width, height=lens.height, params=parameters)
+    camera.has_prior_focal_length = True
+    camera.rescale(*fit_size(lens.width, lens.height, COPY_SIDE))
+    database, copies, _ = match_photos(photos, workspace, camera)
+    start = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as content:
+        (camera,), images = content.read_all_cameras(), content.read_all_images()
+    start.add_camera_with_trivial_rig(camera)
+    for image in images:
+        if number_of(image) in known:
+            placed = pycolmap.Image(name=image.name, camera_id=camera.camera_id, image_id=image.image_id)
+            start.add_image_with_trivial_frame(placed, pycolmap.Rigid3d(known[number_of(image)][:3]))
+    folder, output = workspace / "known", workspace / "models"
+    folder.mkdir()
+    output.mkdir()
+    options = _fixed_pose_options(MAX_ERROR_FRACTION * max(camera.width, camera.height))
+    pycolmap.triangulate_points(start, database, copies, folder, options=options).write_binary(folder)
+    models = pycolmap.incremental_mapping(database, copies, output, options, input_path=folder)
+    scale = lens.width / camera.width
+    return {
+        number_of(image): (np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]), scale * _rms(image, model))
+        for model in models.values()
+        for image in model.images.values()
+        if image.has_pose and number_of(image) not in known and image.num_points3D >= MIN_POINTS
+    }
+
+
+def match_photos(
+    photos: Sequence[Path], workspace: Path, camera: "pycolmap.Camera | None" = None
+) -> tuple[Path, Path, list[tuple[int, int]]]:
+    """Finds features in copies of photos and matches them.
+
+    Args:
+        photos: in the order in which they were taken.
+        workspace: an empty folder.
+        camera: of all copies; None: what their EXIF tags tell.
+
+    Returns:
+        COLMAP's database, the folder of the copies, and widths and heights of the upright photos.
+
+    Raises:
+        InputError: a photo cannot be read.
+    """
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # what fails is told in our own words
+    pycolmap.set_random_seed(0)
+    database, copies = workspace / "database.db", workspace / "photos"
+    reader = pycolmap.ImageReaderOptions()
+    if camera is not None:
+        with pycolmap.Database.open(database) as content:
+            reader.existing_camera_id = content.write_camera(camera)
+    copies.mkdir()
+    with ThreadPoolExecutor(THREADS) as pool:
+        written = pool.map(_write_copy, photos, [copies / copy_name(number) for number in range(len(photos))])
+        lenses = list(tracked(written, len(photos), "reading photos"))
+    for lens in dict.fromkeys(lenses):
+        names = [copy_name(number) for number, other in enumerate(lenses) if other == lens]
+        log.info("looking for features in %d photos of %dx%d", len(names), *lens[0])
+        reader.camera_model = "OPENCV" if len(names) >= MIN_OPENCV_PHOTOS else "SIMPLE_RADIAL"
+        pycolmap.extract_features(database, copies, names, pycolmap.CameraMode.SINGLE, reader)
+    pairs = pair_photos(len(photos))
+    options = pycolmap.ImportedPairingOptions(match_list_path=workspace / "pairs.txt")
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    log.info("matching %d pairs", len(pairs))
+    with counted(len(pairs), "matching pairs of photos") as step:
+        for first in range(0, len(pairs), PAIRS_PER_CALL):
+            chunk = pairs[first : first + PAIRS_PER_CALL]
+            lines = [f"{copy_name(i)} {copy_name(j)}\n" for i, j in chunk]
+            (workspace / "pairs.txt").write_text("".join(lines), encoding="utf-8")
+            pycolmap.match_image_pairs(database, pairing_options=options, verification_options=verification)
+            step(len(chunk))
+    return database, copies, [size for size, _ in lenses]
+
+
+def pair_photos(count: int) -> list[tuple[int, int]]:
+    """Which photos are compared: all with all, or of many those near each other in order, and a few with each other."""
+    if count <= MAX_EXHAUSTIVE:
+        return list(itertools.combinations(range(count), 2))
+    near = {(i, j) for i in range(count) for j in range(i + 1, min(i + NEIGHBOURS + 1, count))}
+    landmarks = np.linspace(0, count - 1, LANDMARKS).round().astype(int).tolist()
+    return sorted(near | set(itertools.combinations(landmarks, 2)))
+
+
+def copy_name(number: int) -> str:
+    """The name of a photo's copy: COLMAP cannot read every name."""
+    return f"{number:06d}.jpg"
+
+
+def number_of(image: "pycolmap.Image") -> int:
+    """The number of the photo of a copy."""
+    return int(Path(image.name).stem)
+
+
+def _write_copy(photo: Path, file: Path) -> tuple[tuple[int, int], bytes]:
+    """Writes a small upright copy in a format that COLMAP reads; the full size and the EXIF tags, which photos of one lens
+    share."""
+    image = Image.fromarray(np.ascontiguousarray(read_pixels(photo, upright=True)[..., :3]))
+    tags = lens_tags(photo)
+    small = image.resize(fit_size(*image.size, COPY_SIDE), Image.Resampling.BOX)
+    small.save(file, quality=98, subsampling=0, exif=tags)
+    return image.size, tags
+
+
+def lens_tags(photo: Path) -> bytes:
+    """The EXIF tags of a photo that tell of its lens; where they are broken, or there are none, nothing is known."""
+    header = read_header(photo)
+    tags = {} if header is None else header.tags
+    kept = Image.Exif()
+    try:
+        for tag in (MAKE, MODEL):
+            if tag in tags:
+                kept[tag] = str(tags[tag])
+        if float(tags.get(FOCAL, 0)) > 0:
+            kept.get_ifd(DETAILS)[FOCAL] = IFDRational(Fraction(float(tags[FOCAL])).limit_denominator(1000))
+        if float(tags.get(FOCAL_35MM, 0)) > 0:
+            kept.get_ifd(DETAILS)[FOCAL_35MM] = round(float(tags[FOCAL_35MM]))
+        return kept.tobytes()
+    except DAMAGED:
+        return b""
+
+
+def _fixed_pose_options(max_error: float) -> "pycolmap.IncrementalPipelineOptions":
+    """COLMAP's options: known poses and the lens are fixed, and matches hold up to an error in pixels."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions(random_seed=0, multiple_models=False, fix_existing_frames=True)
+    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.abs_pose_min_num_inliers = MIN_POINTS
+    options.mapper.abs_pose_max_error = options.mapper.filter_max_reproj_error = max_error
+    options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = max_error
+    options.triangulation.ignore_two_view_tracks = False  # poses are known: two views tell where a point is
+    return options
+
+
+def _make_full_size(model: "pycolmap.Reconstruction", photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> None:
+    """Changes a model of copies into one of the photos; COLMAP's pixel centres are at +0.5, as ours are."""
+    scales = {}
+    for image in model.images.values():
+        number, camera = number_of(image), model.cameras[image.camera_id]
+        if image.camera_id not in scales:
+            scales[image.camera_id] = np.divide(sizes[number], [camera.width, camera.height])
+            camera.rescale(*sizes[number])
+        for point in image.points2D:
+            point.xy = point.xy * scales[image.camera_id]
+        image.name = photos[number].name
+    model.update_point_3d_errors()
+
+
+def _rms(image: "pycolmap.Image", model: "pycolmap.Reconstruction") -> float:
+    """Root mean square reprojection error over a photo's points, pixels."""
+    points = [point for point in image.points2D if point.has_point3D()]
+    projected = [image.project_point(model.points3D[point.point3D_id].xyz) for point in points]
+    squares = [((p - point.xy) ** 2).sum() for p, point in zip(projected, points, strict=True) if p is not None]
+    return float(np.sqrt(np.mean(squares)))
