@@ -77,7 +77,7 @@ TINY = {
     speed: {"WARMUP": 2, "PERIODS": 1, "METHODS": ("hashgrid",), "BLOCKS": 4, "FIRST": 1, "BLOCK": 3},
     cameras: {"STEPS": 2, "CONDITIONS": {"exact": cameras.CONDITIONS["exact"]}},
     photos: {"SIZE": 16, "VIEWS": 6, "HELD_OUT": 2, "STEPS": 2},
-    pictures: {"KINDS": ("clouds",), "FIELDS": ("siren",), "SIZE": 16, "LARGE": 16},
+    pictures: {"KINDS": ("clouds",), "FIELDS": ("hashgrid2d",), "SIZE": 16, "LARGE": 16},
 }  # fmt: skip
 
 
