@@ -50,14 +50,10 @@ CONDITIONS: dict[str, tuple[int | None, Damage, list[str]]] = {
     "light": (None, light, []),
     "light, dark corners": (
         None,
-        lambda scene, seed: corruptions.add_vignetting(light(scene, seed), seed, 0.5),
+        lambda s, n: corruptions.add_vignetting(light(s, n), n, 0.5),
         ["refine.vignetting=true"],
     ),
-    "focal length 3 % too long": (
-        None,
-        lambda scene, seed: corruptions.scale_focal_length(scene, seed, 1.03),
-        ["refine.focal=true"],
-    ),
+    "focal length 3 % too long": (None, lambda s, n: corruptions.scale_focal_length(s, n, 1.03), ["refine.focal=true"]),
     "both, 3 wrong": (None, lambda scene, seed: corruptions.swap_poses(both(scene, seed), seed, WRONG), []),
     "exact, 12 photos": (FEW, lambda scene, seed: scene, []),
     "both, 12 photos": (FEW, both, []),

@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.synthetic.photos import Flaws, write_capture
 from benchmarks.tables import Rows, named
-from nerf_lightning.cameras import look_at
+from nerf_lightning.cameras import Distortion, look_at
 from nerf_lightning.capture.poses.flips import resolve_flips
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
 from nerf_lightning.capture.poses.pose import mark_poses
@@ -17,9 +17,9 @@ from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.run import capture_scene
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import TagLayout, flat_pose
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 
-LENS = Lens(1024, 768, 900.0, 900.0, 520.0, 380.0, (-0.2, 0.05, 0.0, 0.0, 0.0))
+LENS = Intrinsics(1024, 768, 900.0, 900.0, 520.0, 380.0, Distortion(k1=-0.2, k2=0.05))
 SIZE = 0.06
 SHEETS = {
     "one tag": TagLayout("DICT_4X4_50", SIZE, {0: flat_pose(0, 0)}),
@@ -102,7 +102,7 @@ def count_flips(
         noise: of corners, pixels.
         shuffled: the photos are in random order.
     """
-    lens = Lens(1024, 768, 900.0, 900.0, 512.0, 384.0)
+    lens = Intrinsics(1024, 768, 900.0, 900.0, 512.0, 384.0)
     points = SHEETS["one tag"].corners(0)
     truth, rng = random_walk(count, seed, tilt, pace), np.random.default_rng(seed + 100)
     if shuffled:

@@ -12,7 +12,6 @@ import nerf_lightning as nl
 from benchmarks.tables import Rows
 from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 from nerf_lightning.dataset import Scene, Views
-from nerf_lightning.dataset.views import Runs
 from nerf_lightning.synthetic.objects import PILE, bound_bodies, make_scene, place_cameras, render_photos
 
 SIZE, VIEWS, HELD_OUT = 128, 48, 6
@@ -64,7 +63,7 @@ def with_boxes(scene: Scene, seed: int) -> tuple[Scene, Scene]:
             images[view][place] = torch.randint(256, (3,), generator=generator).to(torch.uint8)
             known[view][place] = False
     spoiled = Views.of(images, scene.train.cameras)
-    masked = replace(spoiled, known=Runs.of(known.flatten()))
+    masked = replace(spoiled, known=known.flatten())
     return replace(scene, train=spoiled), replace(scene, train=masked)
 
 
@@ -100,7 +99,6 @@ def measure(args: argparse.Namespace) -> Rows:
             folder = args.output / "photos" / f"{name}_{seed}".replace(" ", "_")
             found.append(nl.train(scene, steps=STEPS, seed=seed, device="cpu", folder=folder, options=QUIET).psnr)
         held = scene.train
-        runs = 0 if held.known is None else held.known.starts.nbytes + held.known.ends.nbytes
-        row = {"photos": name, "psnr": fmean(found), "bytes/pixel": (held.nbytes + runs) / len(held.pixels)}
+        row = {"photos": name, "psnr": fmean(found), "bytes/pixel": held.nbytes / len(held.pixels)}
         rows.append(row)
     return rows

@@ -15,7 +15,7 @@ from benchmarks.agreement import FAILURES, failure
 from benchmarks.count import Count
 from benchmarks.methods import METHODS
 from benchmarks.tables import Row, Rows, named
-from nerf_lightning.callbacks.results import peak_memory_bytes
+from nerf_lightning.callbacks.evaluation import peak_memory_bytes
 from nerf_lightning.config.build import build_data, build_system, build_trainer, device_of, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.limits import limits_of

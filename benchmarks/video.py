@@ -16,14 +16,14 @@ from benchmarks.capture import SHEETS
 from benchmarks.synthetic.photos import Flaws, render_photo
 from benchmarks.synthetic.video import FPS, place_cameras, with_blurs, write_video
 from benchmarks.tables import Row, Rows
-from nerf_lightning.cameras import in_other_frame
+from nerf_lightning.cameras import Distortion, in_other_frame
 from nerf_lightning.capture.poses.geometry import angle_between, inverse
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.placing.frames import frames_of
 from nerf_lightning.dataset.placing.place import place
 from nerf_lightning.synthetic.tracer import map_shadow
 
-LENS = Lens(480, 360, 420.0, 420.0, 242.0, 178.0, (-0.1, 0.02, 0.0, 0.0, 0.0))
+LENS = Intrinsics(480, 360, 420.0, 420.0, 242.0, 178.0, Distortion(k1=-0.1, k2=0.02))
 FLAWS = Flaws(blur=0.4, noise=2.0)
 TURN, PAUSE = 120, 30
 """Pictures of a full turn; and those for which the camera stands still, after a third of it."""

@@ -1,10 +1,8 @@
 """The Python interface: scenes, trainings and runs, with the command line's defaults."""
 
 import functools
-import logging
 import math
 import os
-import random
 import signal
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -14,30 +12,23 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
+from lightning.pytorch.utilities.seed import isolate_rng
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
+from nerf_lightning.cli import export as commands
 from nerf_lightning.cli.compare import compare
 from nerf_lightning.cli.evaluate import evaluate
-from nerf_lightning.cli.export import (
-    export_compact,
-    export_html,
-    export_mesh,
-    export_points,
-    export_transforms,
-    export_voxels,
-)
 from nerf_lightning.cli.render import render as render_run
 from nerf_lightning.cli.rightsize import rightsize
 from nerf_lightning.cli.view import view
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.literal import override_of
-from nerf_lightning.dataset import Reading, Scene, open_scene
-from nerf_lightning.dataset.size import AUTO, auto_resize, parse_resize
+from nerf_lightning.dataset import PhotoLoadOptions, Scene, open_scene
+from nerf_lightning.dataset.size import AUTO, auto_resize
 from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.runs.open import open_scene_run
@@ -46,7 +37,6 @@ from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train as train_configured
 from nerf_lightning.utils.device import the_device
 from nerf_lightning.utils.files import user_path
-from nerf_lightning.utils.libraries import NOISY
 from nerf_lightning.utils.signals import Interrupted, handle_signals
 
 __all__ = ["Run", "View", "compare", "load_run", "load_scene", "rightsize", "train"]
@@ -59,7 +49,7 @@ def _as_method(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def method(self: "Run | Exports", *args: Any, **kwargs: Any) -> T:
-        with undisturbed():
+        with preserve_process_state():
             return function(self.path, *args, **kwargs)  # type: ignore[arg-type]
 
     return method  # type: ignore[return-value]
@@ -91,7 +81,8 @@ class Run:
     @property
     def psnr(self) -> float:
         """Mean PSNR over the held-out views, in dB; nan if none was measured."""
-        return float(self.results.get("psnr") or math.nan)
+        psnr = self.results.get("psnr")
+        return math.nan if psnr is None else float(psnr)
 
     def render(self, camera: Cameras) -> View:
         """Renders the first of some cameras, for example `scene.val.cameras[0]`; the result is on the CPU."""
@@ -116,12 +107,12 @@ class Exports:
 
     path: Path
 
-    compact = _as_method(export_compact)
-    html = _as_method(export_html)
-    mesh = _as_method(export_mesh)
-    points = _as_method(export_points)
-    transforms = _as_method(export_transforms)
-    voxels = _as_method(export_voxels)
+    compact = _as_method(commands.export_compact)
+    html = _as_method(commands.export_html)
+    mesh = _as_method(commands.export_mesh)
+    points = _as_method(commands.export_points)
+    transforms = _as_method(commands.export_transforms)
+    voxels = _as_method(commands.export_voxels)
 
 
 def load_scene(path: str | Path, resize: int | str | None = AUTO) -> Scene:
@@ -135,7 +126,7 @@ def load_scene(path: str | Path, resize: int | str | None = AUTO) -> Scene:
     Raises:
         InputError: if there is none, or it is damaged.
     """
-    return open_scene(os.path.abspath(user_path(path)), reading=Reading(parse_resize(resize)))
+    return open_scene(os.path.abspath(user_path(path)), options=PhotoLoadOptions(resize))
 
 
 def load_run(path: str | Path, device: str = "auto") -> Run:
@@ -149,7 +140,7 @@ def load_run(path: str | Path, device: str = "auto") -> Run:
         InputError: if there is none, it is broken or a picture's, or the device is not available.
     """
     place = user_path(path)
-    with undisturbed():
+    with preserve_process_state():
         found = open_scene_run(place, the_device(device))
     return Run(place, found.system, found.orbit, read_run(place).results if place.is_dir() else {})
 
@@ -183,9 +174,9 @@ def train(
     """
     if not isinstance(scene, Scene):
         size = auto_resize(seconds, steps, the_device(device), torch.get_num_threads())
-        scene = open_scene(os.path.abspath(user_path(scene)), reading=Reading(size))
-    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    place = Path("outputs", scene.name, now) if folder is None else user_path(folder)
+        scene = open_scene(os.path.abspath(user_path(scene)), options=PhotoLoadOptions(size))
+    default = Path("outputs", scene.name, datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
+    place = default if folder is None else user_path(folder)
     given = [
         "dataset=photos",
         override_of("dataset.path", scene.source),
@@ -198,7 +189,7 @@ def train(
         *([] if recipe is None else [f"recipe={recipe}"]),
     ]
     try:
-        with undisturbed(), handle_signals():
+        with preserve_process_state(), handle_signals():
             cfg = composed([*given, *options], place)
             with own_folder(place, cfg.overwrite, renamed=folder is None) as place:
                 train_configured(cfg, folder=place, scene=scene)
@@ -211,23 +202,15 @@ def train(
 
 
 @contextmanager
-def undisturbed() -> Iterator[None]:
-    """Leaves the process as it was: random numbers, threads, kernels, denormal numbers, warnings, logs, Hydra's state."""
+def preserve_process_state() -> Iterator[None]:
+    """Leaves the process as it was: random numbers, threads, kernels, denormal numbers, warnings, Hydra's state."""
     hydra, threads, kernels = HydraConfig.instance().cfg, torch.get_num_threads(), chosen_kernels()
     flushed = float(torch.tensor(1e-40) * 1) == 0
-    numbers, more_numbers, environment = random.getstate(), np.random.get_state(), dict(os.environ)
-    levels = {name: logging.getLogger(name).level for name in NOISY}
     try:
-        with warnings.catch_warnings(), torch.random.fork_rng(range(torch.cuda.device_count())):
+        with warnings.catch_warnings(), isolate_rng():
             yield
     finally:
         HydraConfig.instance().cfg = hydra
         torch.set_num_threads(threads)
         use_kernels(kernels)
         torch.set_flush_denormal(flushed)
-        random.setstate(numbers)
-        np.random.set_state(more_numbers)
-        for name in os.environ.keys() - environment.keys():
-            del os.environ[name]
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)

@@ -6,7 +6,7 @@ import shutil
 import urllib.request
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import UInt8
@@ -15,11 +15,12 @@ from torch import Tensor
 from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PixelDataModule
-from nerf_lightning.dataset.rays import FOCUS, RAYS, SAMPLES, RayDataModule
+from nerf_lightning.dataset.rays import FOCUS, RAYS, SAMPLES, Focused, RayDataModule
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
-from nerf_lightning.dataset.shots import Reading
-from nerf_lightning.dataset.size import AUTO, AutoResize, parse_resize
+from nerf_lightning.dataset.shots import Masked, Orientation, PhotoLoadOptions
+from nerf_lightning.dataset.size import AUTO, AutoResize
+from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.files import atomic, user_path
 from nerf_lightning.utils.options import AtLeast, Count
@@ -31,26 +32,66 @@ DOWNLOAD_TIMEOUT = 10.0
 
 
 def from_photos(
-    path: str,
+    path: str | None = None,
     name: str | None = None,
-    resize: Count | str | AutoResize | None = AUTO,
+    resize: Count | Literal["auto"] | AutoResize | None = AUTO,
     holdout: Annotated[int, AtLeast(2)] = 8,
-    masked: str = "auto",
+    masked: Masked = "auto",
     invert_masks: bool = False,
-    undistort: bool = False,
-    bounded: str | bool = "auto",
-    orientation: str = "auto",
+    bounded: bool | Literal["auto"] = "auto",
+    orientation: Orientation = "auto",
     near: float | None = None,
     far: float | None = None,
     rays: Count = RAYS,
     samples: Count | None = SAMPLES,
     seed: int = 0,
-    focus: float = FOCUS,
+    focus: Focused = FOCUS,
+    url: str | None = None,
+    folder: str = "data",
+    download: bool = True,
 ) -> RayDataModule:
-    """Posed photos in any supported format, see `open_scene` and `RayDataModule`."""
-    reading = Reading(parse_resize(resize), holdout, masked, invert_masks, undistort, str(bounded).lower(), orientation)
-    scene = open_scene(path, name, reading, near, far)
-    return RayDataModule(scene, rays, samples, seed, focus)
+    """Posed photos in any supported format, or a published scene; without that, the built-in one.
+
+    Args:
+        path, name, near, far: see `open_scene`.
+        resize, holdout, masked, invert_masks, bounded, orientation: see `PhotoLoadOptions`.
+        rays, samples, seed, focus: see `RayDataModule`.
+        url: public address of a file, for want of a path.
+        folder: where downloads are kept.
+        download: whether to use the network.
+
+    Raises:
+        InputError: neither path nor url, or a scene that cannot be read.
+    """
+    if path is None:
+        if url is None:
+            raise InputError(
+                "config", "dataset.path", "nothing", "the place of photos or a scene", "give dataset.path=..."
+            )
+        path = find_published(url, Path(folder), download)
+    if path is None:
+        return from_bricks(
+            resize if isinstance(resize, int) else 200, rays=rays, samples=samples, seed=seed, focus=focus
+        )
+    kind = bounded if isinstance(bounded, str) else "true" if bounded else "false"
+    options = PhotoLoadOptions(resize, holdout, masked, invert_masks, kind, orientation)
+    return RayDataModule(open_scene(path, name, options, near, far), rays, samples, seed, focus)
+
+
+def find_published(url: str, folder: Path, download: bool) -> str | None:
+    """The path of a published file, downloaded where it is not in the folder yet; None, with a warning, where that fails."""
+    local = folder / url.rsplit("/", 1)[-1]
+    if local.exists():
+        return str(local)
+    problem = f"{local} is not there"
+    if download:
+        try:
+            _download(url, local)
+            return str(local)
+        except OSError as error:
+            problem += f" and {url} could not be fetched ({error})"
+    log.warning("%s: the built-in scene 'bricks' stands in for it", problem)
+    return None
 
 
 def from_bricks(
@@ -60,54 +101,10 @@ def from_bricks(
     rays: Count = RAYS,
     samples: Count | None = SAMPLES,
     seed: int = 0,
-    focus: float = FOCUS,
+    focus: Focused = FOCUS,
 ) -> RayDataModule:
     """The built-in scene, see `bricks` and `RayDataModule`."""
     return RayDataModule(bricks(size, train_views, val_views), rays, samples, seed, focus)
-
-
-def from_download(
-    url: str,
-    folder: str,
-    download: bool = True,
-    path: str | None = None,
-    resize: Count | str | AutoResize | None = AUTO,
-    bounded: str | bool = "auto",
-    near: float | None = None,
-    far: float | None = None,
-    rays: Count = RAYS,
-    samples: Count | None = SAMPLES,
-    seed: int = 0,
-    focus: float = FOCUS,
-) -> RayDataModule:
-    """A published scene: from `path` if given, else `folder`, else downloaded into `folder`, else the built-in scene.
-
-    Args:
-        url: public address of the file.
-        folder: where downloads are kept.
-        download: whether to use the network.
-        path: a local copy, which must exist.
-        resize, bounded, near, far: see `from_photos`.
-        rays, samples, seed, focus: see `RayDataModule`.
-    """
-    if path is None:
-        local = Path(folder) / url.rsplit("/", 1)[-1]
-        problem = f"{local} is not there" if not local.exists() else ""
-        if problem and download:
-            try:
-                _download(url, local)
-                problem = ""
-            except OSError as error:
-                problem += f" and {url} could not be fetched ({error})"
-        if problem:
-            log.warning("%s: the built-in scene 'bricks' stands in for it", problem)
-            return from_bricks(
-                size=resize if isinstance(resize, int) else 200, rays=rays, samples=samples, seed=seed, focus=focus
-            )
-        path = str(local)
-    return from_photos(
-        path, None, resize, bounded=bounded, near=near, far=far, rays=rays, samples=samples, seed=seed, focus=focus
-    )
 
 
 def _download(url: str, target: Path) -> None:

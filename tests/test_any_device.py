@@ -1,31 +1,200 @@
-"""Everything on a device that is not the CPU: training and all that belongs to it, pictures, files and every verb."""
+"""Everything on a device that is not the CPU: steps, what they ask of it, runs, and what is done with one."""
 
 import itertools
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-import lightning as L
 import numpy as np
 import pytest
 import torch
-import yaml
 
-from nerf_lightning.config.build import build_data, build_system, build_trainer, frame_of
+from benchmarks.count import Count
+from nerf_lightning.cli.evaluate import evaluate
+from nerf_lightning.cli.export import export_compact, export_mesh, export_points, export_voxels
+from nerf_lightning.cli.render import render
+from nerf_lightning.config.build import build_data, build_system, frame_of
 from nerf_lightning.config.compose import composed
-from nerf_lightning.dataset import save_npz
+from nerf_lightning.kernels import use_kernels
 from nerf_lightning.runs.open import open_scene_run
-from nerf_lightning.synthetic.objects import PILE, make_scene
-from nerf_lightning.system import System
+from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.system.growth import grow_field, next_stage
+from nerf_lightning.system.system import total_loss
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.libraries import silence_lightning
+from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.view.painter import Painter, Wish
-from tests.helpers.device_runs import ON_IT, SCENES, options
 from tests.helpers.fake_device import NAME, Module
-from tests.helpers.shared_fixtures import make_once
-from tests.helpers.train_models import MODELS
+from tests.helpers.growth import grow
+from tests.helpers.train_models import MODELS, SCENE
+
+SCENES = ("hashgrid", "voxels", "tensorf", "mlp")
+ON_IT = ("device=pretend", "+trainer.inference_mode=false", "~logger")
+"""Its tensors know no inference mode."""
+QUICK = ("model.grown=0.5", "sampler.update_every=4", "sampler.warmup=8")
+SAMPLERS = {
+    "uniform": ["sampler=uniform", "sampler.samples=16"],
+    "stratified": ["sampler=stratified", "sampler.samples=16"],
+    "importance": ["sampler=importance", "sampler.samples=8", "sampler.fine=8"],
+    "proposal": ["sampler=proposal", "sampler.samples=8", "sampler.first=8", "sampler.second=8"],
+}
+
+
+def options(name: str) -> list[str]:
+    """A model's, small, growing where it does; with an orbit of two frames."""
+    given = [option for option in MODELS[name] if option not in ("callbacks.orbit=null", "model.grown=1")]
+    if name not in SCENES:
+        return [f"model={name}", *given]
+    if name in ("mlp", "hashgrid"):
+        return [f"model={name}", *given, *QUICK[1:], "callbacks.orbit.frames=2"]
+    return [f"model={name}", *given, *QUICK, "callbacks.orbit.frames=2"]
+
+
+def system_of(given: list[str], folder: Path) -> tuple[System, object]:
+    cfg = composed(given, folder)
+    data = build_data(cfg)
+    return build_system(cfg, frame_of(data)), data
+
+
+def stepped(system: System, data: object, steps: int, where: torch.device) -> list[float]:
+    """The losses of the first steps of a scene's training, drawn alike on every device."""
+    optimizer, losses = system.configure_optimizers(), []
+    for step in range(steps):
+        system.state.advance(step / steps)
+        if (stage := next_stage(system, step)) is not None:
+            grow_field(system, data, stage, optimizer)
+        batch, generator = data.draw(step).to(where), step_generator(0, Stream.STEP, step, where)
+        system.sampler.update(step, system.field.density, generator)
+        found, stats = system.compute_losses(batch, generator)
+        loss = total_loss(found)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        if stats.counted:
+            data.note_samples(stats.samples)
+        losses.append(float(loss.detach()))
+    return losses
+
+
+VARIANTS = {
+    **{name: options(name) for name in SCENES},
+    **{
+        name: [*(one for one in SCENE if not one.startswith("sampler.")), "model=mlp", "model.width=16", *given]
+        for name, given in SAMPLERS.items()
+    },
+    "penalty, one colour behind": [
+        *options("hashgrid"),
+        "renderer.distortion_loss_weight=0.01",
+        "renderer.background=white",
+    ],
+    "random colours behind": [*options("tensorf"), "renderer.background=random"],
+}
+
+
+@pytest.mark.parametrize(
+    ("variant", "kind"), list(zip(VARIANTS, itertools.cycle(["alpha", "unbounded"]), strict=False))
+)
+def test_steps_on_device_match_steps_on_cpu(variant: str, kind: str, without_doubles: torch.device, tmp_path: Path):
+    device = without_doubles
+    use_kernels("reference")
+    found = {}
+    for where in (torch.device("cpu"), device):
+        torch.manual_seed(0)
+        system, data = system_of([*VARIANTS[variant], "dataset.samples=null"], tmp_path)
+        assert isinstance(system, NeRF3D) and data.scene.train.images.shape[-1] == 4
+        if kind == "unbounded":
+            unbind(system)
+        found[where.type] = stepped(system.to(where), data, 7, where)
+    assert found[NAME] == pytest.approx(found["cpu"], rel=2e-3)
+    assert found[NAME][0] == pytest.approx(found["cpu"][0], rel=1e-5)
+
+
+def unbind(system: NeRF3D) -> None:
+    """As of a scene with a background."""
+    for part in (system.field, system.sampler):
+        part.bounds = replace(part.bounds, unbounded=True)
+
+
+MOST = {"tensorf": 255, "hashgrid": 255, "voxels": 255, "mlp": 225}
+"""Operations a step between two updates of the sampler: forward, backward, optimiser. Each takes 5 to 10 microseconds."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "hashgrid" else pytest.mark.long) for name in MOST]
+)
+def test_step_on_device_needs_few_operations_and_no_wait(name: str, device: torch.device, tmp_path: Path):
+    """As shipped, of a field that has its size; reading a result, or its size, makes the host wait."""
+    small = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1"]
+    system, data = system_of([f"recipe={name}_medium", *small, "sampler.warmup=0"], tmp_path)
+    assert isinstance(system, NeRF3D)
+    system, period, counts = system.to(device), system.sampler.update_every, []
+    optimizer = system.configure_optimizers()
+    for step in range(2 * period):
+        grow(system.field, 0.9)
+        batch = data.draw(step).to(device)
+        with Count() as count:
+            generator = step_generator(0, Stream.STEP, step, device)
+            system.sampler.update(step, system.field.density, generator)
+            losses, stats = system.compute_losses(batch, generator)
+            total_loss(losses).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+        if stats.counted:
+            data.note_samples(stats.samples)
+        counts.append(count)
+    for count in counts[-period + 3 :]:  # the first ones after an update make what is then kept for the device
+        assert count.operations <= MOST[name], count.names.most_common()
+        assert count.waits == 0, count.names.most_common()
+    assert 0 < sum(count.waits for count in counts[-period:]) <= 8, "for an update"
+
+
+@pytest.mark.parametrize("name", ["hashgrid2d", "picture_mlp", "fourier", "siren"])
+def test_picture_step_on_device_needs_no_wait(name: str, device: torch.device, tmp_path: Path):
+    system, data = system_of(options(name), tmp_path)
+    optimizer, batch = system.to(device).configure_optimizers(), data.draw(0).to(device)
+    for _ in range(2):
+        with Count() as count:
+            system.training_step(batch, 0).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+    assert count.waits == 0 and count.operations <= 100, count.names.most_common()
+
+
+def test_rays_beyond_room_do_not_train(device: torch.device, tmp_path: Path):
+    system, data = system_of(options("hashgrid"), tmp_path)
+    assert isinstance(system, NeRF3D)
+    stepped(system.to(device), data, 2, device)
+    batch, sampler = data.draw(2).to(device), system.sampler
+    sampler.update(2, system.field.density, step_generator(0, Stream.STEP, 2, device))
+    before = sampler.counts_per_ray
+    assert before is not None, "there is room for as many as were counted"
+
+    def drawn(per_ray: tuple[float, float] | None) -> Any:
+        sampler.counts_per_ray = per_ray
+        return sampler(batch.rays, system.field.density, step_generator(0, Stream.STEP, 2, device))
+
+    with torch.no_grad():
+        counted, roomy, tight = drawn(None), drawn(before), drawn((before[0], 0.4 * before[1]))
+    assert counted.whole is None and roomy.whole.all() and len(roomy) > len(counted)
+    ends = [int(end) for end in counted.offsets.cpu()]
+    torch.testing.assert_close(roomy.t[: ends[-1]].cpu(), counted.t.cpu())
+    assert torch.equal(roomy.offsets.cpu(), counted.offsets.cpu()) and not roomy.dt[ends[-1] :].any()
+    whole = tight.whole.cpu()
+    assert whole.tolist() == [end <= len(tight) for end in ends[1:]] and 0 < int(whole.sum()) < len(whole)
+    assert torch.equal(tight.t[: ends[int(whole.sum())]].cpu(), counted.t[: ends[int(whole.sum())]].cpu())
+
+    def loss(pixels: torch.Tensor) -> float:
+        sampler.counts_per_ray = (before[0], 0.4 * before[1])
+        changed = replace(batch, pixels=pixels)
+        losses, _ = system.compute_losses(changed, step_generator(0, Stream.STEP, 2, device))
+        return float(total_loss(losses).detach())
+
+    others = batch.pixels.clone()
+    others[~tight.whole] = 255 - others[~tight.whole]
+    assert loss(batch.pixels) == loss(others) > 0
 
 
 @pytest.fixture(autouse=True)
@@ -33,26 +202,10 @@ def silence_lightning_hints() -> None:
     silence_lightning()
 
 
-def trained(name: str, folder: Path, *more: str) -> dict:
-    """The results of a run on the device."""
-    train(composed([*options(name), *ON_IT, "budget.steps=12", *more], folder))
-    return json.loads((folder / "results.json").read_text())
-
-
-@pytest.fixture(scope="session")
-def run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
-    """A TensoRF run made on the CPU, to be opened on the device. To be looked at."""
-
-    def make(folder: Path) -> Path:
-        train(composed([*options("tensorf"), "budget.steps=60", "~logger", "callbacks.orbit=null"], folder))
-        return folder
-
-    return make_once(tmp_path_factory, "any_device", make)
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_run_on_device_of_each_model_finishes(name: str, without_doubles: torch.device, tmp_path: Path):
-    found = trained(name, tmp_path)
+    train(composed([*options(name), *ON_IT, "budget.steps=12"], tmp_path))
+    found = json.loads((tmp_path / "results.json").read_text())
     assert found["device"] == NAME and found["machine"]["accelerator"] == NAME and found["steps"] == 12
     assert math.isfinite(found["psnr"]) and not found["recoveries"]
     assert (tmp_path / "snapshots").is_dir() and (tmp_path / "checkpoints" / "last.ckpt").exists()
@@ -60,124 +213,31 @@ def test_run_on_device_of_each_model_finishes(name: str, without_doubles: torch.
     assert Module.waited > 0, "clocks are read when the device has done its work"
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["tensorf", "voxels", "hashgrid2d"])
-def test_run_on_device_resumes(name: str, device: torch.device, tmp_path: Path):
-    trained(name, tmp_path)
-    cfg = composed([*options(name), *ON_IT, "budget.steps=20"], tmp_path)
-    train(cfg, tmp_path / "checkpoints" / "last.ckpt")
-    assert json.loads((tmp_path / "results.json").read_text())["steps"] == 20
-
-
-@pytest.mark.parametrize(
-    ("name", "precision"), list(zip(MODELS, itertools.cycle(["bf16-mixed", "16-mixed"]), strict=False))
-)
-def test_mixed_precision_on_device_trains_each_model(name: str, precision: str, device: torch.device, tmp_path: Path):
-    quick = ["callbacks.snapshots=null", "callbacks.heldout=null", "callbacks.orbit=null", "budget.steps=2"]
-    cfg = composed([*options(name), *ON_IT, *quick, f"trainer.precision={precision}"], tmp_path)
-    data = build_data(cfg)
-    system = build_system(cfg, frame_of(data), device)
-    build_trainer(cfg, tmp_path, device).fit(system, data)
-    assert math.isfinite(float(system.stats.mse))
-    assert all(bool(weights.isfinite().all()) for weights in system.parameters())
-
-
-class Spoil(L.Callback):
-    """Breaks training after some steps, in one of the ways that the guard knows."""
-
-    def __init__(self, how: str, when: int):
-        self.how, self.when = how, when
-
-    def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *rest: Any) -> None:
-        if trainer.global_step == self.when:
-            with torch.no_grad():
-                weights = next(pl_module.parameters())
-                weights.fill_(math.nan if self.how == "nan" else 0.0)
-                if self.how == "dead":  # a ReLU below zero everywhere
-                    pl_module.field.density_head.weight.zero_()
-                    pl_module.field.density_head.bias.fill_(-1.0)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "how", "more", "action"),
-    [
-        ("tensorf", "nan", ["callbacks.guard.keep_every=5"], "last good weights"),
-        ("mlp", "dead", ["model.density=relu"], "softplus"),
-        ("mlp", "", ["optimizer.lr=0.5"], "times the learning rate"),
-    ],
-)
-def test_guard_on_device_restarts_training(
-    name: str, how: str, more: list[str], action: str, device: torch.device, tmp_path: Path
-):
-    quick = ["callbacks.snapshots=null", "callbacks.heldout=null", "callbacks.orbit=null"]
-    looks = ["callbacks.guard.every=5", "callbacks.guard.patience=5", "budget.steps=40"]
-    cfg = composed([*options(name), *ON_IT, *quick, *looks, *more], tmp_path)
-    data = build_data(cfg)
-    system = build_system(cfg, frame_of(data), device)
-    trainer = build_trainer(cfg, tmp_path, device)
-    trainer.callbacks.insert(0, Spoil(how, 12 if how else -1))
-    trainer.fit(system, data)
-    guard = next(one for one in trainer.callbacks if type(one).__name__ == "Guard")
-    assert any(action in one.action for one in guard.recoveries), guard.recoveries
-    assert all(bool(weights.isfinite().all()) for weights in system.parameters())
-
-
-def test_evaluate_on_device_finds_quality_of_training(device: torch.device, run: Path, tmp_path: Path):
-    from nerf_lightning.cli.evaluate import evaluate
-
+def test_run_of_cpu_is_used_on_device(device: torch.device, tmp_path: Path):
+    """Judged, filmed, exported and painted."""
+    run = tmp_path / "run"
+    train(composed([*options("tensorf"), "device=cpu", "budget.steps=60", "~logger", "callbacks.orbit=null"], run))
     judged = evaluate(run, output=tmp_path / "evaluation", worst=1, device=NAME)
     expected = json.loads((run / "results.json").read_text())["psnr"]
     assert judged["device"].startswith(NAME)
     assert fmean(view["psnr"] for view in judged["views"]) == pytest.approx(expected, abs=0.01)
-
-
-def test_render_on_device_writes_videos_and_images(device: torch.device, run: Path, tmp_path: Path):
-    from nerf_lightning.cli.render import render
 
     render(run, frames=2, channels="rgb,depth,opacity", output=tmp_path / "film.webp", device=NAME)
     render(run, path="test", output=tmp_path / "beside", device=NAME)
     render(run, frames=1, background="transparent", output=tmp_path / "frames", device=NAME)
     assert (tmp_path / "film.webp").exists() and len(list((tmp_path / "beside").glob("*.png"))) == 1
 
-
-def test_export_on_device_writes_each_kind(device: torch.device, run: Path, tmp_path: Path):
-    from nerf_lightning.cli import export
-
     box = (-0.9, -0.9, -0.9, 0.9, 0.9, 0.9)
     written = [
-        export.export_compact(run, output=tmp_path / "compact.npz", loss_db=3.0, device=NAME),
-        export.export_mesh(run, output=tmp_path / "mesh.glb", resolution=24, box=box, device=NAME),
-        export.export_points(run, output=tmp_path / "points.ply", resolution=24, device=NAME),
-        export.export_voxels(run, output=tmp_path / "voxels.npz", resolution=24, device=NAME),
+        export_compact(run, output=tmp_path / "compact.npz", loss_db=3.0, device=NAME),
+        export_mesh(run, output=tmp_path / "mesh.glb", resolution=24, box=box, device=NAME),
+        export_points(run, output=tmp_path / "points.ply", resolution=24, device=NAME),
+        export_voxels(run, output=tmp_path / "voxels.npz", resolution=24, device=NAME),
     ]
     assert all(file.stat().st_size > 100 for file in written)
 
-
-def test_viewer_on_device_paints_each_channel(device: torch.device, run: Path):
     found = open_scene_run(run, device)
-    eye = found.orbit.c2w[0].numpy()
     for channel in ("rgb", "depth", "opacity"):
-        wish = Wish(eye, 0.8, 1.5, channel, (1.0, 0.5, 0.0), 0.1, math.inf, 64)
+        wish = Wish(found.orbit.c2w[0].numpy(), 0.8, 1.5, channel, (1.0, 0.5, 0.0), 0.1, math.inf, 64)
         picture = Painter(found.system, found.orbit).paint(wish, 24, lambda: True)
         assert picture.shape == (16, 24, 3) and picture.dtype == np.uint8 and picture.std() > 0
-
-
-@pytest.mark.long
-def test_rightsize_on_device_finds_smallest(device: torch.device, tmp_path: Path):
-    from nerf_lightning.cli.rightsize import rightsize
-
-    save_npz(make_scene(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
-    rungs = [{"density_components": 8, "colour_components": 8, "coarsest": 4, "finest": side} for side in (4, 8)]
-    ladder = {"rungs": rungs, "samplers": [{"samples": 32, "resolution": 8}]}
-    (tmp_path / "ladder.yaml").write_text(yaml.safe_dump(ladder))
-    options = [
-        "recipe=tensorf_medium",
-        "budget.steps=6",
-        *ON_IT[:2],
-        "callbacks.orbit=null",
-        "callbacks.snapshots=null",
-    ]
-    where = {"ladder": str(tmp_path / "ladder.yaml"), "output": tmp_path / "found"}
-    found = rightsize(str(tmp_path / "scene.npz"), *options, psnr=8.0, **where)
-    assert found["device"].startswith(NAME) and found["reached"]

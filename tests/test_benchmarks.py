@@ -46,7 +46,9 @@ def few_samples(monkeypatch: pytest.MonkeyPatch):
 def spoil(monkeypatch: pytest.MonkeyPatch, name: str, how: Callable[[Tensor], Tensor]) -> None:
     """Spoils the version of a kernel that trainings run, and leaves the reference as it is."""
     right = getattr(kernels, name)
-    monkeypatch.setattr(kernels, name, lambda *given: how(right(*given)) if kernels.fast(given[0]) else right(*given))
+    monkeypatch.setattr(
+        kernels, name, lambda *given: how(right(*given)) if kernels.has_fast(given[0]) else right(*given)
+    )
 
 
 def test_compare_kernels_right_ones_are_equal_and_wrong_ones_named(few_samples: None, monkeypatch: pytest.MonkeyPatch):

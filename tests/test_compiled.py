@@ -12,64 +12,40 @@ import torch
 from nerf_lightning.errors import InputError
 from nerf_lightning.system.compiled import BACKEND, check_compiler
 from nerf_lightning.utils.device import CPU
-from tests.helpers.shared_fixtures import make_once
 
 ROOT = Path(__file__).resolve().parents[1]
-SOME, OTHERS = ("mlp", "voxels"), ("hashgrid", "tensorf")
-"""Fields: one that the renderer is compiled with, one that grows; and the others, for `make long`."""
-RUN = ("+experiment=smoke_2d", "device=cpu")
+HELPER = ROOT / "tests" / "helpers" / "compile_models.py"
 
 
-def compiling(cache: Path, *what: str) -> dict:
-    """What compile_models.py found."""
-    line = [sys.executable, str(ROOT / "tests" / "helpers" / "compile_models.py"), *what]
+def check_fields(cache: Path, *arguments: str) -> dict:
+    """What compile_models.py finds in a process of its own, after a look at its fields."""
     paths = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(cache)}
+    line = [sys.executable, str(HELPER), *arguments]
     done = subprocess.run(line, env={**os.environ, **paths}, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    found = json.loads(done.stdout.splitlines()[-1])
+    for name, field in found["fields"].items():
+        assert field["worst"] < 1e-4 and field["compiled"] >= 2, name
+        assert field["again"] == 0, f"{name}: a copy of it, or a batch of another size, was compiled anew"
+    return found
 
 
-@pytest.fixture(scope="session")
-def found(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> dict:
-    return make_once(tmp_path_factory, "compiled", lambda folder: compiling(folder / "kernels", *SOME, str(folder)))
-
-
-def same(field: dict) -> None:
-    assert field["worst"] < 1e-4 and field["compiled"] >= 2
-    assert field["again"] == 0, "a copy of it, or a batch of another size, was compiled anew"
-
-
-@pytest.mark.parametrize("name", SOME)
-def test_compiled_field_matches_plain_one(name: str, found: dict):
-    same(found[name])
-
-
-@pytest.mark.long
-def test_compiled_other_fields_match_plain_ones(tmp_path: Path):
-    found = compiling(tmp_path, *OTHERS)
-    assert set(found) == set(OTHERS)
-    for field in found.values():
-        same(field)
-
-
-@pytest.mark.long
-def test_compiled_inductor_kernels_match_plain_field(tmp_path: Path):
-    same(compiling(tmp_path, "whole"))
-
-
-def test_compiled_training_is_as_good(found: dict):
-    compiled, plain = found["trained"]
+def test_compiled_fields_and_training_match_plain_ones(tmp_path: Path):
+    """One that the renderer is compiled with, one that grows, and a training."""
+    compiled, plain = check_fields(tmp_path, "aot_eager", "mlp", "voxels", "--train", str(tmp_path))["trained"]
     assert compiled == pytest.approx(plain, abs=0.05)
 
 
-@pytest.fixture
-def no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.long
+@pytest.mark.parametrize(("backend", "names"), [("aot_eager", ["hashgrid", "tensorf"]), (BACKEND, ["voxels"])])
+def test_compiled_other_fields_and_kernels_match_plain_ones(backend: str, names: list[str], tmp_path: Path):
+    assert list(check_fields(tmp_path, backend, *names)["fields"]) == names
+
+
+def test_missing_compiler_is_one_line_and_writes_nothing(inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch._inductor.config.cpp, "cxx", ("no_such_compiler",))
-
-
-def test_missing_compiler_is_one_line_and_writes_nothing(no_compiler: None, inside, tmp_path: Path):
     with pytest.raises(InputError, match="config: compile: found true, but .*expected a C.. compiler.*compile=false"):
         check_compiler(CPU, BACKEND)
-    code, _, err = inside(*RUN, "compile=true")
+    code, _, err = inside("+experiment=smoke_2d", "device=cpu", "compile=true")
     assert code == 2 and err.count("\n") == 1 and "compile: found true, but" in err, err
     assert not list(tmp_path.rglob("*"))

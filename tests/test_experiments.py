@@ -4,12 +4,15 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import DictConfig
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from nerf_lightning.config import conf_dir
 from nerf_lightning.config.build import build_data, build_system, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
+from nerf_lightning.runs.folder import load_run
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.system import total_loss
@@ -18,7 +21,7 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 from tests.helpers.command_line import BARE
 
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("*.yaml"))
-GROUPS = ("model", "sampler", "optimizer", "schedule")
+GROUPS = ("recipe", "model", "sampler", "optimizer", "schedule")
 
 
 @pytest.fixture(scope="session")
@@ -58,13 +61,6 @@ def take_a_step(cfg: DictConfig) -> System:
     return system
 
 
-@pytest.mark.parametrize("recipe", sorted(path.stem for path in (conf_dir() / "recipe").glob("*.yaml")))
-def test_recipe_each_one_takes_a_step(recipe: str, small_scene: Path, tmp_path: Path):
-    cfg = composed(["dataset=photos", f"dataset.path={small_scene}", f"recipe={recipe}"], tmp_path)
-    assert cfg.recipe == recipe and recipe.startswith(cfg.method)
-    take_a_step(cfg)
-
-
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment_each_one_runs_as_a_whole(experiment: str, small_scene: Path, tmp_path: Path):
     """Each is run as a whole; the charts of a picture, which take longest, only once."""
@@ -84,18 +80,16 @@ def test_experiment_each_one_runs_as_a_whole(experiment: str, small_scene: Path,
     ("group", "option"),
     [(group, path.stem) for group in GROUPS for path in sorted((conf_dir() / group).glob("*.yaml"))],
 )
-def test_group_each_option_takes_a_step(group: str, option: str, tmp_path: Path):
+def test_group_each_option_takes_a_step(group: str, option: str, small_scene: Path, tmp_path: Path):
     flat = option in ("picture_mlp", "hashgrid2d", "fourier", "siren")
-    few = ["dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", "dataset.rays=64"]
-    few = ["dataset=picture", "dataset.max_side=16"] if flat else few
-    system = take_a_step(composed([*few, f"{group}={option}"], tmp_path))
-    assert isinstance(system, NeRF2D) == flat
+    few = ["dataset=photos", f"dataset.path={small_scene}"] if not flat else ["dataset=picture", "dataset.max_side=16"]
+    cfg = composed([*few, *(() if flat or group == "recipe" else ("dataset.rays=64",)), f"{group}={option}"], tmp_path)
+    assert group != "recipe" or (cfg.recipe == option and option.startswith(cfg.method))
+    assert isinstance(take_a_step(cfg), NeRF2D) == flat
 
 
 def test_run_leaves_results_pictures_checkpoints_and_curves(tmp_path: Path):
-    """Contract: results.json, pictures, checkpoints, curves and hyperparameters, in the run's own folder."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
+    """Contract: results.json, pictures, checkpoints, curves and hyperparameters, in its folder, which can be moved."""
     cfg = composed(["+experiment=smoke_3d", "budget.steps=60", "seed=3"], tmp_path)
     quality = train(cfg)
     results = json.loads((tmp_path / "results.json").read_text())
@@ -108,8 +102,6 @@ def test_run_leaves_results_pictures_checkpoints_and_curves(tmp_path: Path):
     assert set(results["scene"]) == {"name", "source", "sha256", "views", "resolution", "bounded", "kind"}
     assert results["scene"]["name"] == "bricks"
     assert results["background"] == [0, 0, 0]
-    assert set(results["machine"]) == {"processor", "cores", "accelerator"}
-    assert results["load"] is None or results["load"].keys() == {"own", "others"}, "None for less than half a second"
     assert (results["method"], results["seed"], results["steps"], results["status"]) == ("hashgrid", 3, 60, "finished")
     assert results["psnr"] == pytest.approx(quality)
     assert results["psnr"] > 17
@@ -124,30 +116,12 @@ def test_run_leaves_results_pictures_checkpoints_and_curves(tmp_path: Path):
     (file,) = tmp_path.glob("events.out.tfevents.*")
     events = EventAccumulator(str(file)).Reload()
     scalars = set(events.Tags()["scalars"])
-    assert {
-        "val/psnr",
-        "val/ssim",
-        "loss/photometric",
-        "train/psnr",
-        "speed/rays_per_second",
-        "speed/train_seconds",
-    } < scalars
+    assert {"val/ssim", "loss/photometric", "train/psnr", "speed/rays_per_second", "speed/train_seconds"} < scalars
     assert {name.partition("/")[0] for name in scalars} == {"loss", "lr", "speed", "train", "val"}
     assert events.Scalars("val/psnr")[-1].step == 60 and events.Tags()["images"] == ["images/view"]
     assert not list(tmp_path.glob("**/.*")), "no temporary file stays behind"
 
-
-def test_run_folder_moved_renders_alike(tmp_path: Path):
-    import torch
-
-    from nerf_lightning.runs.folder import load_run
-
-    train(composed(["+experiment=smoke_3d", "budget.steps=20", "callbacks.orbit.frames=0"], tmp_path / "a"))
-    (tmp_path / "a").rename(tmp_path / "moved")
-    run = load_run(tmp_path / "moved")
-    assert run.orbit is not None
-    rgb = run.system.render(run.orbit.view_rays(0)).rgb
-    saved = torch.load(tmp_path / "moved" / "checkpoints" / "last.ckpt", weights_only=True)
+    run = load_run(tmp_path.rename(tmp_path.parent / "moved"))
+    saved = torch.load(tmp_path.parent / "moved" / "checkpoints" / "last.ckpt", weights_only=True)
     assert torch.equal(run.system.field.grid.tables, saved["state_dict"]["field.grid.tables"])
-    assert rgb.shape == (32 * 32, 3)
-    assert rgb.std() > 0.01
+    assert run.orbit is not None and run.system.render(run.orbit.view_rays(0)).rgb.std() > 0.01

@@ -4,7 +4,6 @@ import json
 import math
 from pathlib import Path
 
-import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
@@ -12,9 +11,6 @@ import torch
 import nerf_lightning as nl
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at, orbit_around
 from nerf_lightning.dataset import RayDataModule, Scene, Views, load_transforms
-from nerf_lightning.dataset.optics import equirectangular
-from nerf_lightning.dataset.shots import Reading, Shot, read_shots
-from nerf_lightning.errors import InputError
 from nerf_lightning.export.mesh import mesh_file
 from nerf_lightning.export.page import field_page
 from nerf_lightning.export.photos import write_photos
@@ -99,20 +95,6 @@ def test_mesh_from_panoramas_sees_all_directions():
         shape.content.split(b"end_header\n")[1], np.dtype([("v", "<f8", 3), ("rgb", "u1", 3)]), 100
     )["v"]
     assert np.abs(np.linalg.norm(vertices - CENTRE.numpy(), axis=1) - RADIUS).max() < 0.1
-
-
-def test_read_shots_panoramas_are_resized_but_not_undistorted(tmp_path: Path):
-    shots = []
-    for number, c2w in enumerate(poses(3, 2)):
-        imageio.imwrite(tmp_path / f"{number}.png", render_photos(c2w).numpy())
-        file = tmp_path / f"{number}.png"
-        shots.append(Shot(file.name, file, c2w.double().numpy(), equirectangular(WIDTH, HEIGHT)))
-    views = read_shots(tmp_path, shots, Reading(resize=32))
-    expected = panoramas(poses(3, 2), 32, 16)
-    assert views.cameras.lenses is not None and views.cameras.sizes.tolist() == [[32, 16]] * 3
-    torch.testing.assert_close(views.cameras.view_rays(1).directions, expected.view_rays(1).directions)
-    with pytest.raises(InputError, match=r"0.png: found a lens .* photo of all directions, .* undistort=false"):
-        read_shots(tmp_path, shots, Reading(undistort=True))
 
 
 def test_write_photos_panoramas_name_projection(scene: Scene, tmp_path: Path):

@@ -6,7 +6,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
     ("errors",),
-    ("utils", "cameras"),
+    ("utils",),
+    ("cameras",),
     ("kernels",),
     ("dataset", "model", "refine"),
     ("synthetic",),

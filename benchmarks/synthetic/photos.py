@@ -15,7 +15,7 @@ from benchmarks.synthetic.tabletop import Tabletop
 from benchmarks.synthetic.viewpoints import object_cameras, sheet_cameras
 from nerf_lightning.capture.poses.geometry import normalised
 from nerf_lightning.capture.tags.layout import TagLayout
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.synthetic.tracer import map_shadow
 
 BLOCK = 32
@@ -36,7 +36,7 @@ class Flaws:
 class Truth:
     """What a capture must find."""
 
-    lens: Lens
+    lens: Intrinsics
     layout: TagLayout
     calibration: dict[str, Float[np.ndarray, "4 4"]]
     """Camera to world in metres, by file name, for the photos of the sheet alone."""
@@ -46,7 +46,7 @@ class Truth:
 
 def render_photo(
     layout: TagLayout,
-    lens: Lens,
+    lens: Intrinsics,
     c2w: Float[np.ndarray, "4 4"],
     with_object: bool,
     flaws: Flaws,
@@ -88,7 +88,7 @@ def render_photo(
 
 
 @functools.lru_cache(maxsize=1)
-def _tangents(lens: Lens, n: int) -> Float[np.ndarray, "H W S 2"]:
+def _tangents(lens: Intrinsics, n: int) -> Float[np.ndarray, "H W S 2"]:
     """x / z and y / z of all samples in the camera frame; kept, because undoing the distortion takes as long as a photo.
 
     The samples of a pixel form a grid that is sheared both ways, so that no two share a row or a column: edges along the
@@ -105,7 +105,7 @@ def _tangents(lens: Lens, n: int) -> Float[np.ndarray, "H W S 2"]:
 def write_capture(
     folder: Path,
     layout: TagLayout,
-    lens: Lens,
+    lens: Intrinsics,
     sheet_views: int,
     object_views: int,
     flaws: Flaws,

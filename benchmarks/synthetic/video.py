@@ -13,14 +13,14 @@ from jaxtyping import Float, UInt8
 from benchmarks.synthetic.tabletop import Tabletop
 from nerf_lightning.cameras import look_at
 from nerf_lightning.capture.tags.layout import TagLayout
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 
 CRF = 20
 """Of H.264, about what phones write."""
 FPS = 30
 
 
-def place_cameras(layout: TagLayout, lens: Lens, count: int) -> Float[np.ndarray, "count 4 4"]:
+def place_cameras(layout: TagLayout, lens: Intrinsics, count: int) -> Float[np.ndarray, "count 4 4"]:
     """Camera to world: one smooth turn around the bulldozer, whose height and distance swing."""
     top = Tabletop(layout)
     centre = top.box.mean(0)

@@ -11,7 +11,7 @@ from benchmarks.synthetic.tabletop import Tabletop
 from nerf_lightning.cameras import look_at
 from nerf_lightning.capture.poses.geometry import inverse, move, normalised, project
 from nerf_lightning.capture.tags.layout import TagLayout
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 
 GOLDEN = (np.sqrt(5) - 1) / 2
 """Its multiples modulo 1 fill [0, 1] evenly, whatever their number."""
@@ -23,7 +23,7 @@ ELEVATIONS = (28.0, 68.0)
 """Of the cameras around the object, degrees above the table."""
 
 
-def sheet_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Float[np.ndarray, "count 4 4"]:
+def sheet_cameras(layout: TagLayout, lens: Intrinsics, count: int, seed: int) -> Float[np.ndarray, "count 4 4"]:
     """Poses for calibration, camera to world in metres: every photo shows all tags, each near another part of the frame.
 
     Tilts of up to 45 degrees toward all sides, any roll, distances from as near as possible to a third farther.
@@ -56,7 +56,7 @@ def sheet_cameras(layout: TagLayout, lens: Lens, count: int, seed: int) -> Float
 
 
 def object_cameras(
-    layout: TagLayout, lens: Lens, count: int, seed: int, steps: int | None = None
+    layout: TagLayout, lens: Intrinsics, count: int, seed: int, steps: int | None = None
 ) -> Float[np.ndarray, "count 4 4"]:
     """Poses around the bulldozer, camera to world in metres, at changing heights and distances.
 
@@ -99,7 +99,9 @@ def object_cameras(
     return np.array(out)
 
 
-def in_frame(lens: Lens, c2w: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]) -> Bool[np.ndarray, "M"]:
+def in_frame(
+    lens: Intrinsics, c2w: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]
+) -> Bool[np.ndarray, "M"]:
     """Which points lie within a photo's frame, a little inside its edges."""
     rim = RIM * lens.width
     local = move(inverse(c2w), points)
@@ -114,7 +116,7 @@ def in_frame(lens: Lens, c2w: Float[np.ndarray, "4 4"], points: Float[np.ndarray
     return out
 
 
-def tags_in_view(top: Tabletop, lens: Lens, c2w: Float[np.ndarray, "4 4"]) -> list[int]:
+def tags_in_view(top: Tabletop, lens: Intrinsics, c2w: Float[np.ndarray, "4 4"]) -> list[int]:
     """The tags that a photo of the object shows whole: in the frame, not under the object, not behind it."""
     corners = {tag: top.layout.corners(tag) for tag in sorted(top.free_tags)}
     return [t for t, c in corners.items() if in_frame(lens, c2w, c).all() and not top.in_front(c2w[:3, 3], c).any()]
@@ -134,7 +136,7 @@ def _placed(centre: Float[np.ndarray, "3"], offset: Float[np.ndarray, "3"], roll
 
 
 def _aimed(
-    lens: Lens, c2w: Float[np.ndarray, "4 4"], point: Float[np.ndarray, "3"], pixel: Float[np.ndarray, "2"]
+    lens: Intrinsics, c2w: Float[np.ndarray, "4 4"], point: Float[np.ndarray, "3"], pixel: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "4 4"]:
     """The camera turned on its spot, by the shortest way, so that it shows a point it looked at in the given pixel."""
     ray = np.append(normalised(lens, pixel[None])[0], 1.0)

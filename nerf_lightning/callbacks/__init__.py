@@ -2,16 +2,13 @@
 
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.checkpoints import Checkpoints
-from nerf_lightning.callbacks.enlarge import Enlarge
+from nerf_lightning.callbacks.evaluation import Evaluation
 from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.live import Live
 from nerf_lightning.callbacks.orbit import Orbit
-from nerf_lightning.callbacks.picture.baselines import Baselines
-from nerf_lightning.callbacks.picture.charts import PictureCharts
-from nerf_lightning.callbacks.picture.training_gif import TrainingGif
+from nerf_lightning.callbacks.pictures import Baselines, Enlarge, PictureCharts, TrainingGif
 from nerf_lightning.callbacks.progress import Progress
-from nerf_lightning.callbacks.results import Results
 from nerf_lightning.callbacks.snapshots import Snapshots
 from nerf_lightning.callbacks.throughput import Throughput
 
@@ -20,13 +17,13 @@ __all__ = [
     "Budget",
     "Checkpoints",
     "Enlarge",
+    "Evaluation",
     "Guard",
     "HeldOut",
     "Live",
     "Orbit",
     "PictureCharts",
     "Progress",
-    "Results",
     "Snapshots",
     "Throughput",
     "TrainingGif",

@@ -4,7 +4,7 @@ from typing import TypeVar
 
 import lightning as L
 
-from nerf_lightning.dataset import Picture, PixelDataModule, RayDataModule
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
 
 Kind = TypeVar("Kind", bound=L.Callback)
 Value = TypeVar("Value")
@@ -35,10 +35,3 @@ def data_of(trainer: L.Trainer) -> RayDataModule | PixelDataModule:
 def agreed(trainer: L.Trainer, value: Value) -> Value:
     """The first process's value in all processes of a run: clocks differ, and all must decide the same."""
     return trainer.strategy.broadcast(value) if trainer.world_size > 1 else value
-
-
-def picture_of(trainer: L.Trainer) -> Picture:
-    """The picture of a 2D run."""
-    scene = data_of(trainer).scene
-    assert isinstance(scene, Picture)  # NeRF2D trains on nothing else
-    return scene

@@ -5,10 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import ChecksData, attached, data_of
+from nerf_lightning.callbacks.attached import ChecksData, data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.heldout import HeldOut
-from nerf_lightning.callbacks.progress import Progress
+from nerf_lightning.callbacks.progress import describe_progress
 from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D, System
@@ -18,12 +17,8 @@ from nerf_lightning.view.serve import announce, require_viser, resolve_host
 if TYPE_CHECKING:
     from nerf_lightning.view.field_page import FieldPage
 
-MAX_SAVED_SECONDS = 0.2
-"""Of drawing, that can be saved up while nobody is looking."""
-IMAGE_SECONDS = 0.06
-"""That one image may take."""
-PROGRESS_SECONDS = 0.5
-"""Between two updates of the page's progress."""
+MAX_SIDE, IMAGE_SECONDS = 512, 0.06
+"""Of an image: pixels along its longer side, and the time that it may take."""
 
 
 class Live(ChecksData):
@@ -36,7 +31,6 @@ class Live(ChecksData):
         host: address to listen on; 0.0.0.0 shares the page with the network.
         port: the next free one if it is in use; 0 for any.
         share: of the time that drawing may take.
-        side: pixels along the longer side of the finest image.
 
     Raises:
         InputError: at the start of training, if it is an image's, Viser is not installed, or the address does not exist.
@@ -47,15 +41,12 @@ class Live(ChecksData):
         host: str = "127.0.0.1",
         port: Port = 8080,
         share: Annotated[float, AtLeast(0.001), AtMost(0.99)] = 0.06,
-        side: int = 512,
     ):
         self.host = host
         self.port = port
         self.share = share
-        self.side = side
         self.page: FieldPage | None = None
-        self._credit = 0.0
-        self._drawn = self._told = 0.0
+        self._next = 0.0  # when drawing may take time again, by `time.perf_counter`
 
     def check(self, data: RayDataModule | PixelDataModule) -> None:
         if isinstance(data, PixelDataModule):
@@ -71,42 +62,23 @@ class Live(ChecksData):
 
         from nerf_lightning.view.field_page import FieldPage
 
-        self.page = FieldPage(scene.name, pl_module, scene.orbit, scene, self.host, self.port, self.side, live=True)
+        self.page = FieldPage(scene.name, pl_module, scene.orbit, scene, self.host, self.port, MAX_SIDE, live=True)
         print(f"live: {announce(scene.name, self.host, self.port, self.page.port)}", flush=True)
 
-    def describe(self, trainer: L.Trainer) -> str:
-        """Step, held-out dB and time left."""
-        held_out, progress = attached(trainer, HeldOut), attached(trainer, Progress)
-        parts = [f"step {trainer.global_step:,}"]
-        if held_out is not None and held_out.latest is not None:
-            parts.append(f"held out {held_out.latest:.2f} dB")
-        if progress is not None:
-            parts.append(progress.left(trainer)[1])
-        return ", ".join(filter(None, parts))
-
-    def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        self._drawn = time.perf_counter()
-
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        if self.page is None:
-            return
-        now = time.perf_counter()
-        self._credit = min(self._credit + self.share * (now - self._drawn), MAX_SAVED_SECONDS)
-        self._drawn = now
-        if self._credit <= 0 or not self.page.visitors:
+        start = time.perf_counter()
+        if self.page is None or not self.page.visitors or start < self._next:
             return
         with Budget.of(trainer).paused():
-            if now - self._told > PROGRESS_SECONDS:
-                self.page.show_progress(pl_module.state.progress, self.describe(trainer))
-                self._told = now
+            self.page.show_progress(pl_module.state.progress, ", ".join(describe_progress(trainer)))
             self.page.again()
             self.page.paint(IMAGE_SECONDS)
-        self._drawn = time.perf_counter()
-        self._credit -= self._drawn - now
+        end = time.perf_counter()
+        self._next = end + (end - start) * (1 / self.share - 1)
 
     def on_test_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         if self.page is not None:
-            self.page.show_progress(1.0, f"trained; measuring: {self.describe(trainer)}")
+            self.page.show_progress(1.0, f"trained; measuring: {', '.join(describe_progress(trainer))}")
             self.page.paint(IMAGE_SECONDS)
 
     def finish(self, psnr: float | None, stay: bool) -> None:

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import lightning as L
 import numpy as np
+import torch
 from jaxtyping import UInt8
 
 from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.render_plan import Need, Renders
-from nerf_lightning.callbacks.rendering import share_of
+from nerf_lightning.callbacks.rendering import Renders
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.panels import panel, to_bytes, write_animation
@@ -23,11 +23,8 @@ from nerf_lightning.utils.text import subsample
 
 FILE = "orbit.gif"
 """Below the run folder."""
-MAX_FRAMES, MIN_FRAMES = 60, 12
-MAX_SIDE = 800
-"""Pixels along a frame's longer side by default."""
-MIN_SCALE = 0.25
-"""Smallest factor on the size of frames."""
+MAX_FRAMES, MAX_SIDE = 60, 800
+"""By default; the side is the longer one of a frame, in pixels."""
 
 
 class Orbit(Renders):
@@ -35,65 +32,48 @@ class Orbit(Renders):
 
     Args:
         frames: how many of the orbit's views, evenly chosen, at their full size; 0 makes no GIF. None takes 60 of at most
-            `MAX_SIDE` pixels, or fewer and smaller ones where there is not time for them (see `RenderPlan`).
+            `MAX_SIDE` pixels, or smaller ones where there is not time for them (see `Renders`).
         fps: frames a second.
     """
 
     def __init__(self, frames: Annotated[int, AtLeast(0)] | None = None, fps: FramesPerSecond = 20):
         self.frames = frames
         self.fps = fps
-        self._drawn = 0
+        self.in_full = frames is not None
+        self._done = 0.0  # share of the frames
 
-    def needs(self, trainer: L.Trainer) -> dict[str, Need]:
-        cameras = self.cameras(trainer)
-        count = self.count(cameras)
-        pixels = int(cameras.sizes[subsample(len(cameras), count)][self._drawn :].prod(1).sum())
-        least = min(1.0, MIN_FRAMES / max(count, 1)) * MIN_SCALE**2 * pixels
-        return {"orbit": Need(pixels, least, asked=self.frames is not None)}
+    def pixels_left(self, trainer: L.Trainer) -> float:
+        return float(self.cameras(trainer).sizes.prod(1).sum()) * (1 - self._done)
 
     def cameras(self, trainer: L.Trainer) -> Cameras:
-        """The path, at the size for which there may be time."""
+        """Of the frames, at the size for which there may be time."""
         scene = data_of(trainer).scene
         assert isinstance(scene, Scene)  # NeRF3D trains on nothing else
-        return scene.orbit if self.frames is not None else scene.orbit.scaled(min(1.0, MAX_SIDE / scene.orbit.longest))
-
-    def count(self, cameras: Cameras) -> int:
-        """Frames, likewise."""
-        return min(MAX_FRAMES if self.frames is None else self.frames, len(cameras))
-
-    def setup(self, trainer: L.Trainer, pl_module: NeRF3D, stage: str) -> None:
-        self._drawn = 0
+        count = MAX_FRAMES if self.frames is None else self.frames
+        chosen = scene.orbit[torch.tensor(subsample(len(scene.orbit), count), dtype=torch.long)]
+        return chosen if self.in_full else chosen.scaled(min(1.0, MAX_SIDE / scene.orbit.longest))
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF3D) -> None:
         if self.frames == 0 or not trainer.is_global_zero:
             return
         full = self.cameras(trainer)
-        most = self.count(full)
-        count, scale = fit_orbit(most, share_of(trainer, pl_module, "orbit"))
+        scale = 1.0 if self.in_full else math.sqrt(self.share(trainer, pl_module))
         cameras = full.scaled(scale).to(pl_module.device)
-        if count < most or scale < 1:
+        if scale < 1:
             print(
-                f"{FILE}: {count} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
-                f" training; callbacks.orbit.frames={most} draws all at full size"
+                f"{FILE}: {len(full)} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
+                f" training; callbacks.orbit.frames={len(full)} draws them at full size"
             )
         with atomic(Path(trainer.default_root_dir) / FILE) as temporary:
-            write_animation(temporary, self._frames(trainer, pl_module, cameras, count), 1 / self.fps)
+            write_animation(temporary, self._draw(trainer, pl_module, cameras), 1 / self.fps)
 
-    def _frames(
-        self, trainer: L.Trainer, system: NeRF3D, cameras: Cameras, count: int
-    ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    def _draw(self, trainer: L.Trainer, system: NeRF3D, cameras: Cameras) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
         plan, caption = Budget.of(trainer).plan, f"{data_of(trainer).scene.name}, step {trainer.global_step}"
-        for number, view in enumerate(subsample(len(cameras), count), 1):
+        for view in range(len(cameras)):
             before = plan.spent
-            with plan.rendering(f"orbit, frame {number} of {count}"):
+            with plan.rendering(f"orbit, frame {view + 1} of {len(cameras)}"):
                 rgb = system.render(cameras.view_rays(view)).rgb
                 image = to_bytes(rgb.view(cameras.height, cameras.width, 3))
             plan.note(len(rgb), plan.spent - before)
-            self._drawn = number * self.count(cameras) // count
+            self._done = (view + 1) / len(cameras)
             yield panel([image], caption)
-
-
-def fit_orbit(frames: int, share: float) -> tuple[int, float]:
-    """How many frames to draw, and the factor on their size, where so large a share of all their pixels may be rendered."""
-    count = min(frames, max(int(frames * share), MIN_FRAMES))
-    return count, min(1.0, max(MIN_SCALE, math.sqrt(frames * share / count)))

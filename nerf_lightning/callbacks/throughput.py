@@ -15,6 +15,8 @@ TRAIN_SECONDS = "speed/train_seconds"
 class Throughput(L.Callback):
     """Logs the terms of the loss, PSNR of the batch, learning rates, rays a second and samples a ray, every `every` steps.
 
+    Lightning's `ThroughputMonitor` knows neither a clock that stops nor rays.
+
     Args:
         every: steps between log entries; the speeds are averages over them.
     """
@@ -35,13 +37,11 @@ class Throughput(L.Callback):
         self._samples += stats.samples * trainer.world_size
         if step % self.every:
             return
-        seconds = Budget.of(trainer).seconds
-        rays = self.rays - self._mark[1]
+        seconds, rays = Budget.of(trainer).seconds, self.rays - self._mark[1]
         if trainer.logger is not None:
-            mse = float(stats.mse)
             scalars = {
                 **{f"loss/{name}": float(term) for name, term in stats.losses.items()},
-                "train/psnr": mse_to_psnr(mse),
+                "train/psnr": mse_to_psnr(float(stats.mse)),
                 **{f"lr/{group['name']}": group["lr"] for group in trainer.optimizers[0].param_groups},
                 "speed/rays_per_second": rays / max(seconds - self._mark[0], 1e-9),
                 "speed/samples_per_ray": self._samples / max(rays, 1),

@@ -4,20 +4,9 @@ from nerf_lightning.cameras.bounds import Bounds, InBounds
 from nerf_lightning.cameras.cameras import Cameras, Rays, has_panoramas
 from nerf_lightning.cameras.layout import Layout, classify_layout, gaze_point
 from nerf_lightning.cameras.lenses import Distortion, Lenses, Projection
-from nerf_lightning.cameras.orbit import (
-    look_at,
-    orbit_around,
-    typical_view,
-    upward,
-)
 from nerf_lightning.cameras.paths import orbit_like, pivot_of, resample_path, spiral_like
-from nerf_lightning.cameras.transforms import (
-    in_other_frame,
-    pixel_to_camera,
-    transform,
-    transform_directions,
-)
-from nerf_lightning.cameras.upright import held, turn_upright
+from nerf_lightning.cameras.poses import find_up, look_at, orbit_around, turn_upright, typical_view, upward
+from nerf_lightning.cameras.transforms import in_other_frame, pixel_to_camera, transform, transform_directions
 
 __all__ = [
     "Bounds",
@@ -29,9 +18,9 @@ __all__ = [
     "Projection",
     "Rays",
     "classify_layout",
+    "find_up",
     "gaze_point",
     "has_panoramas",
-    "held",
     "in_other_frame",
     "look_at",
     "orbit_around",

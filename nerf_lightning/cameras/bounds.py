@@ -2,15 +2,14 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras.cameras import Rays
+from nerf_lightning.utils.tensors import TensorDataclass
 
 UNBOUNDED_REACH = 50.0
 """An unbounded scene is sampled out to this many half-sizes of the box; beyond, it looks like a picture at infinity."""
@@ -20,18 +19,8 @@ MOST_FINE = 2.0
 """Most that `Bounds.fineness` is: content of 800 pixels; an occupancy grid costs its cube."""
 
 
-def once(of: Callable[[Any], Tensor]) -> cached_property:
-    """A cached property whose tensor works with gradients even if first read in inference mode."""
-
-    def made(self: Any) -> Tensor:
-        with torch.inference_mode(False):
-            return of(self)
-
-    return cached_property(made)
-
-
 @dataclass(frozen=True)
-class Bounds:
+class Bounds(TensorDataclass):
     """An axis-aligned box around the content, in world units.
 
     A bounded scene has nothing outside the box. An unbounded one keeps the box at full detail and contracts everything
@@ -47,26 +36,19 @@ class Bounds:
     pixel: float | None = None
     """Width of what one pixel of the photos shows at the content, world units; None if unknown."""
 
-    @once
-    def centre(self) -> Float[Tensor, "3"]:
-        return self.aabb.mean(0)
+    centre: Float[Tensor, "3"] = field(init=False, repr=False)
+    half_size: Float[Tensor, "3"] = field(init=False, repr=False)
+    longest: float = field(init=False, repr=False)
+    """The largest of the half-sizes."""
+    _low: Float[Tensor, "3"] = field(init=False, repr=False)
+    _size: Float[Tensor, "3"] = field(init=False, repr=False)
 
-    @once
-    def half_size(self) -> Float[Tensor, "3"]:
-        return (self.aabb[1] - self.aabb[0]) / 2
-
-    @once
-    def _low(self) -> Float[Tensor, "3"]:
-        return self.centre - self.half_size
-
-    @once
-    def _size(self) -> Float[Tensor, "3"]:
-        return 2 * self.half_size
-
-    @cached_property
-    def longest(self) -> float:
-        """The largest of the half-sizes."""
-        return float(self.half_size.max())
+    def __post_init__(self) -> None:
+        with torch.inference_mode(False):  # they take part in gradients, wherever they were made
+            centre, half_size = self.aabb.mean(0), (self.aabb[1] - self.aabb[0]) / 2
+            derived = {"centre": centre, "half_size": half_size, "longest": float(half_size.max())}
+            for name, value in (derived | {"_low": centre - half_size, "_size": 2 * half_size}).items():
+                object.__setattr__(self, name, value)
 
     @property
     def pixels_across(self) -> float:
@@ -87,13 +69,6 @@ class Bounds:
         if self.unbounded or self.pixel is None:
             return 1.0
         return min(max(1.0, math.sqrt(self.pixels_across / USUAL_WIDTH)), MOST_FINE)
-
-    def settle(self) -> None:
-        """Computes all cached properties now."""
-        _ = self.centre, self.half_size, self._low, self._size, self.longest
-
-    def to(self, device: torch.device | str) -> "Bounds":
-        return replace(self, aabb=self.aabb.to(device))
 
     def to_unit(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """World positions -> [0, 1]^3. Bounded: outside the box leaves the unit cube. Unbounded: never leaves it."""
@@ -176,15 +151,11 @@ def unwarp(y: Float[Tensor, "R S"], inside: Float[Tensor, "R 2"], unit: float) -
 class InBounds(torch.nn.Module):
     """Base of modules that live in a scene's bounds; the box follows the module from device to device."""
 
-    aabb: Tensor
-
     def __init__(self, bounds: Bounds):
         super().__init__()
-        self.register_buffer("aabb", bounds.aabb.clone(), persistent=False)
-        self._bounds = replace(bounds, aabb=self.aabb)
+        self.bounds = bounds
 
-    @property
-    def bounds(self) -> Bounds:
-        if self._bounds.aabb is not self.aabb:  # the module has moved
-            self._bounds = replace(self._bounds, aabb=self.aabb)
-        return self._bounds
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "InBounds":
+        """What moves the module moves its bounds."""
+        self.bounds = self.bounds.map_tensors(fn)
+        return super()._apply(fn, recurse)

@@ -1,6 +1,7 @@
 """Cameras and Rays, the data of the first stages."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -8,7 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf_lightning.cameras.lenses import Lenses, Projection, distort, per_view, to_directions, to_flat, undistort
+from nerf_lightning.cameras.lenses import Lenses, Projection, distort, to_directions, to_flat, undistort
+from nerf_lightning.cameras.transforms import on_sensor
+from nerf_lightning.utils.tensors import TensorDataclass
 
 PINHOLE_FOV_DEG, PINHOLE_ASPECT = 90.0, 4 / 3
 """Horizontal field of view, and width by height, of pinhole cameras that stand for equirectangular ones."""
@@ -17,7 +20,7 @@ LATTICE = 33
 
 
 @dataclass(frozen=True)
-class Rays:
+class Rays(TensorDataclass):
     """Half-lines in the world frame: x(t) = origin + t * direction, t > 0 in the scene's unit."""
 
     origins: Float[Tensor, "R 3"]
@@ -27,19 +30,9 @@ class Rays:
     def __len__(self) -> int:
         return self.origins.shape[0]
 
-    def __getitem__(self, index: slice | Tensor) -> "Rays":
-        return Rays(self.origins[index], self.directions[index])
-
-    def detach(self) -> "Rays":
-        """Without gradient."""
-        return Rays(self.origins.detach(), self.directions.detach())
-
-    def to(self, device: torch.device | str) -> "Rays":
-        return Rays(self.origins.to(device), self.directions.to(device))
-
 
 @dataclass(frozen=True)
-class Cameras:
+class Cameras(TensorDataclass):
     """V views, OpenCV frame, each of its own size.
 
     `K` holds pixels, `c2w` maps camera to world.
@@ -67,9 +60,9 @@ class Cameras:
         sizes = self.sizes[index.cpu() if isinstance(index, Tensor) else index]
         return Cameras(self.K[index], self.c2w[index], sizes, None if self.lenses is None else self.lenses[index])
 
-    def to(self, device: torch.device | str) -> "Cameras":
-        lenses = None if self.lenses is None else self.lenses.to(device)
-        return replace(self, K=self.K.to(device), c2w=self.c2w.to(device), lenses=lenses)
+    def map_tensors(self, operation: Callable[[Tensor], Tensor]) -> "Cameras":
+        """A copy with an operation applied to each tensor but the sizes."""
+        return replace(super().map_tensors(operation), sizes=self.sizes)
 
     @property
     def centres(self) -> Float[Tensor, "V 3"]:
@@ -87,22 +80,15 @@ class Cameras:
 
     @property
     def width(self) -> int:
-        """Of all views.
-
-        Raises:
-            ValueError: they have several sizes.
-        """
-        return self._side(0)
+        """Of all views, which have one size."""
+        (width,) = self.sizes[:, 0].unique().tolist() or [0]
+        return width
 
     @property
     def height(self) -> int:
-        """Of all views, likewise."""
-        return self._side(1)
-
-    def _side(self, axis: int) -> int:
-        if not self.one_size:
-            raise ValueError("these views have several sizes: ask for that of each, size(view)")
-        return int(self.sizes[0, axis]) if len(self) else 0
+        """Of all views, which have one size."""
+        (height,) = self.sizes[:, 1].unique().tolist() or [0]
+        return height
 
     @property
     def longest(self) -> int:
@@ -153,7 +139,7 @@ class Cameras:
         else:
             coefficients = self.lenses.coefficients[view]
             places = torch.stack([u, v], dim=1)
-            flat = undistort(_on_sensor(self.K[view], places), coefficients, self._guess(view, places), steps=1)
+            flat = undistort(on_sensor(self.K[view], places), coefficients, self._guess(view, places), steps=1)
             local = to_directions(flat, self.lenses.projection[view])
             directions = (self.c2w[view, :3, :3] * local[:, None]).sum(2)
         return Rays(self.centres[view], torch.nn.functional.normalize(directions, dim=1))
@@ -191,7 +177,7 @@ class Cameras:
         tables = []
         for lens in range(int(which.max()) + 1):
             view = int((which == lens).int().argmax())
-            seen = _on_sensor(self.K[view : view + 1], lattice * sizes[view])
+            seen = on_sensor(self.K[view : view + 1], lattice * sizes[view])
             tables.append(undistort(seen, self.lenses.coefficients[view : view + 1]))
         return which, torch.cat(tables), (LATTICE - 1) / sizes
 
@@ -216,15 +202,15 @@ class Cameras:
         if self.lenses is None:
             ahead, flat = depth > 0, local[:, :2] / torch.where(depth > 0, depth, 1.0)[:, None]
         else:
-            projection = per_view(self.lenses.projection, view)
-            flat = to_flat(local, projection)
+            lens = self.lenses[view : view + 1]
+            flat = to_flat(local, lens.projection)
             # Beyond the rim a polynomial may lead back into the picture.
-            ahead = ((depth > 0) | (projection != Projection.PERSPECTIVE)) & (flat.norm(dim=1) <= self.rims[view])
-            flat = distort(flat, per_view(self.lenses.coefficients, view))[0]
+            ahead = ((depth > 0) | (lens.projection != Projection.PERSPECTIVE)) & (flat.norm(dim=1) <= self.rims[view])
+            flat = distort(flat, lens.coefficients)[0]
         K, size = self.K[view], self.sizes[view].to(self.K)
         pixels = flat @ K[:2, :2].T + K[:2, 2]
         if self.lenses is not None:
-            everywhere = projection == Projection.EQUIRECTANGULAR
+            everywhere = lens.projection == Projection.EQUIRECTANGULAR
             depth = torch.where(everywhere, local.norm(dim=1), depth)
             # The seam and the poles lie on the border.
             last = size * (1 - torch.finfo(size.dtype).eps)
@@ -244,10 +230,3 @@ def has_panoramas(cameras: Cameras) -> bool:
     """Whether any photo shows all directions, so that its optical axis does not say where it looks."""
     lenses = cameras.lenses
     return lenses is not None and bool((lenses.projection == Projection.EQUIRECTANGULAR).any())
-
-
-def _on_sensor(K: Float[Tensor, "#N 3 3"], places: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:
-    """Flat coordinates, distorted, of places in pixels."""
-    y = (places[:, 1] - K[:, 1, 2]) / K[:, 1, 1]
-    x = (places[:, 0] - K[:, 0, 2] - K[:, 0, 1] * y) / K[:, 0, 0]
-    return torch.stack([x, y], dim=1)

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 MAX_FORWARD_SPREAD = 0.1
 """Largest circular variance (1 - length of the mean axis) of forward-facing cameras: axes within about 35 degrees."""
 MIN_CONVERGENCE = 0.4
-"""See `convergence`."""
+"""See `find_convergence`: 1 where all look at a point, 0 or less where they might look in one direction."""
 PARALLEL = 1e-5
 """Circular variance below which axes are parallel: within a quarter of a degree."""
 MAX_SPOT = 0.05
@@ -114,24 +114,17 @@ def is_noise(centres: Float[Tensor, "V 3"], axes: Float[Tensor, "V 3"]) -> bool:
     return bool(torch.minimum(in_order, in_direction) > MIN_SCATTER * usual)
 
 
-def convergence(c2w: Float[Tensor, "V 4 4"], point: Float[Tensor, "3"]) -> float:
-    """How much better a point explains where cameras look than one direction does: 1 where all look at it, 0 or less where
-    they might look in one direction, or each in its own.
+def find_convergence(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"] | None:
+    """The point that cameras look at together, double precision; None where they look at none.
 
-    1 - (mean of 1 - cos of the angles between axes and the point) / (circular variance of the axes).
+    It has to explain where they look better than one direction does: 1 - (mean of 1 - cos of the angles between axes and the
+    point) / (circular variance of the axes) is at least `MIN_CONVERGENCE`.
     """
     variance = circular_variance(normalize(c2w[:, :3, 2].double(), dim=1))
-    if variance < PARALLEL:
-        return 0.0
-    return 1 - (1 - float(gaze(c2w, point[None].double())[0].mean())) / variance
-
-
-def find_convergence(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"] | None:
-    """The point that cameras look at together, double precision; None where they look at none."""
-    if centre_spread(c2w) == 0:
+    if centre_spread(c2w) == 0 or variance < PARALLEL:
         return None
     target = gaze_point(c2w)
-    return target if convergence(c2w, target) >= MIN_CONVERGENCE else None
+    return target if 1 - (1 - float(gaze(c2w, target[None])[0].mean())) / variance >= MIN_CONVERGENCE else None
 
 
 def gaze(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> Float[Tensor, "P V"]:

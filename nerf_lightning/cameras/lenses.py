@@ -5,8 +5,10 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int
 from torch import Tensor
+
+from nerf_lightning.utils.tensors import TensorDataclass
 
 NEWTON = 8
 """Steps of Newton's method that undo a distortion; real lenses need three or four for single precision."""
@@ -48,7 +50,7 @@ class Projection(IntEnum):
 
 
 @dataclass(frozen=True)
-class Lenses:
+class Lenses(TensorDataclass):
     """The projection and the distortion of V views, in OpenCV's and COLMAP's terms.
 
     A direction has flat coordinates, see `Projection`. The distortion moves them; K makes pixels of them.
@@ -59,16 +61,10 @@ class Lenses:
     projection: Int[Tensor, "V"]
     """See `Projection`."""
 
-    def __getitem__(self, index: slice | Tensor) -> "Lenses":
-        return Lenses(self.coefficients[index], self.projection[index])
-
     def zoomed(self, factor: float) -> "Lenses":
         """Of cameras with that many times the focal length, which bend the same places of a photo alike: a place is bent by how
         far it lies from the axis in focal lengths."""
         return Lenses(self.coefficients * factor ** self.coefficients.new_tensor(POWERS), self.projection)
-
-    def to(self, device: torch.device | str) -> "Lenses":
-        return Lenses(self.coefficients.to(device), self.projection.to(device))
 
 
 def distort(
@@ -157,8 +153,3 @@ def to_flat(directions: Float[Tensor, "N 3"], projection: Int[Tensor, "#N"]) -> 
     kind = projection[:, None]
     bent = torch.where(kind == Projection.FISHEYE, fisheye, equirectangular)
     return torch.where(kind == Projection.PERSPECTIVE, perspective, bent)
-
-
-def per_view(values: Shaped[Tensor, "V *rest"], view: Shaped[Tensor, "N"] | int) -> Shaped[Tensor, "N *rest"]:
-    """The values of each ray's view, or of one."""
-    return values[view : view + 1] if isinstance(view, int) else values[view]

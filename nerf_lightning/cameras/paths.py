@@ -1,6 +1,7 @@
 """Camera paths to show a scene along, which stay where photos were taken."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,8 +12,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.cameras.cameras import Cameras
 from nerf_lightning.cameras.layout import Layout, centre_spread, classify_layout, find_convergence
-from nerf_lightning.cameras.orbit import look_at, typical_view, upward
-from nerf_lightning.cameras.upright import held
+from nerf_lightning.cameras.poses import find_up, level_axes, look_at, typical_view, upward
 
 MAX_STEEPNESS = 1.4
 """Largest angle of a path above or below the horizon, radians."""
@@ -22,13 +22,11 @@ MIN_DENSITY = 0.15
 """An azimuth was photographed where the kernel density is at least this share of its mean: gaps of 90 degrees do."""
 INSIDE = 0.7
 """Share of the views that lie within a loop before the subject."""
-MAX_DETOUR = 2.0
-"""Photos are not in the order of a walk where it is that many times longer than going to the nearest one each time."""
 WALK_SAMPLES = 512
 SPIRAL_TURNS, SPIRAL_CLIMB = 2, 0.75
 """Turns of a spiral, and how much of the way to its axis it climbs."""
-ONE_SIDED = 0.35
-"""Mean of the unit vectors from a subject to a path's views above which they are all on one side of it."""
+MIN_ONE_SIDED = 0.1
+"""Mean of the unit vectors from a subject to a path's views below which they are all around it."""
 
 
 def orbit_like(
@@ -48,7 +46,7 @@ def orbit_like(
     """
     c2w = cameras.c2w.double()
     layout = classify_layout(c2w) if layout is None else layout
-    up, sides = held(c2w)
+    up = find_up(c2w)
     if layout == Layout.WALK:
         poses = walk_along(c2w, up, frames)
     elif layout == Layout.PAN:
@@ -60,12 +58,8 @@ def orbit_like(
             centre = ahead if target is None else target
         build = turn_around if layout == Layout.INWARD else loop_before
         poses = build(c2w, centre.double(), up, frames)
-    typical = typical_view(cameras)
-    one = cameras[typical].as_pinholes()  # photos of all directions have no view to repeat
-    K, (width, height) = one.K[0], one.size(0)
-    if int(sides[typical]) % 2 == 1:  # it lies on its side
-        K, width, height = on_its_side(K, width, height), height, width
-    return Cameras.of_size(K.repeat(frames, 1, 1), poses.to(cameras.c2w), width, height)
+    lens = cameras[typical_view(cameras)].as_pinholes()  # photos of all directions have no view to repeat
+    return Cameras.of_size(lens.K.repeat(frames, 1, 1), poses.to(cameras.c2w), *lens.size(0))
 
 
 def turn_around(
@@ -95,9 +89,8 @@ def angular_loop(
         Unit vectors; and for each the weights, of sum 1, of the vectors that are around it.
     """
     direction = normalize(offset, dim=1)
-    helper = torch.eye(3, dtype=up.dtype, device=up.device)[int(up.abs().argmin())]
-    right = normalize(torch.linalg.cross(up, helper), dim=0)
-    front = torch.linalg.cross(right, up)
+    right, behind = level_axes(up)
+    front = -behind
     azimuth = torch.atan2(direction @ right, direction @ front)
     elevation = torch.asin((direction @ up).clamp(-1, 1))
     level = elevation.cos() + 1e-3  # what points straight up has no azimuth
@@ -117,7 +110,7 @@ def angular_loop(
         above = mean_elevation(at)
     else:
         middle = compass[density.argmax()]
-        dark, off = _wrapped(compass[~seen] - middle), _wrapped(azimuth - middle)
+        dark, off = wrap(compass[~seen] - middle), wrap(azimuth - middle)
         start = max([-math.pi, *dark[dark < 0].tolist()])
         end = min([math.pi, *dark[dark > 0].tolist()])
         within = off[(off > start) & (off < end)]
@@ -129,7 +122,7 @@ def angular_loop(
     return torch.cos(above)[:, None] * flat + torch.sin(above)[:, None] * up, normalize(around(at), p=1, dim=1)
 
 
-def _wrapped(angle: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+def wrap(angle: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
     """The same angles from -pi to pi."""
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
@@ -141,14 +134,8 @@ def loop_before(
     middle = c2w[:, :3, 3].mean(0)
     offset = c2w[:, :3, 3] - middle
     ahead = normalize(c2w[:, :3, 2].mean(0), dim=0)
-    flat = offset - (offset @ ahead)[:, None] * ahead
-    first = torch.linalg.svd(flat).Vh[0]
-    first = (
-        normalize(first - (first @ ahead) * ahead, dim=0) if float(flat.norm()) > 0 else normalize(c2w[0, :3, 0], dim=0)
-    )
-    second = torch.linalg.cross(ahead, first)
-    places = torch.stack([flat @ first, flat @ second], dim=1)
-    axes = places.abs().quantile(INSIDE, dim=0)
+    first, second = look_at(middle, middle + ahead, up)[:3, :2].unbind(1)  # to the right and down
+    axes = torch.stack([offset @ first, offset @ second], dim=1).abs().quantile(INSIDE, dim=0)
     turn = torch.arange(frames, dtype=up.dtype, device=up.device) * (2 * math.pi / frames)
     at = axes * torch.stack([torch.cos(turn), torch.sin(turn)], dim=1)
     eye = middle + at[:, :1] * first + at[:, 1:] * second
@@ -156,8 +143,7 @@ def loop_before(
 
 
 def walk_along(c2w: Float[Tensor, "V 4 4"], up: Float[Tensor, "3"], frames: int) -> Float[Tensor, "frames 4 4"]:
-    """Smoothly from photo to photo, in their order or, where that jumps, to the nearest each time; round, or there and back."""
-    c2w = c2w[walking_order(c2w[:, :3, 3])]
+    """Smoothly from photo to photo in their order; round, or there and back."""
     count = len(c2w)
     at = torch.linspace(0, count - 1, WALK_SAMPLES, dtype=c2w.dtype, device=c2w.device)
     width = max(1.0, count / 20)
@@ -175,25 +161,6 @@ def walk_along(c2w: Float[Tensor, "V 4 4"], up: Float[Tensor, "3"], frames: int)
     share = share if is_round else 1 - (1 - 2 * share).abs()
     which = torch.searchsorted(passed, share * passed[-1]).clamp_max(WALK_SAMPLES - 1)
     return look_at(place[which], place[which] + ahead[which], up)
-
-
-def walking_order(centres: Float[Tensor, "V 3"]) -> list[int]:
-    """The given order, or from each place to the nearest that is left, where that is far shorter."""
-    distance = torch.cdist(centres, centres)
-    order = [int(distance.sum(1).argmax())]
-    left = distance.clone()
-    for _ in range(len(centres) - 1):
-        left[:, order[-1]] = math.inf
-        order.append(int(left[order[-1]].argmin()))
-    given, shortest = distance.diagonal(1).sum(), distance[order[:-1], order[1:]].sum()
-    return order if float(given) > MAX_DETOUR * float(shortest) else list(range(len(centres)))
-
-
-def on_its_side(K: Float[Tensor, "3 3"], width: int, height: int) -> Float[Tensor, "3 3"]:
-    """Intrinsics of a photo turned by a quarter, with its principal point in the middle."""
-    turned = torch.eye(3, dtype=K.dtype, device=K.device)
-    turned[0, 0], turned[1, 1], turned[0, 2], turned[1, 2] = K[1, 1], K[0, 0], height / 2, width / 2
-    return turned
 
 
 def resample_path(cameras: Cameras, frames: int, closed: bool) -> Cameras:
@@ -233,54 +200,25 @@ def pivot_of(path: Cameras) -> Float[Tensor, "3"]:
 def spiral_like(orbit: Cameras, frames: int = 60) -> Cameras:
     """A closed path that winds from an orbit inward and back, with the same size and intrinsics.
 
-    From a circle it winds up to the circle's axis, at the same distance; from a loop or an arc on one side of the subject, in
-    to its middle. A pan and a walk have nothing to wind about: the orbit itself.
+    It winds to the middle of the orbit's directions, which is above the subject for a circle, at the same distance. A pan and
+    a walk have nothing to wind about: the orbit itself.
 
     Args:
         orbit: as `orbit_like` gives; a path of another shape around a subject counts as the circle it resembles.
         frames: number of poses; the last stops one step short of the first.
     """
-    layout = classify_layout(orbit.c2w)
     target = find_convergence(orbit.c2w)
-    if layout in (Layout.PAN, Layout.WALK) or target is None:
+    if target is None or classify_layout(orbit.c2w) in (Layout.PAN, Layout.WALK):
         return resample_path(orbit, frames, closed=True)
+    number = torch.arange(frames)
+    loop = resample_path(orbit, frames, closed=True)[SPIRAL_TURNS * number % frames]
     up = upward(orbit)
     centre = target.to(up)
-    offset = orbit.centres - centre
-    flat = normalize(offset - (offset @ up)[:, None] * up, dim=1)
-    build = wind_up if float(flat.mean(0).norm()) < ONE_SIDED else wind_in
-    poses = build(offset, up, frames)
-    poses[:, :3, 3] += centre
-    return Cameras.of_size(orbit.K[:1].repeat(frames, 1, 1), poses, orbit.width, orbit.height)
-
-
-def wind_up(offset: Float[Tensor, "V 3"], up: Float[Tensor, "3"], frames: int) -> Float[Tensor, "frames 4 4"]:
-    """From a circle around the origin up to its axis and back; looking at the origin."""
-    radius = offset.norm(dim=-1).mean()
-    mean = offset.mean(0)
-    axis = torch.linalg.svd(offset - mean).Vh[2]  # across the circle's plane
-    side = mean if mean.norm() > 1e-3 * radius else up  # a circle at the subject's own height has no mean offset
-    axis = axis * torch.where(axis @ side < 0, -1.0, 1.0)
-    angle = torch.acos((normalize(offset, dim=-1) @ axis).clamp(-1, 1)).mean()
-    first = normalize(offset[0] - (offset[0] @ axis) * axis, dim=-1)
-    second = torch.linalg.cross(axis, first)
-    turn, share = _winding(frames, up)
-    slope = angle * share
-    around = torch.cos(SPIRAL_TURNS * turn) * first + torch.sin(SPIRAL_TURNS * turn) * second
-    return look_at(radius * (torch.sin(slope) * around + torch.cos(slope) * axis), torch.zeros_like(up), up)
-
-
-def wind_in(offset: Float[Tensor, "V 3"], up: Float[Tensor, "3"], frames: int) -> Float[Tensor, "frames 4 4"]:
-    """From a loop on one side of the origin in to its middle and back, at the loop's distance; looking at the origin."""
-    middle = normalize(offset, dim=1).mean(0)
-    turn, share = _winding(frames, up)
-    which = (turn[:, 0] * (SPIRAL_TURNS * len(offset) / (2 * math.pi))).round().long() % len(offset)
-    direction = normalize(middle + share * (normalize(offset, dim=1)[which] - middle), dim=1)
-    distance = offset.norm(dim=1)[which, None] * share + offset.norm(dim=1).mean() * (1 - share)
-    return look_at(distance * direction, torch.zeros_like(up), up)
-
-
-def _winding(frames: int, like: Tensor) -> tuple[Float[Tensor, "frames 1"], Float[Tensor, "frames 1"]]:
-    """Angles of one turn, and how much of the way from the axis to the loop is left at each."""
-    turn = torch.arange(frames, dtype=like.dtype, device=like.device)[:, None] * (2 * math.pi / frames)
-    return turn, 1 - SPIRAL_CLIMB * (1 - torch.cos(turn)) / 2
+    distance, direction = (loop.centres - centre).norm(dim=1, keepdim=True), normalize(loop.centres - centre, dim=1)
+    middle = direction.mean(0)
+    axis = normalize(middle, dim=0) if float(middle.norm()) > MIN_ONE_SIDED else up
+    left = 1 - SPIRAL_CLIMB * (1 - torch.cos(number.to(up) * (2 * math.pi / frames)))[:, None] / 2
+    angle = torch.acos((direction @ axis).clamp(-1, 1))[:, None].clamp_min(1e-3)
+    between = torch.sin((1 - left) * angle) * axis + torch.sin(left * angle) * direction
+    eye = centre + normalize(between, dim=1) * (left * distance + (1 - left) * distance.mean())
+    return replace(loop, c2w=look_at(eye, centre, up))

@@ -34,7 +34,12 @@ def pixel_to_camera(
         uv: continuous pixel coordinates (x right, y down); the centre of pixel (row, col) is (col + 0.5, row + 0.5).
         depth: distance along the camera's z axis, in the scene's unit.
     """
-    # K is upper triangular with a unit corner, so K^-1 is back-substitution: cheaper and more exact than inverse().
+    flat = on_sensor(K, uv)
+    return torch.cat([flat, torch.ones_like(flat[..., :1])], dim=-1) * depth[..., None]
+
+
+def on_sensor(K: Float[Tensor, "*#batch 3 3"], uv: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*batch 2"]:
+    """Flat coordinates (x/z, y/z of a pinhole camera) of places in pixels: K^-1 [u, v, 1] by back-substitution."""
     y = (uv[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
     x = (uv[..., 0] - K[..., 0, 2] - K[..., 0, 1] * y) / K[..., 0, 0]
-    return torch.stack([x * depth, y * depth, depth.expand_as(x)], dim=-1)
+    return torch.stack([x, y], dim=-1)

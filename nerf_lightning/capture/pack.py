@@ -12,7 +12,7 @@ from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.cameras.paths import orbit_like
 from nerf_lightning.dataset.extent import visible_cube
 from nerf_lightning.dataset.formats.decode import read_pixels
-from nerf_lightning.dataset.lens import Lens, Rectification, rectify
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.posed import NEAR
 from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.resize import fit_size
@@ -25,16 +25,32 @@ SUBJECT_WIDTH_FRACTION = 0.5
 field has less detail the farther out."""
 
 
-def rectify_photo(path: Path, rectification: Rectification, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-    """A photo, upright, its distortion undone, averaged down to a size."""
-    image = rectification.apply(np.ascontiguousarray(read_pixels(path, upright=True)[..., :3]))
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+def rectify_photos(
+    paths: Sequence[Path], lens: Intrinsics, width: int, height: int
+) -> tuple[UInt8[np.ndarray, "V h w 3"], Float[np.ndarray, "3 3"]]:
+    """Photos, upright, their distortion undone, averaged down to a size; and K of the pinhole camera before that.
+
+    It zooms in just so far that no border without a source pixel is left.
+    """
+    size, distortion = (lens.width, lens.height), lens.opencv
+    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV puts pixel centres at integers, we put them at +0.5
+    pinhole = lens.K - half
+    if distortion.any():
+        pinhole, _ = cv2.getOptimalNewCameraMatrix(pinhole, distortion, size, 0, size)
+    col, row = cv2.initUndistortRectifyMap(lens.K - half, distortion, None, pinhole, size, cv2.CV_32FC1)
+    photos = []
+    for path in paths:
+        image = np.ascontiguousarray(read_pixels(path, upright=True)[..., :3])
+        # Replicating keeps rounding at the very edge from painting it black.
+        image = cv2.remap(image, col, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        photos.append(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+    return np.stack(photos), pinhole + half
 
 
 def pack(
     paths: Sequence[Path],
     c2w: Float[np.ndarray, "V 4 4"],
-    lens: Lens,
+    lens: Intrinsics,
     name: str,
     source: str,
     longest: int | None = 300,
@@ -59,10 +75,9 @@ def pack(
     """
     if len(paths) < 2:
         raise InputError(source, "", f"{len(paths)} placed photos", "at least 2: one to train on, one to hold out")
-    rectification = rectify(lens)
     width, height = fit_size(lens.width, lens.height, longest)
-    images = torch.from_numpy(np.stack([rectify_photo(path, rectification, width, height) for path in paths]))
-    K = torch.from_numpy(rectification.K).float().repeat(len(paths), 1, 1)
+    photos, pinhole = rectify_photos(paths, lens, width, height)
+    images, K = torch.from_numpy(photos), torch.from_numpy(pinhole).float().repeat(len(paths), 1, 1)
     cameras = Cameras.of_size(K, torch.from_numpy(c2w).float(), lens.width, lens.height).resized((width, height))
     held = torch.zeros(len(paths), dtype=torch.bool)
     held[holdout // 2 :: holdout] = True

@@ -21,7 +21,7 @@ from nerf_lightning.capture.tags.board import Board, board_detector
 from nerf_lightning.capture.tags.detect import Sighting, detect_in_photos, guess_family, tag_detector
 from nerf_lightning.capture.tags.layout import read_layout
 from nerf_lightning.dataset.formats.npz import save_npz
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.placing.photos import find_photos
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
@@ -121,7 +121,7 @@ def capture_scene(
 
 
 def place_by_tags(
-    sightings: Sequence[Sighting], lens: Lens, layout: dict[int, Pose] | None
+    sightings: Sequence[Sighting], lens: Intrinsics, layout: dict[int, Pose] | None
 ) -> tuple[Solved, dict[str, str]]:
     """Places photos; leaves out those without tags and those that contradict the others.
 
@@ -155,7 +155,7 @@ def _placed_by_tags(sightings: Sequence[Sighting], solved: Solved) -> list[Place
 
 
 def _place_untagged(
-    sightings: Sequence[Sighting], lens: Lens, solved: Solved, reasons: dict[str, str]
+    sightings: Sequence[Sighting], lens: Intrinsics, solved: Solved, reasons: dict[str, str]
 ) -> tuple[list[PlacedPhoto], dict[str, str]]:
     """Places photos without tags by their texture, and tells why each that is still left out is."""
     untagged = [s.name for s in sightings if not s.marks]
@@ -211,7 +211,7 @@ def _write_calibration(file: Path, found: Calibration, tags: dict[str, Any]) -> 
     content = {
         **{key: getattr(lens, key) for key in ("width", "height")},
         **{key: float(getattr(lens, key)) for key in ("fx", "fy", "cx", "cy")},
-        "distortion": dict(zip(("k1", "k2", "p1", "p2", "k3"), map(float, lens.distortion), strict=True)),
+        "distortion": dict(zip(("k1", "k2", "p1", "p2", "k3"), map(float, lens.opencv), strict=True)),
         "standard_deviations": found.deviations,
         "reprojection_px": found.rms,
         "photos_used": [s.name for s in found.used],

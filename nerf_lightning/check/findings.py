@@ -76,7 +76,7 @@ def describe_scene(scene: Scene) -> dict[str, str]:
         "box": f"from ({low}) to ({high})" + (", with surroundings" if bounds.unbounded else ", with nothing outside"),
     }
     if scene.train.known is not None:
-        facts["masked"] = f"{1 - len(scene.train.known) / len(scene.train.pixels):.0%} of the pixels are unknown"
+        facts["masked"] = f"{1 - float(scene.train.known.float().mean()):.0%} of the pixels are unknown"
     elif scene.train.channels == 4:
         facts["masked"] = "photos have alpha: what is transparent is empty"
     return facts

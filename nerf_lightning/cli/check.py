@@ -17,7 +17,6 @@ def check(
     holdout: Annotated[int, AtLeast(2)] = 8,
     masked: Literal["auto", "unknown", "empty"] = "auto",
     invert_masks: bool = False,
-    undistort: bool = False,
     bounded: Literal["auto", "true", "false"] = "auto",
     orientation: Literal["auto", "stored", "exif"] = "auto",
 ) -> list[str]:
@@ -30,7 +29,6 @@ def check(
         holdout: Every N-th photo is held out, unless the files say which.
         masked: What masks leave out: unknown, empty or auto.
         invert_masks: Masks are black where the photo is kept.
-        undistort: Resample photos to those of a pinhole camera.
         bounded: Whether nothing is outside the box: true, false, or auto by the photos.
         orientation: How photos are turned: stored, exif, or auto as their cameras say.
 
@@ -42,15 +40,15 @@ def check(
     """
     from nerf_lightning.check.findings import describe_scene, find_doubts, judge_photos, record_warnings
     from nerf_lightning.check.page import check_page
-    from nerf_lightning.dataset import Reading, open_scene
+    from nerf_lightning.dataset import PhotoLoadOptions, open_scene
     from nerf_lightning.drawing.camera_map import camera_map
     from nerf_lightning.drawing.ink import pixels_of
     from nerf_lightning.utils.files import atomic, output_path
 
     path = output_path(output or "check.html")
     with record_warnings() as warnings:
-        reading = Reading(resize, holdout, masked, invert_masks, undistort, bounded, orientation)
-        found = open_scene(str(scene), reading=reading)
+        options = PhotoLoadOptions(resize, holdout, masked, invert_masks, bounded, orientation)
+        found = open_scene(str(scene), options=options)
         doubts = find_doubts(found)
     photos, poses = judge_photos(found)
     page = check_page(

@@ -82,11 +82,10 @@ def has_run(path: Path) -> bool:
 
 
 def _open_scene(path: Path, resize: int | str | None, holdout: int, host: str, port: int) -> "Page":
-    from nerf_lightning.dataset import Reading, open_scene
-    from nerf_lightning.dataset.size import parse_resize
+    from nerf_lightning.dataset import PhotoLoadOptions, open_scene
     from nerf_lightning.view.scene_page import ScenePage
 
-    return ScenePage(open_scene(str(path), reading=Reading(parse_resize(resize), holdout)), host, port)
+    return ScenePage(open_scene(str(path), options=PhotoLoadOptions(resize, holdout)), host, port)
 
 
 def _open_run(source: Path, device: str, side: int, host: str, port: int) -> "Page":

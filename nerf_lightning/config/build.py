@@ -16,7 +16,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
 
-from nerf_lightning.callbacks import Budget, Results
+from nerf_lightning.callbacks import Budget, Evaluation
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.config.literal import escape
@@ -268,13 +268,13 @@ def build_logger(cfg: DictConfig, folder: Path) -> Logger:
     return logger
 
 
-def build_trainer(cfg: DictConfig, folder: Path, device: torch.device, results: Results | None = None) -> L.Trainer:
-    """The Trainer with its callbacks, on a device, writing into `folder`; with `results`, a results.json too."""
+def build_trainer(cfg: DictConfig, folder: Path, device: torch.device) -> L.Trainer:
+    """The Trainer with its callbacks, on a device, writing into `folder`."""
     logger = build_logger(cfg, folder) if cfg.get("logger") is not None else False
     chosen = [name for name, node in (cfg.get("callbacks") or {}).items() if node is not None]
     callbacks = [make(cfg, f"callbacks.{name}", L.Callback) for name in chosen]
-    # The budget comes first, as the others read its clock; results before the orbit, as figures should not wait for a GIF.
-    callbacks = [build_budget(cfg), *([results] if results else []), *callbacks]
+    # The budget comes first, as the others read its clock, and figures come before pictures.
+    callbacks = [build_budget(cfg), Evaluation(), *callbacks]
     devices = str(OmegaConf.select(cfg, "trainer.devices"))
     if devices.isdecimal() and int(devices) > MAX_DEVICES:
         raise InputError("config", "trainer.devices", devices[:60], f"at most {MAX_DEVICES}, one process each")

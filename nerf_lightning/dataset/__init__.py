@@ -8,7 +8,7 @@ from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PictureBatch, PixelBatch, PixelDataModule, pixel_grid
 from nerf_lightning.dataset.rays import RayBatch, RayDataModule, ViewBatch, draw_rays
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
-from nerf_lightning.dataset.shots import Reading
+from nerf_lightning.dataset.shots import PhotoLoadOptions
 from nerf_lightning.dataset.views import Views
 
 __all__ = [
@@ -18,7 +18,7 @@ __all__ = [
     "PixelBatch",
     "PixelDataModule",
     "RayBatch",
-    "Reading",
+    "PhotoLoadOptions",
     "RayDataModule",
     "ViewBatch",
     "Scene",
@@ -33,4 +33,5 @@ __all__ = [
     "pixel_grid",
     "open_scene",
     "save_npz",
+    "PhotoLoadOptions",
 ]

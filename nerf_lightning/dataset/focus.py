@@ -115,8 +115,7 @@ class Focus:
 
     def state_dict(self) -> dict[str, Tensor]:
         """All that later draws depend on."""
-        of = {name: getattr(self, name) for name in KEPT}
-        return {**of, "noted": torch.tensor(self.noted)}
+        return {name: getattr(self, name) for name in KEPT} | {"noted": torch.tensor(self.noted)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Goes on from `state_dict`; the photos are the same."""

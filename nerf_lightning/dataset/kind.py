@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.dataset.extent import MAX_VIEWS, border_colour, take_border
-from nerf_lightning.dataset.views import Runs, Views
+from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
 MIN_TRANSPARENT_SHARE = 0.2
@@ -45,7 +45,7 @@ def decide_kind(views: Views, bounded: str, masked: str, alpha_background: tuple
     Args:
         views: training photos.
         bounded: `auto`, or `true` or `false` where the user knows.
-        masked: `empty` where the user knows that alpha cuts out, see `Reading`.
+        masked: `empty` where the user knows that alpha cuts out, see `PhotoLoadOptions`.
         alpha_background: what photos with alpha are composited on, the format's convention.
     """
     alpha = "cut_out" if masked == "empty" and views.channels == 4 else interpret_alpha(views)
@@ -85,8 +85,8 @@ def apply_alpha(views: Views, meaning: str) -> Views:
         return views
     known: Bool[Tensor, "N"] = views.pixels[:, 3] >= OPAQUE
     counted = known if views.known is None else known & views.mask
-    runs = None if meaning == "none" and views.known is None else Runs.of(counted)
-    return replace(views, pixels=views.pixels[:, :3].contiguous(), known=runs)
+    counts_all = meaning == "none" and views.known is None
+    return replace(views, pixels=views.pixels[:, :3].contiguous(), known=None if counts_all else counted)
 
 
 def check_visible(source: object, views: Views) -> None:
@@ -97,7 +97,7 @@ def check_visible(source: object, views: Views) -> None:
     """
     if views.channels == 4 and not bool(torch.any(views.pixels[:, 3])):
         raise InputError(source, "", "training photos whose alpha is 0 everywhere", "photos that show something")
-    if views.known is not None and not len(views.known):
+    if views.known is not None and not views.known.any():
         raise InputError(
             source,
             "",

@@ -13,6 +13,7 @@ from nerf_lightning.dataset.extent import take_border
 from nerf_lightning.dataset.formats.decode import read_pixels
 from nerf_lightning.dataset.formats.names import MASK_FOLDERS, fold_name, walk_images
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.text import join_truncated
 
 log = logging.getLogger(__name__)
 
@@ -20,6 +21,8 @@ KEPT = 128
 """Brightness, or alpha, from which a mask keeps a pixel: white is kept, as nerfstudio and COLMAP have it."""
 SURE = 250
 """Share of a pixel, in 1/255, that must be known after averaging for the pixel to be known."""
+SHOWN = 4
+"""Names in a message."""
 CELLS = 16
 """Along each side of a photo, to see where most masks leave something out."""
 FLAT = 12
@@ -83,7 +86,7 @@ def match_mask(
         masks: folded paths below their folder, and files.
 
     Raises:
-        InputError: several fit equally well.
+        InputError: several fit.
     """
 
     def fits(mask: tuple[str, ...], exact: bool) -> bool:
@@ -92,16 +95,11 @@ def match_mask(
         shared = min(len(mask), len(photo)) - 1
         return (name == base if exact else longer) and mask[-1 - shared : -1] == photo[-1 - shared : -1]
 
-    for exact in (True, False):
-        fitting = [one for one in masks if fits(one[0], exact)]
-        overlaps = [min(len(mask), len(photo)) for mask, _ in fitting]
-        best = [path for (_, path), overlap in zip(fitting, overlaps, strict=True) if overlap == max(overlaps)]
-        if len(best) > 1 and exact:
-            shown = ", ".join(path.relative_to(folder).as_posix() for path in best[:4])
-            raise InputError(folder, "", f"{len(best)} masks for {file.name}: {shown}", "one mask for each photo")
-        if len(best) == 1:
-            return best[0]
-    return None
+    found = [path for mask, path in masks if fits(mask, True)] or [path for mask, path in masks if fits(mask, False)]
+    if len(found) > 1:
+        shown = join_truncated([path.relative_to(folder).as_posix() for path in found], SHOWN)
+        raise InputError(folder, "", f"{len(found)} masks for {file.name}: {shown}", "one mask for each photo")
+    return found[0] if found else None
 
 
 def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.ndarray, "H W"]:

@@ -13,18 +13,25 @@ from nerf_lightning.dataset.placing.photos import has_photos
 from nerf_lightning.dataset.placing.place import place as place_photos
 from nerf_lightning.dataset.placing.video import VIDEOS
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import AS_IT_IS, Reading
+from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.text import join_truncated
 
 SUPPORTED = (
     "photos or a video, an .npz file, a COLMAP folder (sparse/0), poses_bounds.npy beside images, a Blender folder"
     " (transforms_train.json), or transforms.json or its folder"
 )
+SHOWN = 5
+"""Names of what else is in a folder."""
 
 
 def open_scene(
-    path: str, name: str | None = None, reading: Reading = AS_IT_IS, near: float | None = None, far: float | None = None
+    path: str,
+    name: str | None = None,
+    options: PhotoLoadOptions = AS_IT_IS,
+    near: float | None = None,
+    far: float | None = None,
 ) -> Scene:
     """Reads a scene of any supported format, told apart by what is inside.
 
@@ -34,14 +41,14 @@ def open_scene(
             of photos, or a video, which COLMAP places once.
         name: what to call it; defaults to the file's or folder's name.
         near, far: distances along the rays, in the scene's unit, that override the bounds'.
-        reading: see there.
+        options: see there.
 
     Raises:
         InputError: nothing readable at `path`, or what is there is damaged.
     """
     place = user_path(path)
     try:
-        scene = _open(place, name, reading)
+        scene = _open(place, name, options)
     except OSError as error:  # a loop of links, a folder that may not be read
         raise InputError(place, "", f"something unreadable ({error})", SUPPORTED) from error
     if near is None and far is None:
@@ -53,34 +60,31 @@ def open_scene(
     return replace(scene, bounds=replace(bounds, near=near, far=far))
 
 
-def _open(place: Path, name: str | None, reading: Reading) -> Scene:
+def _open(place: Path, name: str | None, options: PhotoLoadOptions) -> Scene:
     if place.suffix.lower() == ".npz" and not place.is_dir():
-        return load_npz(place, name, reading)
+        return load_npz(place, name, options)
     if (place / "transforms_train.json").is_file():
-        return load_blender(place, name, reading)
+        return load_blender(place, name, options)
     if (place / "transforms.json").is_file() or (place.suffix.lower() == ".json" and place.is_file()):
-        return load_transforms(place, name, reading)
+        return load_transforms(place, name, options)
     if find_models(place):
-        return load_colmap(place, name, reading)
+        return load_colmap(place, name, options)
     if (place / POSES).is_file():
-        return load_llff(place, name, reading)
+        return load_llff(place, name, options)
     if place.suffix.lower() in VIDEOS and place.is_file():
-        return _placed(kept_frames(place), name or place.stem, reading)
+        return _placed(kept_frames(place), name or place.stem, options)
     placed_already = any((place / below).is_dir() for below in MODEL_FOLDERS if below)
     for below in () if placed_already else ("", *PHOTO_FOLDERS):  # a damaged model is not made again in silence
         if has_photos(place / below):
-            return _placed(place / below, name or place.resolve().name, reading)
-    raise InputError(place, "", _description(place), SUPPORTED)
-
-
-def _placed(photos: Path, name: str, reading: Reading) -> Scene:
-    """Photos whose cameras COLMAP finds, unless it has found them before."""
-    return load_colmap(place_photos(photos), name, reading, photos, upright=True)
-
-
-def _description(place: Path) -> str:
+            return _placed(place / below, name or place.resolve().name, options)
     if place.is_dir():
         names = sorted(item.name for item in place.iterdir())
-        shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-        return f"a folder with {shown}" if names else "an empty folder"
-    return f"a {place.suffix or 'plain'} file" if place.exists() else "nothing there"
+        found = f"a folder with {join_truncated(names, SHOWN)}" if names else "an empty folder"
+    else:
+        found = f"a {place.suffix or 'plain'} file" if place.exists() else "nothing there"
+    raise InputError(place, "", found, SUPPORTED)
+
+
+def _placed(photos: Path, name: str, options: PhotoLoadOptions) -> Scene:
+    """Photos whose cameras COLMAP finds, unless it has found them before."""
+    return load_colmap(place_photos(photos), name, options, photos, upright=True)

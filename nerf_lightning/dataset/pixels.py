@@ -2,18 +2,18 @@
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
-from nerf_lightning.errors import InputError
 from nerf_lightning.utils.options import Count
 from nerf_lightning.utils.seeding import Stream, step_generator
+from nerf_lightning.utils.tensors import TensorDataclass
 
 USUAL = 8192
 """Pixels a step, where a picture is not large."""
@@ -59,15 +59,12 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class PixelBatch:
+class PixelBatch(TensorDataclass):
     """N places and their colours."""
 
     uv: Float[Tensor, "N 2"]
     """In [0, 1]^2, x right, y down; the centre of pixel (row, col) is ((col + 0.5) / W, (row + 0.5) / H)."""
     rgb: Float[Tensor, "N 3"]
-
-    def to(self, device: torch.device | str) -> "PixelBatch":
-        return PixelBatch(self.uv.to(device), self.rgb.to(device))
 
 
 @dataclass(frozen=True)
@@ -81,25 +78,12 @@ class PictureBatch(PixelBatch):
     known: ClassVar[None] = None
     """All pixels count."""
 
-    def to(self, device: torch.device | str) -> "PictureBatch":
-        return replace(self, uv=self.uv.to(device), rgb=self.rgb.to(device))
 
-
-def centres(height: int, width: int, index: Int[Tensor, "N"]) -> Float[Tensor, "N 2"]:
-    """The centres of pixels with the given row-major indices, see `PixelBatch`."""
-    return torch.stack([(index % width + 0.5) / width, (index // width + 0.5) / height], dim=-1)
-
-
-def pixel_grid(height: int, width: int) -> Float[Tensor, "N 2"]:
-    """The centres of all pixels, row by row."""
-    x, y = ((torch.arange(side) + 0.5) / side for side in (width, height))
+def pixel_grid(height: int, width: int, subset: PixelSubset = WHOLE) -> Float[Tensor, "N 2"]:
+    """The centres of pixels, row by row, see `PixelBatch`."""
+    rows, columns = subset.grid(width, height)
+    x, y = (columns + 0.5) / width, (rows + 0.5) / height
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).view(-1, 2)
-
-
-def pixels_at(image: UInt8[Tensor, "H W 3"], index: Int[Tensor, "N"]) -> PixelBatch:
-    """The pixels with the given row-major indices."""
-    height, width, _ = image.shape
-    return PixelBatch(centres(height, width, index), image.view(-1, 3)[index].float() / 255)
 
 
 class PixelDataModule(StepDataModule[Tensor]):
@@ -110,24 +94,14 @@ class PixelDataModule(StepDataModule[Tensor]):
         pixels: pixels a step, drawn with replacement; several processes share them. None: 8192, and of more than a million
             pixels 1 in 128.
         seed: of the draw.
-
-    Raises:
-        InputError: for less than one pixel a step.
     """
 
     held_out_views = 1
 
     def __init__(self, scene: Picture, pixels: Count | None = None, seed: int = 0):
-        super().__init__(seed)
-        if pixels is not None and pixels < 1:
-            raise InputError("dataset.pixels", "", str(pixels), "at least 1")
-        width, height = scene.size
+        super().__init__(scene.image, seed)
         self.scene = scene
-        self.pixels = pixels or max(USUAL, round(SHARE * width * height))
-
-    @property
-    def photos(self) -> UInt8[Tensor, "H W 3"]:
-        return self.scene.image
+        self.pixels = pixels or max(USUAL, round(SHARE * self.pixels_held_out(0)))
 
     def enlarge(self, batch: int) -> None:
         """Takes that many times the pixels a step, for a device that takes more at once. Before training."""
@@ -135,8 +109,10 @@ class PixelDataModule(StepDataModule[Tensor]):
 
     def draw_from(self, photos: UInt8[Tensor, "H W 3"], step: int, part: slice) -> PixelBatch:
         generator = step_generator(self.seed, Stream.BATCH, step, photos.device)
-        index = torch.randint(photos[..., 0].numel(), (self.pixels,), generator=generator, device=photos.device)
-        return pixels_at(photos, index[part])
+        height, width, _ = photos.shape
+        index = torch.randint(height * width, (self.pixels,), generator=generator, device=photos.device)[part]
+        uv = torch.stack([(index % width + 0.5) / width, (index // width + 0.5) / height], dim=-1)
+        return PixelBatch(uv, photos.view(-1, 3)[index].float() / 255)
 
     def some_pixels(self) -> PixelBatch:
         """As in `RayDataModule`; here, all pixels."""
@@ -148,10 +124,7 @@ class PixelDataModule(StepDataModule[Tensor]):
 
     def held_out(self, view: int, subset: PixelSubset = WHOLE) -> PictureBatch:
         """The picture."""
-        height, width, _ = self.scene.image.shape
-        if subset is WHOLE:
-            rgb = self.scene.image.view(-1, 3).float().div_(255)  # in place: large pictures
-            return PictureBatch(pixel_grid(height, width), rgb, height, width)
+        width, height = self.scene.size
         rows, columns = subset.grid(width, height)
-        some = pixels_at(self.scene.image, (rows[:, None] * width + columns).flatten())
-        return PictureBatch(some.uv, some.rgb, len(rows), len(columns), subset.strip)
+        rgb = self.scene.image[rows][:, columns].view(-1, 3).float().div_(255)  # in place: large pictures
+        return PictureBatch(pixel_grid(height, width, subset), rgb, len(rows), len(columns), subset.strip)

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import (
     Bounds,
     Cameras,
+    find_up,
     has_panoramas,
-    held,
     in_other_frame,
     orbit_like,
     transform,
@@ -24,11 +24,11 @@ from nerf_lightning.cameras import (
 )
 from nerf_lightning.dataset.extent import estimate_bounds
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.kind import apply_alpha, check_visible, decide_kind
+from nerf_lightning.dataset.kind import SceneKind, apply_alpha, check_visible, decide_kind
 from nerf_lightning.dataset.matching.triangulate import match_points
 from nerf_lightning.dataset.region import Region, find_region
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import Reading, Shot, read_shots
+from nerf_lightning.dataset.shots import PhotoLoadOptions, Shot, read_shots
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
@@ -52,16 +52,6 @@ class Split:
     """Held out: measured on while training and at its end."""
     test: list[int] = field(default_factory=list)
     """Held out and measured on at the end alone, where a format has both."""
-
-
-@dataclass(frozen=True)
-class PosedViews:
-    """Photos as they are read, and their poses in the file's frame."""
-
-    views: Views
-    """The poses of its cameras do not count."""
-    c2w: Float[np.ndarray, "V 4 4"]
-    """OpenCV camera to world, the file's frame and unit."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +89,7 @@ def build_scene(
     source: Path,
     name: str,
     shots: Sequence[Shot],
-    reading: Reading,
+    options: PhotoLoadOptions,
     split: Split | None = None,
     hints: Hints = Hints(),  # noqa: B008  (frozen)
 ) -> Scene:
@@ -109,57 +99,54 @@ def build_scene(
         source: what the user named, for messages.
         name: of the scene.
         shots: in the order of the format.
-        reading: see there.
-        split: None holds out every `reading.holdout`-th.
+        options: see there.
+        split: None holds out every `options.holdout`-th.
         hints: what else the file says.
 
     Raises:
         InputError: nothing to train on or to hold out, or photos that cannot be read.
     """
-    if split is None:
-        split = split_shots(source, len(shots), reading.holdout)
+    split = split or split_shots(source, len(shots), options.holdout)
     checks.check_split_size(source, "train split", len(split.train))
     checks.check_split_size(source, "val split", len(split.val))
     # Part after part, so that none of them needs a copy of its pixels.
-    parts = (split.train, split.val, split.test)
-    shots = [shots[i] for part in parts for i in part]
-    ends = np.cumsum([0, *map(len, parts)]).tolist()
+    shots = [shots[i] for part in (split.train, split.val, split.test) for i in part]
+    ends = np.cumsum([0, len(split.train), len(split.val), len(split.test)]).tolist()
     train, val, test = (list(range(*pair)) for pair in itertools.pairwise(ends))
-    poses = np.stack([shot.c2w for shot in shots])
-    views = read_shots(source, shots, reading)
-    check_visible(source, views)
-
-    def take(part: list[int]) -> PosedViews:
-        return PosedViews(views[torch.tensor(part, dtype=torch.long)], poses[part])
-
-    known = select_known(views, val, shots)
-    return assemble_scene(source, name, take(train), take(known), take(test) if test else None, reading, hints)
+    views = read_shots(source, shots, options)
+    if views.known is not None and (masked := [view for view in val if not views.mask_of(view).any()]):
+        log.warning("%d held-out photos are masked entirely, %s first: left out", len(masked), shots[masked[0]].name)
+        val = [view for view in val if view not in masked]
+        checks.check_split_size(source, "val split", len(val))
+    parts = [views[torch.tensor(part)] for part in (train, val, test) if part]
+    return assemble_scene(source, name, parts, options, hints)
 
 
 def assemble_scene(
     source: Path,
     name: str,
-    train: PosedViews,
-    val: PosedViews,
-    test: PosedViews | None,
-    reading: Reading,
+    parts: Sequence[Views],
+    options: PhotoLoadOptions,
     hints: Hints = Hints(),  # noqa: B008  (frozen)
 ) -> Scene:
     """Places read photos in one frame and decides what kind of scene they show, the same for every format.
 
     The world is moved to the region that the training photos show (see `find_region`), turned so that z points up (see
-    `cameras.held`), and scaled so that this region is the cube [-1, 1]^3, the box of an unbounded scene; `to_source` leads
+    `cameras.find_up`), and scaled so that this region is the cube [-1, 1]^3, the box of an unbounded scene; `to_source` leads
     back. A bounded scene with `hints.keep_frame` stays where it is instead.
+
+    `parts` are training and held-out photos, and those that are measured on at the end alone, where there are any; with
+    double-precision poses in the file's frame and unit. For the other arguments see `build_scene`.
     """
-    check_visible(source, train.views)
-    kind = decide_kind(train.views, reading.bounded, reading.masked, hints.alpha_background)
-    if hints.bounds is not None and reading.bounded == "auto":
+    train = parts[0]
+    check_visible(source, train)
+    kind = decide_kind(train, options.bounded, options.masked, hints.alpha_background)
+    if hints.bounds is not None and options.bounded == "auto":
         kind = replace(kind, bounded=not hints.bounds.unbounded, reason="the file states a box")
     if hints.background is not None:
         kind = replace(kind, background=hints.background)
-    poses = viewing_poses(train.views.cameras, train.c2w)
     points = None if hints.points is None else torch.from_numpy(hints.points)
-    region = find_region(poses, points, lambda: match_points(train.views, train.c2w))
+    region = find_region(viewing_poses(train.cameras), points, lambda: match_points(train, train.cameras.c2w.numpy()))
     if not checks.NEAREST <= region.unit <= checks.FARTHEST:
         expected = f"a distance of {checks.NEAREST:g} to {checks.FARTHEST:g}"
         found = f"cameras {region.unit:.3g} from what they look at"
@@ -168,44 +155,28 @@ def assemble_scene(
     log.info(text, name, "bounded" if kind.bounded else "unbounded", kind.reason, region.layout)
     if not region.known and not kind.bounded:
         log.warning("%s: %s", source, region.doubt)
-    splits = {"train": train, "val": val} | ({} if test is None else {"test": test})
-    # Single precision tells pixels apart in the file's frame unless its origin is far away, as of georeferenced files.
-    rounding = checks.STEP * float(np.abs(train.c2w[:, :3, 3]).max())
-    is_precise = rounding <= region.unit / float(train.views.cameras.K[:, 0, 0].median())
-    if hints.bounds is not None or (hints.keep_frame and kind.bounded and is_precise):
-        to_source = torch.eye(4, dtype=torch.float64)
-    else:
-        _, to_source = normalize_poses(torch.from_numpy(train.c2w), torch.arange(len(train.c2w)), region)
+    keeps_frame = hints.keep_frame and kind.bounded and is_precise(train.cameras, region)
+    to_source = torch.eye(4, dtype=torch.float64)
+    if hints.bounds is None and not keeps_frame:
+        to_source = region_frame(train.cameras.c2w, region)
     from_source = torch.linalg.inv(to_source)
 
-    def move(cameras: Cameras, c2w: Float[np.ndarray, "V 4 4"]) -> Cameras:
-        return replace(cameras, c2w=in_other_frame(torch.from_numpy(c2w), from_source).float())
+    def move(cameras: Cameras) -> Cameras:
+        return replace(cameras, c2w=in_other_frame(cameras.c2w, from_source).float())
 
-    def place(posed: PosedViews) -> Views:
-        views = apply_alpha(posed.views, kind.alpha)
-        return replace(views, cameras=move(views.cameras, posed.c2w))
-
-    placed = {key: place(posed) for key, posed in splits.items()}
-    views = placed["train"]
-    scale = float(torch.linalg.det(from_source[:3, :3])) ** (1 / 3)
-    near, far = (None if x is None else x * scale for x in (hints.near, hints.far))
-    if hints.bounds is not None:
-        bounds = replace(hints.bounds, near=near, far=far)
-    elif kind.bounded:
-        bounds = estimate_bounds(views, kind.background, near, far)
-    else:
-        bounds = replace(unbounded_box(views, from_source, hints, region), far=far)
-        bounds = bounds if near is None else replace(bounds, near=near)
+    placed = [replace(apply_alpha(part, kind.alpha), cameras=move(part.cameras)) for part in parts]
     centre = transform(from_source, region.centre.double()).float()
-    path = None if hints.path is None else move(hints.path, hints.path.c2w.double().numpy())
+    orbit = (
+        orbit_like(placed[0].cameras, layout=region.layout, centre=centre) if hints.path is None else move(hints.path)
+    )
     return Scene(
         name=name.lower(),
         source=str(source),
-        train=views,
-        val=placed["val"],
-        test=placed.get("test"),
-        orbit=orbit_like(views.cameras, layout=region.layout, centre=centre) if path is None else path,
-        bounds=bounds,
+        train=placed[0],
+        val=placed[1],
+        test=placed[2] if placed[2:] else None,
+        orbit=orbit,
+        bounds=find_bounds(placed[0], kind, from_source, hints, region),
         background=kind.background,
         to_source=to_source if hints.to_source is None else torch.from_numpy(hints.to_source) @ to_source,
         kind=f"{kind.reason}; {region.layout} cameras",
@@ -213,29 +184,40 @@ def assemble_scene(
     )
 
 
-def unbounded_box(views: Views, from_source: Float[Tensor, "4 4"], hints: Hints, region: Region) -> Bounds:
-    """The cube [-1, 1]^3, and where sampling starts: before the nearest content that is known, or what cameras look at."""
-    known = [] if hints.nearest is None else [hints.nearest * float(torch.linalg.det(from_source[:3, :3])) ** (1 / 3)]
+def is_precise(cameras: Cameras, region: Region) -> bool:
+    """Whether single precision tells pixels apart in the file's frame: not where its origin is far away, as of georeferenced
+    files."""
+    return checks.STEP * float(cameras.centres.abs().max()) <= region.unit / float(cameras.K[:, 0, 0].median())
+
+
+def find_bounds(
+    views: Views, kind: SceneKind, from_source: Float[Tensor, "4 4"], hints: Hints, region: Region
+) -> Bounds:
+    """The box that the file states, or that silhouettes give; of an unbounded scene the cube [-1, 1]^3.
+
+    There sampling starts before the nearest content that is known, or what cameras look at.
+    """
+    scale = float(torch.linalg.det(from_source[:3, :3])) ** (1 / 3)
+    near, far = (None if x is None else x * scale for x in (hints.near, hints.far))
+    if hints.bounds is not None:
+        return replace(hints.bounds, near=near, far=far)
+    if kind.bounded:
+        return estimate_bounds(views, kind.background, near, far)
+    starts = [] if hints.nearest is None else [CLEAR * (hints.nearest * scale)]
     if hints.points is not None and len(hints.points):
-        known.append(nearest_point(transform(from_source, torch.from_numpy(hints.points)).float(), views))
-    starts = [CLEAR * distance for distance in known]
+        starts.append(CLEAR * nearest_point(transform(from_source, torch.from_numpy(hints.points)).float(), views))
     if region.has_subject:
-        starts.append(NEAR * nearest_camera(views))
-    return Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3]), unbounded=True, near=min(starts, default=None))
+        starts.append(NEAR * min(1.0, float(views.cameras.centres.norm(dim=1).min())))
+    near = min(starts, default=None) if near is None else near
+    return Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3]), unbounded=True, near=near, far=far)
 
 
-def viewing_poses(cameras: Cameras, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor, "W 4 4"]:
+def viewing_poses(cameras: Cameras) -> Float[Tensor, "W 4 4"]:
     """Poses whose axes say where cameras look: of a photo of all directions, four around its vertical axis."""
-    poses = torch.from_numpy(c2w)
     if not has_panoramas(cameras):
-        return poses
+        return cameras.c2w
     quarter = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
-    return torch.cat([poses @ torch.linalg.matrix_power(quarter, turns) for turns in range(4)])
-
-
-def nearest_camera(views: Views) -> float:
-    """Distance of the nearest camera to the region's centre, at most the usual one, in the scene's unit."""
-    return min(1.0, float(views.cameras.centres.norm(dim=1).min()))
+    return torch.cat([cameras.c2w @ torch.linalg.matrix_power(quarter, turns) for turns in range(4)])
 
 
 def nearest_point(points: Float[Tensor, "P 3"], views: Views) -> float:
@@ -249,27 +231,9 @@ def nearest_point(points: Float[Tensor, "P 3"], views: Views) -> float:
     return min(found)
 
 
-def select_known(views: Views, val: list[int], shots: Sequence[Shot]) -> list[int]:
-    """Held-out photos of which something is known; a line names the others."""
-    if views.known is None:
-        return val
-    kept = [view for view in val if bool(views.mask_of(view).any())]
-    if lost := [shots[view].name for view in val if view not in kept]:
-        log.warning("%d held-out photos are masked entirely, %s first: left out", len(lost), lost[0])
-    checks.check_split_size(shots[0].photo.parent, "val split", len(kept))
-    return kept
-
-
-def normalize_poses(
-    c2w: Float[Tensor, "V 4 4"], train: Int[Tensor, "T"], region: Region
-) -> tuple[Float[Tensor, "V 4 4"], Float[Tensor, "4 4"]]:
-    """Poses in a frame centred on a region, in its unit, with what is up in the training photos along z; and the similarity
-    back."""
-    turn = turn_upright(held(c2w[train])[0])
-    moved = c2w.clone()
-    moved[:, :3, :3] = turn @ c2w[:, :3, :3]
-    moved[:, :3, 3] = (c2w[:, :3, 3] - region.centre) @ turn.mT / region.unit
+def region_frame(c2w: Float[Tensor, "V 4 4"], region: Region) -> Float[Tensor, "4 4"]:
+    """The similarity from a frame centred on a region, in its unit, with what is up in the photos along z, to theirs."""
     to_source = torch.eye(4, dtype=torch.float64)
-    to_source[:3, :3] = region.unit * turn.mT
+    to_source[:3, :3] = region.unit * turn_upright(find_up(c2w)).mT
     to_source[:3, 3] = region.centre
-    return moved, to_source
+    return to_source

@@ -1,7 +1,7 @@
 """RayDataModule: rays and their pixels, drawn from all training photos."""
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -13,11 +13,13 @@ from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.errors import InputError
+from nerf_lightning.utils.options import AtLeast, AtMost, Count
 from nerf_lightning.utils.seeding import Stream, step_generator
+from nerf_lightning.utils.tensors import TensorDataclass
 
 RAYS, SAMPLES = 1024, 16384
 """Rays of the first step, and the samples per step that the number of rays then adapts to."""
+Focused = Annotated[float, AtLeast(0), AtMost(0.99)]
 FOCUS = 0.5
 """Share of the rays that are drawn by the error around them."""
 SOME_PIXELS = 8192
@@ -29,7 +31,7 @@ CONTRAST = 0.01
 
 
 @dataclass(frozen=True)
-class RayBatch:
+class RayBatch(TensorDataclass):
     """R rays and their pixels."""
 
     rays: Rays
@@ -42,10 +44,6 @@ class RayBatch:
     weights: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
     """How much each counts, see `Focus`; None where all count the same."""
 
-    def to(self, device: torch.device | str) -> "RayBatch":
-        views, plain, weights = (None if x is None else x.to(device) for x in (self.views, self.plain, self.weights))
-        return RayBatch(self.rays.to(device), self.pixels.to(device), views=views, plain=plain, weights=weights)
-
 
 @dataclass(frozen=True)
 class ViewBatch(RayBatch):
@@ -57,10 +55,6 @@ class ViewBatch(RayBatch):
     """Which pixels count; None for all."""
     strip: int | None = None
     """See `PixelSubset.strip`."""
-
-    def to(self, device: torch.device | str) -> "ViewBatch":
-        known = None if self.known is None else self.known.to(device)
-        return replace(self, rays=self.rays.to(device), pixels=self.pixels.to(device), known=known)
 
 
 def rays_through(views: Views, places: Int[Tensor, "R"]) -> tuple[Rays, Int[Tensor, "R"]]:
@@ -101,29 +95,12 @@ def plainness(views: Views, places: Int[Tensor, "R"], view: Int[Tensor, "R"]) ->
     return torch.exp(-contrast / (255 * CONTRAST))
 
 
-def draw_rays(
-    views: Views,
-    count: int,
-    generator: torch.Generator,
-    part: slice = slice(None),  # noqa: B008
-    plain: bool = False,
-) -> RayBatch:
-    """Draws `count` pixels uniformly from all views, masked ones excepted, with replacement; returns a part of them.
+def draw_rays(views: Views, count: int, generator: torch.Generator, plain: bool = False) -> RayBatch:
+    """Draws pixels uniformly from all views, masked ones excepted, with replacement.
 
     Photos stay bytes, and rays are made only for the drawn pixels: the cost does not depend on the number of photos.
-
-    Args:
-        views: the photos.
-        count: pixels drawn.
-        generator: of the draw.
-        part: of the pixels that is returned.
-        plain: whether to look how plain photos are around them.
     """
-    whole = len(views.pixels) if views.known is None else len(views.known)
-    flat = torch.randint(whole, (count,), generator=generator, device=views.pixels.device)[part]
-    if views.known is not None:
-        flat = views.known.find(flat)
-    return batch_of(views, flat, plain)
+    return batch_of(views, views.draw(count, generator), plain)
 
 
 def batch_of(
@@ -144,23 +121,14 @@ class RayDataModule(StepDataModule[Views]):
         samples: aim for this many samples a step by adapting the number of rays; None keeps `rays`.
         seed: of the draw.
         focus: share of the rays that are drawn by the error of what is around them, see `Focus`; 0 draws all alike.
-
-    Raises:
-        InputError: for less than one ray or sample a step, or a focus outside [0, 1).
     """
 
     MOST_RAYS = 32  # times the rays of the first step
 
     def __init__(
-        self, scene: Scene, rays: int = RAYS, samples: int | None = SAMPLES, seed: int = 0, focus: float = FOCUS
+        self, scene: Scene, rays: Count = RAYS, samples: Count | None = SAMPLES, seed: int = 0, focus: Focused = FOCUS
     ):
-        super().__init__(seed)
-        if not 0 <= focus < 1:
-            raise InputError("dataset.focus", "", str(focus), "at least 0, below 1")
-        if rays < 1:
-            raise InputError("dataset.rays", "", str(rays), "at least 1")
-        if samples is not None and samples < 1:
-            raise InputError("dataset.samples", "", str(samples), "at least 1, or null for a fixed number of rays")
+        super().__init__(scene.train, seed)
         self.scene = scene
         self.rays = self.first_rays = rays
         self.samples = samples
@@ -173,10 +141,6 @@ class RayDataModule(StepDataModule[Views]):
         """Whether batches say how plain photos are, see `RayBatch.plain`."""
         self.finer = 1.0
         """Factor on the samples aimed for, see `Field.finer`: fewer meet in a small cell, and gradients would be noise."""
-
-    @property
-    def photos(self) -> Views:
-        return self.scene.train
 
     def enlarge(self, batch: int) -> None:
         """Takes that many times the rays and samples a step, for a device that takes more at once. Before training."""
@@ -207,7 +171,7 @@ class RayDataModule(StepDataModule[Views]):
     def draw_from(self, photos: Views, step: int, part: slice) -> RayBatch:
         generator = step_generator(self.seed, Stream.BATCH, step, photos.pixels.device)
         if self.focus == 0:
-            return draw_rays(photos, self.rays, generator, part, self.plain)
+            return batch_of(photos, photos.draw(self.rays, generator)[part], self.plain)
         if self._focus is None or self._focus.views is not photos:
             self._focus_state = self._focus_state if self._focus is None else self._focus.state_dict()
             self._focus = Focus(photos, self.focus)

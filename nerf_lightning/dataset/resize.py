@@ -1,46 +1,33 @@
 """Area-average resizing, also of pictures with alpha."""
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 import torch
 from jaxtyping import UInt8
 
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.errors import InputError
 
 
 def fit_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
     """Width and height with the longest side at `longest` pixels; never larger than before, and as before for None."""
     if longest is None:
         return width, height
-    if longest < 1:
-        raise InputError("resize", "", str(longest), "the longest side in pixels, at least 1")
     scale = min(1.0, longest / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def premultiplied(
-    image: UInt8[np.ndarray, "H W C"], operation: Callable[[np.ndarray], np.ndarray]
-) -> UInt8[np.ndarray, "h w C"]:
-    """Applies a linear filter to RGB as it is, to RGBA with premultiplied alpha.
-
-    Straight colours under alpha 0 are arbitrary, mostly black: averaging them would give objects a dark rim.
-    """
-    if image.shape[2] == 3:
-        return operation(image)
-    image = image.astype(np.float32)
-    image[..., :3] *= image[..., 3:] / 255
-    image = operation(image)
-    image[..., :3] /= np.maximum(image[..., 3:] / 255, 1e-6)
-    return np.rint(image).clip(0, 255).astype(np.uint8)
-
-
 def area_resize(image: UInt8[np.ndarray, "H W C"], width: int, height: int) -> UInt8[np.ndarray, "h w C"]:
+    """RGB as it is, RGBA with premultiplied alpha: straight colours under alpha 0 are arbitrary, mostly black, and would give
+    objects a dark rim."""
     if image.shape[:2] == (height, width):
         return image
-    return premultiplied(image, lambda x: cv2.resize(x, (width, height), interpolation=cv2.INTER_AREA))
+    if image.shape[2] == 3:
+        return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    large = image.astype(np.float32)
+    large[..., :3] *= large[..., 3:] / 255
+    rgba = np.asarray(cv2.resize(large, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    rgba[..., :3] /= np.maximum(rgba[..., 3:] / 255, 1e-6)
+    return np.rint(rgba).clip(0, 255).astype(np.uint8)
 
 
 def resize_views(views: Views, longest: int | None) -> Views:

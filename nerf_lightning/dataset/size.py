@@ -1,10 +1,12 @@
 """The size at which photos are trained on: what the budget, the device and the memory can use."""
 
+import itertools
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import torch
 
@@ -17,7 +19,7 @@ from nerf_lightning.utils.memory import free_memory
 
 log = logging.getLogger(__name__)
 
-AUTO = "auto"
+AUTO: Literal["auto"] = "auto"
 LONGEST_PX, CORE_SECONDS, GROWTH = 800, 360.0, 1 / 3
 """What 180 s on two cores can use, see `auto_resize`, and how the longest side grows with the work, which is an estimate."""
 MIN_LONGEST_PX = 800
@@ -65,7 +67,7 @@ def auto_resize(seconds: float | None, steps: int | None, device: torch.device, 
 
 
 def choose_resize(
-    source: object, sizes: Sequence[tuple[int, int]], channels: int, resize: int | AutoResize | None
+    source: object, sizes: Sequence[tuple[int, int]], channels: int, resize: int | str | AutoResize | None
 ) -> int | None:
     """The longest side that photos of these sizes are read at; None keeps them. Tells what was chosen.
 
@@ -76,15 +78,22 @@ def choose_resize(
         source: what the user named, for the message.
         sizes: widths and heights.
         channels: bytes a pixel.
-        resize: longest side, or what chooses it.
+        resize: longest side, or what chooses it; `auto` is for a training of 90 s on this process's threads.
+
+    Raises:
+        InputError: for a `resize` that is nothing of these.
     """
+    if resize == AUTO:
+        resize = auto_resize(None, None, CPU, torch.get_num_threads())
+    if isinstance(resize, str) or (isinstance(resize, int) and resize < 1):
+        raise InputError("config", "dataset.resize", repr(resize), "auto, null or the longest side in pixels")
     if not isinstance(resize, AutoResize):
         return resize
     width, height = max(sizes, key=max)
     largest = max(width, height)
     suited = divisor = max(1, round(largest / resize.longest))
-    room = MEMORY_SHARE * free_memory()
-    while divisor < largest and channels * _pixels(sizes, round(largest / divisor)) > room:
+    pixels = MEMORY_SHARE * free_memory() / channels
+    while divisor < largest and sum(math.prod(fit_size(*size, round(largest / divisor))) for size in sizes) > pixels:
         divisor += 1
     if divisor == 1:
         return None
@@ -96,34 +105,14 @@ def choose_resize(
     return longest
 
 
-def _pixels(sizes: Sequence[tuple[int, int]], longest: int) -> int:
-    return sum(width * height for width, height in (fit_size(*size, longest) for size in sizes))
-
-
-def parse_resize(resize: Any) -> int | AutoResize | None:
-    """An option `resize`; `auto` without a training is for one of 90 s on this process's threads.
-
-    Raises:
-        InputError: for what is neither a size, nor auto or None.
-    """
-    if resize == AUTO:
-        return auto_resize(None, None, CPU, torch.get_num_threads())
-    if not isinstance(resize, int | AutoResize | None):
-        raise InputError("config", "dataset.resize", repr(resize), "auto, null or the longest side in pixels")
-    return resize
-
-
 def find_reduced(photo: Path, size: tuple[int, int], upright: bool) -> Path:
     """The same photo in `images_8`, `images_4` or `images_2` beside its folder `images`, where that is large enough for `size`
     and has the same shape and channels; else the photo itself."""
     width, height, alpha = image_header(photo, upright)
-    for factor in REDUCED:
-        for folder in photo.parents[:MAX_DEPTH]:
-            if not folder.name:
-                continue
-            file = folder.with_name(f"{folder.name}_{factor}") / photo.relative_to(folder)
-            if not file.is_file():
-                continue
+    above = [folder for folder in photo.parents[:MAX_DEPTH] if folder.name]
+    for factor, folder in itertools.product(REDUCED, above):
+        file = folder.with_name(f"{folder.name}_{factor}") / photo.relative_to(folder)
+        if file.is_file():
             w, h, has_alpha = image_header(file, upright)
             if w >= size[0] and h >= size[1] and has_shape((w, h), (width, height)) and has_alpha == alpha:
                 return file

@@ -8,48 +8,20 @@ from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
+from nerf_lightning.utils.tensors import TensorDataclass
+
+BLOCK = 32
+"""Pixels whose known ones are counted together, to find one by its number."""
 
 
 @dataclass(frozen=True)
-class Runs:
-    """Stretches of known pixels, one after the other in `Views.pixels`; everything between them is masked."""
-
-    starts: Int[Tensor, "S"]
-    ends: Int[Tensor, "S"]
-    """How many known pixels there are up to the end of each."""
-
-    @classmethod
-    def of(cls, known: Bool[Tensor, "N"]) -> "Runs":
-        """The stretches of a mask."""
-        edge = torch.cat([known.new_zeros(1), known, known.new_zeros(1)]).to(torch.int8).diff()
-        starts, stops = ((edge == way).nonzero()[:, 0] for way in (1, -1))
-        return cls(starts, (stops - starts).cumsum(0))
-
-    def __len__(self) -> int:
-        """Known pixels."""
-        return int(self.ends[-1]) if len(self.ends) else 0
-
-    def find(self, number: Int[Tensor, "R"]) -> Int[Tensor, "R"]:
-        """Where the known pixels with these numbers lie."""
-        run = torch.searchsorted(self.ends, number, right=True)
-        return self.starts[run] + number - self.ends[run] + self.lengths[run]
-
-    @property
-    def lengths(self) -> Int[Tensor, "S"]:
-        return self.ends.diff(prepend=self.ends.new_zeros(1))
-
-    def to(self, device: torch.device) -> "Runs":
-        return Runs(self.starts.to(device), self.ends.to(device))
-
-
-@dataclass(frozen=True)
-class Views:
+class Views(TensorDataclass):
     """Photos of any sizes, and the cameras that took them."""
 
     pixels: UInt8[Tensor, "N C"]
     """sRGB, photo after photo, each row by row; C is 3, or 4 with straight (not premultiplied) alpha."""
     cameras: Cameras
-    known: Runs | None = None
+    known: Bool[Tensor, "N"] | None = None
     """Pixels that count; None for all of them."""
     names: tuple[str, ...] = ()
     """Of the photos' files; empty where they have none."""
@@ -71,8 +43,8 @@ class Views:
 
     @property
     def nbytes(self) -> int:
-        """Of the pictures."""
-        return self.pixels.nbytes
+        """Of the pictures and their masks."""
+        return self.pixels.nbytes + (0 if self.known is None else self.known.nbytes)
 
     @cached_property
     def starts(self) -> Int[Tensor, "V1"]:
@@ -112,12 +84,30 @@ class Views:
     @cached_property
     def mask(self) -> Bool[Tensor, "N"]:
         """Which pixels count."""
+        if self.known is not None:
+            return self.known
+        return torch.ones(len(self.pixels), dtype=torch.bool, device=self.pixels.device)
+
+    @cached_property
+    def _known_before(self) -> Int[Tensor, "B1"]:
+        """How many known pixels there are before each `BLOCK` of them, and in all."""
+        padded = torch.nn.functional.pad(self.mask, (0, -len(self.mask) % BLOCK))
+        counts = padded.view(-1, BLOCK).sum(1)
+        return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+
+    def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
+        """Places in `pixels`, drawn uniformly from those that count, with replacement."""
+        device = self.pixels.device
         if self.known is None:
-            return torch.ones(len(self.pixels), dtype=torch.bool, device=self.pixels.device)
-        edge = torch.zeros(len(self.pixels) + 1, dtype=torch.int8, device=self.pixels.device)
-        edge[self.known.starts] = 1
-        edge[self.known.starts + self.known.lengths] = -1
-        return edge[:-1].cumsum(0, dtype=torch.int8).bool()
+            return torch.randint(len(self.pixels), (count,), generator=generator, device=device)
+        before = self._known_before
+        number = torch.randint(int(before[-1]), (count,), generator=generator, device=device)
+        block = torch.searchsorted(before, number, right=True) - 1
+        places = block[:, None] * BLOCK + torch.arange(BLOCK, device=device)
+        found = (self.known[places.clamp_max(len(self.known) - 1)].cumsum(1) <= (number - before[block])[:, None]).sum(
+            1
+        )
+        return block * BLOCK + found
 
     def mask_of(self, view: int) -> Bool[Tensor, "H W"]:
         """Which pixels of a photo count."""
@@ -136,7 +126,7 @@ class Views:
             return values[parts[0]] if len(parts) == 1 else torch.cat([values[:0], *(values[part] for part in parts)])
 
         pixels = take(self.pixels)
-        known = None if self.known is None else Runs.of(take(self.mask))
+        known = None if self.known is None else take(self.known)
         names = tuple(self.names[view] for view in chosen) if self.names else ()
         exposures = tuple(self.exposures[view] for view in chosen) if self.exposures else ()
         return Views(pixels, self.cameras[index], known, names, exposures)
@@ -144,7 +134,3 @@ class Views:
     def spread(self, count: int) -> "Views":
         """At most `count` views, evenly spaced from the first to the last."""
         return self[torch.linspace(0, len(self) - 1, min(len(self), count)).round().long()]
-
-    def to(self, device: torch.device) -> "Views":
-        known = None if self.known is None else self.known.to(device)
-        return Views(self.pixels.to(device), self.cameras.to(device), known, self.names, self.exposures)

@@ -99,8 +99,6 @@ def optics(views: Views, view: int) -> dict[str, Any]:
     lens = Distortion(*lenses.coefficients[view].tolist())._asdict()
     if unknown := [name for name, value in lens.items() if value and name not in STATED[projection]]:
         expected = f"at most {', '.join(STATED[projection])}, as transforms.json knows"
-        raise InputError(
-            views.name(view), unknown[0], f"{lens[unknown[0]]:g}", expected, "train with dataset.undistort=true"
-        )
+        raise InputError(views.name(view), unknown[0], f"{lens[unknown[0]]:g}", expected)
     model = "OPENCV_FISHEYE" if projection == Projection.FISHEYE else "OPENCV"
     return {"camera_model": model, **found, **{name: lens[name] for name in STATED[projection]}}

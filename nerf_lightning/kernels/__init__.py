@@ -3,45 +3,24 @@
 The fast versions for CPUs are in `cpu/`; `use_kernels("reference")` (config key `kernels`) switches them all off.
 """
 
-from nerf_lightning.kernels.composite import (
-    composite,
-    keep_visible,
-    volume_weights,
-)
+from nerf_lightning.kernels.composite import composite, keep_visible, volume_weights
 from nerf_lightning.kernels.front_first import front_first
 from nerf_lightning.kernels.harmonics import spherical_harmonics
 from nerf_lightning.kernels.hashgrid import hash_interpolate
-from nerf_lightning.kernels.march import (
-    cell_index,
-    march,
-    mark_cells,
-    pack_intervals,
-    points,
-)
+from nerf_lightning.kernels.march import cell_index, march, mark_cells, pack_intervals, points
 from nerf_lightning.kernels.merge import merge_faint
 from nerf_lightning.kernels.mlp import mlp, mlp_heads
-from nerf_lightning.kernels.planes import (
-    plane_line_products,
-    plane_line_sum,
-    plane_line_sum_and_products,
-)
+from nerf_lightning.kernels.planes import plane_line_products, plane_line_sum, plane_line_sum_and_products
 from nerf_lightning.kernels.proposals import along, inverse_cdf, resample
-from nerf_lightning.kernels.switch import fast, use_kernels
-from nerf_lightning.kernels.voxels import (
-    interpolate_rows,
-    locate,
-    mark_rows,
-    read_voxels,
-    roughness,
-    voxel_value,
-)
+from nerf_lightning.kernels.switch import has_fast, use_kernels
+from nerf_lightning.kernels.voxels import interpolate_rows, locate, mark_rows, read_voxels, roughness, voxel_value
 
 __all__ = [
     "along",
     "cell_index",
     "composite",
-    "fast",
     "front_first",
+    "has_fast",
     "hash_interpolate",
     "interpolate_rows",
     "inverse_cdf",

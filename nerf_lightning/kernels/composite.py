@@ -2,14 +2,14 @@
 
 import math
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.kernels.march import Packed, counted, within
+from nerf_lightning.kernels import cpu
+from nerf_lightning.kernels.march import Packed, offsets_from_counts, within
 from nerf_lightning.kernels.sums import before
-from nerf_lightning.kernels.switch import fast
+from nerf_lightning.kernels.switch import has_fast
 
 Pixels = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
 """Colour, opacity and depth summed along each ray, each sample by its weight."""
@@ -51,24 +51,16 @@ def composite_reference(density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, ray
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, offsets: Tensor) -> Pixels:
-        from nerf_lightning.kernels.cpu import composite, workers
-
-        rays = len(offsets) - 1
-        density, rgb = density.contiguous(), rgb.T.contiguous()
+        rays, density, rgb = len(offsets) - 1, density.contiguous(), rgb.T.contiguous()
         colour, opacity, depth, before = torch.empty(3, rays), torch.empty(rays), torch.empty(rays), torch.empty(len(t))
-        given = [x.detach().numpy() for x in (density, rgb, t, dt, offsets)]
-        composite.forward(*given, colour.numpy(), opacity.numpy(), depth.numpy(), before.numpy(), workers())
+        cpu.composite.forward(density, rgb, t, dt, offsets, colour, opacity, depth, before)
         ctx.save_for_backward(density, rgb, t, dt, offsets, before)
         return colour.T, opacity, depth
 
     @staticmethod
     def backward(ctx, colour: Tensor, opacity: Tensor, depth: Tensor) -> tuple[Tensor | None, ...]:
-        from nerf_lightning.kernels.cpu import composite, workers
-
-        saved = [x.numpy() for x in ctx.saved_tensors]
-        above = colour.T.contiguous().numpy(), opacity.contiguous().numpy(), depth.contiguous().numpy()
-        density, rgb = torch.empty(saved[0].shape), torch.empty(saved[1].shape)
-        composite.backward(*saved, *above, density.numpy(), rgb.numpy(), workers())
+        density, rgb = (torch.empty_like(x) for x in ctx.saved_tensors[:2])
+        cpu.composite.backward(*ctx.saved_tensors, colour.T, opacity, depth, density, rgb)
         return density, rgb.T, None, None, None
 
 
@@ -90,7 +82,7 @@ def composite(
     Returns:
         Colour without background, opacity in [0, 1], and the sum of distances (not divided by opacity).
     """
-    if fast(density, rgb, t, dt) and not (t.requires_grad or dt.requires_grad):
+    if has_fast(density, rgb, constants=(t, dt)):
         return _Composite.apply(density, rgb, t, dt, offsets)
     return composite_reference(density, rgb, t, dt, ray, offsets)
 
@@ -112,7 +104,7 @@ def keep_visible_reference(
     keep = ~((before(thickness, ray, offsets) > -math.log(early_stop_eps)) | nothing)
     if room is not None:  # drops what an earlier call repeated to fill its room
         keep = keep & (dt > 0)
-    counts = counted(keep)
+    counts = offsets_from_counts(keep)
     if room is None:
         index, kept = keep.nonzero()[:, 0], counts.index_select(0, offsets)
         found, t, dt, ray = (x.index_select(0, index) for x in (thickness, t, dt, ray))
@@ -142,15 +134,11 @@ def keep_visible(
         dropped: optical thickness that a ray's samples below `min_thickness` may have together; the later ones stay.
     """
     t, dt, ray, offsets = packed
-    if room is not None or not fast(thickness, t, dt) or t.requires_grad or dt.requires_grad:
+    if room is not None or not has_fast(thickness, constants=(t, dt)):
         return keep_visible_reference(thickness, packed, early_stop_eps, min_thickness, room, dropped)
-    from nerf_lightning.kernels.cpu import composite, workers
-
-    threads, keep, counts = workers(), np.empty(len(t), np.bool_), np.empty(len(offsets) - 1, np.int64)
-    given, ends = [x.detach().contiguous().numpy() for x in (thickness, t, dt)], offsets.numpy()
-    composite.visible(given[0], ends, early_stop_eps, float(min_thickness), dropped, keep, counts, threads)
-    kept = torch.zeros_like(offsets)
-    np.cumsum(counts, out=kept.numpy()[1:])
-    out = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
-    composite.gather(keep, ends, kept.numpy(), *given, *(x.numpy() for x in out), threads)
-    return out[0][0], (out[0][1], out[0][2], out[1], kept)
+    keep, counts = torch.empty(len(t), dtype=torch.bool), torch.empty(len(offsets) - 1, dtype=torch.int64)
+    cpu.composite.visible(thickness, offsets, early_stop_eps, float(min_thickness), dropped, keep, counts)
+    kept = offsets_from_counts(counts)
+    out, rays = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
+    cpu.composite.gather(keep, offsets, kept, thickness, t, dt, out, rays)
+    return out[0], (out[1], out[2], rays, kept)

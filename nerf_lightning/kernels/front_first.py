@@ -3,13 +3,14 @@
 import math
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels.march import Packed, Walk, march, walks
+from nerf_lightning.kernels import cpu
+from nerf_lightning.kernels.march import Packed, Walk, march, offsets_from_counts
+from nerf_lightning.kernels.switch import has_fast
 
 FIRST = 4
 """Steps of each ray that are asked for at first; then four times as many each time."""
@@ -37,26 +38,23 @@ def front_first(
         early_stop_eps: early-stop transmittance, above 0: below it a ray has ended.
     """
     given = rays, bounds, near, far, shift, occupied, samples, step
-    if room is not None or not walks(rays, near, far, shift):
+    if room is not None or not has_fast(constants=(rays.origins, rays.directions, near, far, shift)):
         packed = march(*given, room, most)
         return thickness(packed), packed
-    from nerf_lightning.kernels.cpu import composite, workers
-
     walk, furthest, many = Walk(*given), -math.log(early_stop_eps), FIRST
-    going, optical, counts = torch.arange(len(rays)), np.zeros(len(rays)), np.zeros(len(rays), np.int64)
-    parts = []
+    going, counts = torch.arange(len(rays)), torch.zeros(len(rays), dtype=torch.int64)
+    optical, parts = torch.zeros(len(rays), dtype=torch.float64), []
     while len(going):
         packed = walk.on(going, many)
-        t, dt, _, ends = (x.numpy() for x in packed)
-        found, which, on = thickness(packed).numpy(), going.numpy(), np.empty(len(going), np.bool_)
-        composite.absorb(found, ends, which, furthest, many, optical, on, workers())
-        counts[which] += np.diff(ends)
-        parts.append((which, ends, found, t, dt))
-        going, many = going[torch.from_numpy(on)], 4 * many
-    offsets = torch.zeros(len(rays) + 1, dtype=torch.int64)
-    np.cumsum(counts, out=offsets.numpy()[1:])
-    total, at = int(offsets[-1]), offsets.numpy()[:-1].copy()
+        t, dt, _, ends = packed
+        found, on = thickness(packed), torch.empty(len(going), dtype=torch.bool)
+        cpu.composite.absorb(found, ends, going, furthest, many, optical, on)
+        counts[going] += ends.diff()
+        parts.append((going, ends, found, t, dt))
+        going, many = going[on], 4 * many
+    offsets = offsets_from_counts(counts)
+    total, at = int(offsets[-1]), offsets[:-1].clone()
     out = torch.empty(total), torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
     for part in parts:
-        composite.append(*part, at, *(x.numpy() for x in out), workers())
+        cpu.composite.append(*part, at, *out)
     return out[0], (*out[1:], offsets)

@@ -4,8 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.constants import constant
-from nerf_lightning.kernels.switch import fast
+from nerf_lightning.kernels.switch import has_fast
 
 # Products of coordinates that the harmonics are made of: of two coordinates, then of three.
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
@@ -42,15 +43,15 @@ CONSTANTS = {0: 0.28209479177387814, 6: -0.31539156525252005}
 @constant
 def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, list[Tensor]]:
     """Factors of all powers, constants, and which coordinates and pairs are multiplied."""
-    factors, constants = (torch.zeros(*shape, len(TERMS), dtype=torch.float64) for shape in ((9 + len(TRIPLES),), ()))
-    for function, powers in enumerate(TERMS):
-        for power, factor in powers.items():
-            factors[power, function] = factor
-    for function, value in CONSTANTS.items():
-        constants[function] = value
+    factors = [[terms.get(power, 0.0) for terms in TERMS] for power in range(9 + len(TRIPLES))]
+    constants = [CONSTANTS.get(function, 0.0) for function in range(len(TERMS))]
     firsts, seconds, pairs, axes = (list(column) for both in (PAIRS, TRIPLES) for column in zip(*both, strict=True))
     columns = [torch.tensor(column, device=device) for column in (firsts + seconds + axes, pairs)]
-    return factors.to(dtype).to(device), constants.to(dtype).to(device), columns
+    return (
+        torch.tensor(factors, dtype=dtype, device=device),
+        torch.tensor(constants, dtype=dtype, device=device),
+        columns,
+    )
 
 
 def spherical_harmonics_reference(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:
@@ -64,10 +65,8 @@ def spherical_harmonics_reference(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 1
 
 def spherical_harmonics(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:
     """Real spherical harmonics of degrees 0 to 3 at unit directions (orthonormal; Sloan 2013, appendix A2)."""
-    if not fast(d) or d.requires_grad:
+    if not has_fast(constants=(d,)):
         return spherical_harmonics_reference(d)
-    from nerf_lightning.kernels.cpu import harmonics, workers
-
     out = torch.empty(16, len(d))
-    harmonics.evaluate(d.contiguous().numpy(), out.numpy(), workers())
+    cpu.harmonics.evaluate(d, out)
     return out.T

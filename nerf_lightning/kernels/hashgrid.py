@@ -11,8 +11,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.constants import constant
-from nerf_lightning.kernels.switch import fast
+from nerf_lightning.kernels.switch import has_fast
 
 # Instant-NGP, eq. 4: pi_1 = 1, pi_2 = 2654435761, pi_3 = 805459861; the second as the int32 it wraps to.
 PRIMES = (1, 2654435761 - 2**32, 805459861)
@@ -135,33 +136,27 @@ def hash_interpolate_reference(
 class _HashInterpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx, tables: Tensor, unit: Tensor, resolutions: Sequence[Cells], sizes: Sequence[int]) -> Tensor:
-        from nerf_lightning.kernels.cpu import hashgrid, workers
-
         places = unit.T.contiguous()
         cells = np.array(resolutions, np.int32).reshape(len(sizes), len(places))
-        # Only what the places' gradient reads, where that is asked for.
-        ctx.save_for_backward(places, *((tables,) if ctx.needs_input_grad[1] else ()))
-        ctx.levels, ctx.shape = (cells, np.array(sizes, np.int64)), tuple(tables.shape)
+        ctx.save_for_backward(tables, places)
+        ctx.levels = cells, np.array(sizes, np.int64)
         ctx.widths = (0,) * len(places), (0,) * tables.shape[1]
         out = torch.empty(len(sizes) * tables.shape[1], len(unit))
-        hashgrid.interpolate(tables.detach().numpy(), places.numpy(), *ctx.levels, out.numpy(), *ctx.widths, workers())
+        cpu.hashgrid.interpolate(tables, places, *ctx.levels, out, *ctx.widths)
         return out.T
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
-        from nerf_lightning.kernels.cpu import hashgrid, workers
-
-        places, *read = ctx.saved_tensors
-        tables, above, moved = None, grad.T.contiguous().numpy(), None
+        tables, places = ctx.saved_tensors
+        learned, above, moved = None, grad.T.contiguous(), None
         if ctx.needs_input_grad[0]:
-            tables = torch.empty(ctx.shape)
-            hashgrid.scatter(tables.numpy(), places.numpy(), *ctx.levels, above, *ctx.widths, workers())
-        if read:
+            learned = torch.empty(tables.shape)
+            cpu.hashgrid.scatter(learned, places, *ctx.levels, above, *ctx.widths)
+        if ctx.needs_input_grad[1]:
             moved = torch.empty_like(places)
-            given = read[0].numpy(), places.numpy(), *ctx.levels, above, moved.numpy()
-            hashgrid.slope(*given, *ctx.widths, workers())
+            cpu.hashgrid.slope(tables, places, *ctx.levels, above, moved, *ctx.widths)
             moved = moved.T
-        return tables, moved, None, None
+        return learned, moved, None, None
 
 
 def hash_interpolate(
@@ -175,6 +170,6 @@ def hash_interpolate(
         resolutions: each level's cells along every axis.
         sizes: entries of each level's table: all corners of its grid, or a power of two to hash into.
     """
-    if fast(tables, unit):
+    if has_fast(tables, unit):
         return _HashInterpolate.apply(tables, unit, resolutions, sizes)
     return hash_interpolate_reference(tables, unit, resolutions, sizes)

@@ -1,13 +1,16 @@
 """Where rays cross the occupied cells of a grid over the bounds."""
 
+import functools
+
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.constants import constant
-from nerf_lightning.kernels.switch import fast
+from nerf_lightning.kernels.switch import has_fast
 
 MOST = 1 << 20
 """Intervals that the reference tests at a time, unless told otherwise."""
@@ -26,9 +29,9 @@ def cell_index(
     return torch.add(z, torch.add(y, x, alpha=resolution), alpha=resolution)
 
 
-def counted(mask: Bool[Tensor, "M"]) -> Int[Tensor, "M_plus_1"]:
-    """How many entries are true before each one, and in total."""
-    return torch.cat([_nothing(mask.device), mask.cumsum(0)])
+def offsets_from_counts(counts: Shaped[Tensor, "M"]) -> Int[Tensor, "M_plus_1"]:
+    """The sum of the counts before each one, and of all: of a mask, how many entries are true."""
+    return torch.cat([_nothing(counts.device), counts.cumsum(0)])
 
 
 @constant
@@ -43,9 +46,9 @@ def _numbers(bits: int, device: torch.device) -> Int[Tensor, "numbers"]:
 
 
 def within(room: int, counts: Int[Tensor, "M_plus_1"]) -> tuple[Int[Tensor, "room"], Bool[Tensor, "room"]]:
-    """Indices of the first `room` true entries, given `counted`, and which are real: the host need not wait for a count.
+    """Indices of the first `room` true entries, and which are real: the host need not wait for a count.
 
-    Where fewer than `room` are true, the last one is repeated.
+    Where fewer than `room` are true, the last one is repeated. `counts`: `offsets_from_counts` of the entries.
     """
     order, total = _numbers(room.bit_length(), counts.device)[:room], counts[-1:]
     return torch.searchsorted(counts[1:], torch.minimum(order, total)), order <= total
@@ -56,10 +59,9 @@ def _pack(
 ) -> Packed:
     steps, flat = keep.shape[1], keep.flatten()
     if room is None:
-        chosen, each = flat.nonzero()[:, 0], keep.sum(1)
-        offsets = torch.cat([each.new_zeros(1), each.cumsum(0)])
+        chosen, offsets = flat.nonzero()[:, 0], offsets_from_counts(keep.sum(1))
         return t.flatten().index_select(0, chosen), dt.flatten().index_select(0, chosen), chosen // steps, offsets
-    counts = counted(flat)
+    counts = offsets_from_counts(flat)
     chosen, there = within(room, counts)
     length = dt.flatten().index_select(0, chosen) * there
     return t.flatten().index_select(0, chosen), length, chosen // steps, counts[::steps]
@@ -119,15 +121,9 @@ def march(
             last interval is repeated with length 0; if more, rays whose `offsets` end beyond `room` lack some.
         most: intervals that the reference tests at a time, which bounds its memory.
     """
-    if room is not None or not walks(rays, near, far, shift):
+    if room is not None or not has_fast(constants=(rays.origins, rays.directions, near, far, shift)):
         return march_reference(rays, bounds, near, far, shift, occupied, samples, step, room, most)
     return Walk(rays, bounds, near, far, shift, occupied, samples, step).on(torch.arange(len(rays)), samples + 1)
-
-
-def walks(rays: Rays, *ends: Tensor) -> bool:
-    """Whether there is a fast version for these rays and what is said of each."""
-    given = (rays.origins, rays.directions, *ends)
-    return fast(rays.origins, *ends) and not any(x.requires_grad for x in given)
 
 
 class Walk:
@@ -144,42 +140,32 @@ class Walk:
         samples: int,
         step: float,
     ):
-        from nerf_lightning.kernels.cpu import march, workers
-
         resolution = round(len(occupied) ** (1 / 3))
-        threads = workers()
+        cells, held = resolution, occupied
         if resolution % BLOCK == 0:
             cells = resolution // BLOCK
-            blocks = np.empty(cells**3, np.uint8)
-            march.coarsen(occupied.numpy().view(np.uint32), resolution, BLOCK, blocks, threads)
-        else:
-            cells, blocks = resolution, np.where(occupied.numpy(), 0, march.FAR).astype(np.uint8)
+            # A block's four cells in a row as one number.
+            rows = occupied.view(torch.int32).view(cells, BLOCK, cells, BLOCK, cells)
+            held = functools.reduce(torch.bitwise_or, [row for part in rows.unbind(1) for row in part.unbind(2)])
+        blocks = cpu.march.FAR * (held == 0).to(torch.uint8).flatten()
         if not bounds.unbounded:
-            cube = blocks.reshape((cells,) * 3)
-            march.clear(cube, np.empty_like(cube), threads)
+            cpu.march.clear(blocks.view(cells, cells, cells))
         inside = bounds.inside(rays) if bounds.unbounded else torch.empty(0, 2)
-        lines = (rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy())
-        self.ends = tuple(x.contiguous().numpy() for x in (near, far, inside, shift))
-        self.shape = bounds.half_size.numpy(), bounds.unbounded
+        self.ends, self.shape = (near, far, inside, shift), (bounds.half_size, bounds.unbounded)
         self.steps = samples, np.float32(step)
-        grid = occupied.numpy(), resolution, blocks, cells
-        self.given = *lines, *self.ends, *grid, bounds.centre.numpy(), *self.shape, *self.steps
-        self.after = np.zeros(len(rays), np.int32)
+        grid = occupied, resolution, blocks, cells
+        self.given = rays.origins, rays.directions, *self.ends, *grid, bounds.centre, *self.shape, *self.steps
+        self.after = torch.zeros(len(rays), dtype=torch.int32)
         """The interval at which each ray goes on."""
 
     def on(self, which: Int[Tensor, "A"], most: int) -> Packed:
         """The next intervals of some rays, at most so many of each; `offsets` counts these rays alone."""
-        from nerf_lightning.kernels.cpu import march, workers
-
-        threads, some, count = workers(), which.numpy(), len(which)
-        found, counts = np.empty((count, most), np.int32), np.empty(count, np.int64)
-        march.walk(some, *self.given, most, self.after, found, counts, threads)
-        offsets = torch.zeros(count + 1, dtype=torch.int64)
-        np.cumsum(counts, out=offsets.numpy()[1:])
+        found, counts = torch.empty(len(which), most, dtype=torch.int32), torch.empty_like(which)
+        cpu.march.walk(which, *self.given, most, self.after, found, counts)
+        offsets = offsets_from_counts(counts)
         total = int(offsets[-1])
         t, dt, ray = torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
-        out = t.numpy(), dt.numpy(), ray.numpy()
-        march.pack(some, *self.ends, *self.shape, *self.steps, found, offsets.numpy(), *out, threads)
+        cpu.march.pack(which, *self.ends, *self.shape, *self.steps, found, offsets, t, dt, ray)
         return t, dt, ray, offsets
 
 
@@ -191,11 +177,8 @@ def points_reference(origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor
 class _Points(torch.autograd.Function):
     @staticmethod
     def forward(ctx, origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor) -> Tensor:
-        from nerf_lightning.kernels.cpu import march, workers
-
         out = torch.empty(3, len(t))
-        arrays = (x.detach().contiguous().numpy() for x in (origins, directions, ray, t))
-        march.points(*arrays, out.numpy(), workers())
+        cpu.march.points(origins, directions, ray, t, out)
         ctx.save_for_backward(ray, t)
         ctx.rays = len(origins)
         return out.T
@@ -211,22 +194,15 @@ def points(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
 ) -> Float[Tensor, "N 3"]:
     """Positions at distances `t` along rays; `ray` holds each position's ray."""
-    if not fast(origins, directions, t) or t.requires_grad:
+    if not has_fast(origins, directions, constants=(t,)):
         return points_reference(origins, directions, ray, t)
     return _Points.apply(origins, directions, ray, t)
 
 
-def mark_cells_reference(marks: Tensor, mark: int, bounds: Bounds, positions: Tensor) -> None:
-    """`mark_cells` in plain PyTorch, for every device."""
-    marks.index_fill_(0, cell_index(bounds.to_unit(positions), round(len(marks) ** (1 / 3))), mark)
-
-
 def mark_cells(marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions: Float[Tensor, "N 3"]) -> None:
     """Writes `mark` into each cell of a cubic grid over the bounds that holds any of the positions (world units)."""
-    if not fast(positions):
-        return mark_cells_reference(marks, mark, bounds, positions)
-    from nerf_lightning.kernels.cpu import march, workers
-
-    box = bounds.centre.numpy(), bounds.half_size.numpy(), bounds.unbounded
-    places = positions.detach().T.contiguous().numpy()
-    march.mark(places, *box, marks.numpy(), round(len(marks) ** (1 / 3)), mark, workers())
+    resolution = round(len(marks) ** (1 / 3))
+    if has_fast(positions):
+        cpu.march.mark(positions.T, bounds.centre, bounds.half_size, bounds.unbounded, marks, resolution, mark)
+    else:
+        marks.index_fill_(0, cell_index(bounds.to_unit(positions), resolution), mark)

@@ -1,13 +1,13 @@
 """Fewer samples along rays: one that hardly counts and the one beside it become one."""
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.composite import Kept, volume_weights
-from nerf_lightning.kernels.march import Packed, counted
-from nerf_lightning.kernels.switch import fast
+from nerf_lightning.kernels.march import Packed, offsets_from_counts
+from nerf_lightning.kernels.switch import has_fast
 
 APART = 0.625
 """Distance between the midpoints of neighbours, as a share of their lengths together: 0.5 if they touch, and 0.75 at least with
@@ -26,7 +26,7 @@ def merge_faint_reference(thickness: Tensor, packed: Packed, faint: float) -> Ke
     place = torch.arange(len(ray), device=ray.device)
     chain = torch.where(could, 0, place).cummax(0).values if len(ray) else place
     joins = could & ((place - chain) % 2 == 1)
-    index, kept = (~joins).nonzero()[:, 0], counted(~joins).index_select(0, offsets)
+    index, kept = (~joins).nonzero()[:, 0], offsets_from_counts(~joins).index_select(0, offsets)
 
     def kept_of(own: Tensor, added: Tensor) -> Tensor:
         """Of those that remain, with what the next one adds where that joins."""
@@ -50,15 +50,11 @@ def merge_faint(thickness: Float[Tensor, "N"], packed: Packed, faint: float) -> 
         faint: weight, see `volume_weights`.
     """
     t, dt, _, offsets = packed
-    if not fast(thickness, t, dt) or any(x.requires_grad for x in (thickness, t, dt)):
+    if not has_fast(constants=(thickness, t, dt)):
         return merge_faint_reference(thickness, packed, faint)
-    from nerf_lightning.kernels.cpu import merge, workers
-
-    given, ends, threads = [x.contiguous().numpy() for x in (thickness, t, dt)], offsets.numpy(), workers()
-    share, counts = np.empty(len(t), np.float32), np.empty(len(offsets) - 1, np.int64)
-    merge.pair(*given, ends, faint, APART, share, counts, threads)
-    kept = torch.zeros_like(offsets)
-    np.cumsum(counts, out=kept.numpy()[1:])
-    out = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
-    merge.join(share, ends, kept.numpy(), *given, *(x.numpy() for x in out), threads)
-    return out[0][0], (out[0][1], out[0][2], out[1], kept)
+    share, counts = torch.empty(len(t)), torch.empty(len(offsets) - 1, dtype=torch.int64)
+    cpu.merge.pair(thickness, t, dt, offsets, faint, APART, share, counts)
+    kept = offsets_from_counts(counts)
+    out, rays = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
+    cpu.merge.join(share, offsets, kept, thickness, t, dt, out, rays)
+    return out[0], (out[1], out[2], rays, kept)

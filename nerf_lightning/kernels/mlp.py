@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import linear
 
-from nerf_lightning.kernels.switch import fast
+from nerf_lightning.kernels import cpu
+from nerf_lightning.kernels.switch import has_fast
 
 Layers = Sequence[tuple[Float[Tensor, "_ _"], Float[Tensor, "_"]]]
 """Matrix [outputs, inputs] and bias [outputs] of each layer."""
@@ -40,8 +41,6 @@ def _blocks(shapes: list[tuple[int, int]], row: np.ndarray) -> list[tuple[np.nda
 class _MLP(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: Tensor, extra: Tensor, first: int, *flat: Tensor) -> tuple[Tensor, Tensor]:
-        from nerf_lightning.kernels.cpu import mlp, workers
-
         shapes = [(len(matrix), matrix.shape[1]) for matrix in flat[::2]]
         widths = np.array([_padded(n) for n in (shapes[0][1], *(outputs for outputs, _ in shapes))])
         row = np.zeros((widths[1:] * (widths[:-1] + 1)).sum(), np.float32)
@@ -49,21 +48,17 @@ class _MLP(torch.autograd.Function):
             block[0][:], block[1][:] = matrix.detach().numpy(), bias.detach().numpy()
         x, extra = x.T.contiguous(), extra.T.contiguous()
         out = torch.empty(shapes[-1][0], x.shape[1])
-        mlp.forward(row, widths, x.numpy(), extra.numpy(), out.numpy(), workers())
+        cpu.mlp.forward(row, widths, x, extra, out)
         ctx.save_for_backward(x, extra)
         ctx.network = shapes, widths, row
         return out[:first].T, out[first:].T
 
     @staticmethod
     def backward(ctx, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        from nerf_lightning.kernels.cpu import mlp, workers
-
         x, extra = ctx.saved_tensors
         shapes, widths, row = ctx.network
-        grad_x, threads = torch.empty_like(x), workers()
-        sums = np.empty((threads, len(row)), np.float32)
-        above = torch.cat([grad.T for grad in grads]).numpy()
-        mlp.backward(row, widths, x.numpy(), extra.numpy(), above, grad_x.numpy(), sums, threads)
+        grad_x, sums = torch.empty_like(x), np.empty((cpu.compile.workers(), len(row)), np.float32)
+        cpu.mlp.backward(row, widths, x, extra, torch.cat([grad.T for grad in grads]), grad_x, sums)
         return grad_x.T, None, None, *(torch.tensor(part) for block in _blocks(shapes, sums.sum(0)) for part in block)
 
 
@@ -72,7 +67,7 @@ def mlp_heads(
 ) -> tuple[Float[Tensor, "N first"], Float[Tensor, "N rest"]]:
     """Like `mlp`, with the first outputs returned apart from the others, which saves splitting them."""
     parameters = [parameter for layer in layers for parameter in layer]
-    if not fast(x, *parameters, *(() if extra is None else (extra,))):
+    if not has_fast(x, *parameters, *(() if extra is None else (extra,))):
         out = mlp_reference(x, layers, None if extra is None else extra.detach())
         head, rest = out.split([first, out.shape[1] - first], dim=1)
         return head, rest

@@ -7,8 +7,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.constants import constant
-from nerf_lightning.kernels.switch import fast
+from nerf_lightning.kernels.switch import has_fast
 
 PLANE_AXES = ((1, 2), (0, 2), (0, 1))
 """Axes of each mode's plane; its line runs along the remaining axis: 0, 1, 2."""
@@ -76,15 +77,8 @@ def _products(planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], a
     return (corners * at.plane_shares).sum(0) * (ends * at.line_shares).sum(0)
 
 
-def plane_line_products_reference(
-    planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N threeC"]:
-    """`plane_line_products` in plain PyTorch, for every device and differentiable in the positions too."""
-    return _each((planes, lines), unit=unit)[0].flatten(1)
-
-
-def _each(*volumes: tuple[Tensor, Tensor], unit: Float[Tensor, "N 3"]) -> list[Tensor]:
-    """Products of each of some planes and lines of one size, mode by mode, N 3 C."""
+def _reference(*volumes: tuple[Tensor, Tensor], unit: Float[Tensor, "N 3"]) -> list[Tensor]:
+    """Products of each of some planes and lines of one size, mode by mode, N 3 C, in plain PyTorch for every device."""
     if unit.device.type == "cuda":
         return [sampled_products(*volume, unit) for volume in volumes]
     at = footprint(unit, volumes[0][1].shape[1])
@@ -100,34 +94,26 @@ def _block(channels: int) -> tuple[int, ...]:
 class _PlaneLine(torch.autograd.Function):
     @staticmethod
     def forward(ctx, planes: Tensor, lines: Tensor, unit: Tensor, summed: bool) -> Tensor:
-        from nerf_lightning.kernels.cpu import planes as cpu
-        from nerf_lightning.kernels.cpu import workers
-
         planes, lines, places, channels = planes.contiguous(), lines.contiguous(), unit.T.contiguous(), lines.shape[2]
         out = torch.empty(1 if summed else 3 * channels, len(unit))
-        given = planes.detach().flatten(1, 2).numpy(), lines.detach().numpy(), places.numpy()
-        lanes = (0,) * channels
+        given, lanes = (planes.flatten(1, 2), lines, places, out), (0,) * channels
         if summed:
-            cpu.sums(*given, out.numpy(), lanes, workers())
+            cpu.planes.sums(*given, lanes)
         else:
-            cpu.products(*given, out.numpy(), lanes, _block(channels), workers())
+            cpu.planes.products(*given, lanes, _block(channels))
         ctx.save_for_backward(planes, lines, places)
         return out.T
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor | None, None]:
-        from nerf_lightning.kernels.cpu import planes as cpu
-        from nerf_lightning.kernels.cpu import workers
-
         planes, lines, places = ctx.saved_tensors
         grad_planes, grad_lines = torch.zeros_like(planes), torch.zeros_like(lines)
-        given = planes.flatten(1, 2).numpy(), lines.numpy(), places.numpy(), grad.T.contiguous().numpy()
-        block = _block(lines.shape[2])
-        cpu.scatter(*given, grad_planes.flatten(1, 2).numpy(), grad_lines.numpy(), block, 2 * block, workers())
+        given, block = (planes.flatten(1, 2), lines, places, grad.T.contiguous()), _block(lines.shape[2])
+        cpu.planes.scatter(*given, grad_planes.flatten(1, 2), grad_lines, block, 2 * block)
         moved = None
         if ctx.needs_input_grad[2]:
             moved = torch.empty_like(places)
-            cpu.slope(*given, moved.numpy(), (0,) * lines.shape[2], block, workers())
+            cpu.planes.slope(*given, moved, (0,) * lines.shape[2], block)
             moved = moved.T
         return grad_planes, grad_lines, moved, None
 
@@ -142,18 +128,18 @@ def plane_line_products(
         lines: along the axes 0, 1 and 2.
         unit: positions in [0, 1]^3; outside they are clamped.
     """
-    if fast(planes, lines, unit):
+    if has_fast(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, False)
-    return plane_line_products_reference(planes, lines, unit)
+    return _reference((planes, lines), unit=unit)[0].flatten(1)
 
 
 def plane_line_sum(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N"]:
     """The sum of what `plane_line_products` gives at each position."""
-    if fast(planes, lines, unit):
+    if has_fast(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, True)[:, 0]
-    return _each((planes, lines), unit=unit)[0].sum((1, 2))
+    return _reference((planes, lines), unit=unit)[0].sum((1, 2))
 
 
 def plane_line_sum_and_products(
@@ -162,7 +148,7 @@ def plane_line_sum_and_products(
     unit: Float[Tensor, "N 3"],
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N threeB"]]:
     """`plane_line_sum` of some planes and lines, and `plane_line_products` of others of the same size."""
-    if fast(*summed, unit) and fast(*apart, unit):
+    if has_fast(*summed, unit) and has_fast(*apart, unit):
         return plane_line_sum(*summed, unit), plane_line_products(*apart, unit)
-    total, products = _each(summed, apart, unit=unit)
+    total, products = _reference(summed, apart, unit=unit)
     return total.sum((1, 2)), products.flatten(1)

@@ -6,7 +6,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels.switch import fast
+from nerf_lightning.kernels import cpu
+from nerf_lightning.kernels.switch import has_fast
 
 FLOOR = 1e-5
 """Added to all weights: rays without any are divided evenly."""
@@ -33,17 +34,13 @@ def along(
         near, far: distances along each ray.
         s: where the intervals begin and end, in [0, 1], see `Bounds.distances`.
     """
-    given = (rays.origins, rays.directions, near, far, s)
-    if not fast(*given) or any(x.requires_grad for x in given):
+    if not has_fast(constants=(rays.origins, rays.directions, near, far, s)):
         return along_reference(rays, bounds, near, far, s)
-    from nerf_lightning.kernels.cpu import proposals, workers
-
     count, steps = len(s), s.shape[1] - 1
     inside = bounds.inside(rays) if bounds.unbounded else torch.empty(0, 2)
     unit, t, dt = torch.empty(3, count * steps), torch.empty(count, steps), torch.empty(count, steps)
-    arrays = (x.contiguous().numpy() for x in (rays.origins, rays.directions, near, far, inside, s))
-    box = bounds.centre.numpy(), bounds.half_size.numpy(), bounds.unbounded
-    proposals.along(*arrays, *box, unit.numpy(), t.numpy(), dt.numpy(), workers())
+    box = bounds.centre, bounds.half_size, bounds.unbounded
+    cpu.proposals.along(rays.origins, rays.directions, near, far, inside, s, *box, unit, t, dt)
     return unit.T, t, dt
 
 
@@ -61,12 +58,6 @@ def inverse_cdf(
     return start + share * (end - start)
 
 
-def resample_reference(s: Tensor, share: Tensor, shift: Tensor, count: int) -> Tensor:
-    """`resample` in plain PyTorch, for every device."""
-    u = (torch.arange(count + 1, device=s.device) + shift[:, None]) / count
-    return inverse_cdf(s, share, u.clamp(0, 1))
-
-
 def resample(
     s: Float[Tensor, "R S_plus_1"], share: Float[Tensor, "R S"], shift: Float[Tensor, "R"], count: int
 ) -> Float[Tensor, "R K_plus_1"]:
@@ -77,11 +68,9 @@ def resample(
         share: of each old interval; about 1 in total.
         shift: of each ray's edges, in shares of a new interval.
     """
-    if not fast(s, share, shift):
-        return resample_reference(s, share, shift, count)
-    from nerf_lightning.kernels.cpu import proposals, workers
-
+    if not has_fast(s, share, shift):
+        u = (torch.arange(count + 1, device=s.device) + shift[:, None]) / count
+        return inverse_cdf(s, share, u.clamp(0, 1))
     out = torch.empty(len(s), count + 1)
-    arrays = (x.detach().contiguous().numpy() for x in (s, share, shift))
-    proposals.resample(*arrays, np.float32(FLOOR), out.numpy(), workers())
+    cpu.proposals.resample(s, share, shift, np.float32(FLOOR), out)
     return out

@@ -25,9 +25,12 @@ def chosen_kernels() -> str:
     return "auto" if _allowed else "reference"
 
 
-def fast(*tensors: Tensor) -> bool:
-    """Whether the fast version applies: it is allowed, and all floating tensors are single precision on a CPU."""
-    return _allowed and all(
-        tensor.device.type == "cpu" and (tensor.dtype == torch.float32 or not tensor.is_floating_point())
-        for tensor in tensors
-    )
+def has_fast(*tensors: Tensor, constants: tuple[Tensor, ...] = ()) -> bool:
+    """Whether the fast version applies: it is allowed, and all floating tensors are single precision on a CPU.
+
+    Args:
+        constants: further tensors, for which it has no gradient.
+    """
+    given = (*tensors, *constants)
+    single = all(x.device.type == "cpu" and (x.dtype == torch.float32 or not x.is_floating_point()) for x in given)
+    return _allowed and single and not any(x.requires_grad for x in constants)

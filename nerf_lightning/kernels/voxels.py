@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.constants import constant
-from nerf_lightning.kernels.switch import fast
+from nerf_lightning.kernels.switch import has_fast
 
 
 def side_of(index: Int[Tensor, "cells"]) -> int:
@@ -43,24 +44,19 @@ def locate_reference(
 class _Locate(torch.autograd.Function):
     @staticmethod
     def forward(ctx, index: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
-        from nerf_lightning.kernels.cpu import voxels, workers
-
         places, cells = unit.T.contiguous(), side_of(index) - 1
         rows, weights = torch.empty(len(unit), 8, dtype=torch.int32), torch.empty(len(unit), 8)
-        voxels.locate(index.numpy(), cells, places.numpy(), rows.numpy(), weights.numpy(), workers())
-        if ctx.needs_input_grad[1]:
-            ctx.save_for_backward(places)
-            ctx.cells = cells
+        cpu.voxels.locate(index, cells, places, rows, weights)
+        ctx.save_for_backward(places)
+        ctx.cells = cells
         ctx.mark_non_differentiable(rows)
         return rows, weights
 
     @staticmethod
     def backward(ctx, _: Tensor, above: Tensor) -> tuple[None, Tensor]:
-        from nerf_lightning.kernels.cpu import voxels, workers
-
         (places,) = ctx.saved_tensors
         grad = torch.empty_like(places)
-        voxels.slope(ctx.cells, places.numpy(), above.contiguous().numpy(), grad.numpy(), workers())
+        cpu.voxels.slope(ctx.cells, places, above, grad)
         return None, grad.T
 
 
@@ -71,17 +67,15 @@ def locate(index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]) -> tuple[Int
         index: row of every vertex of a cubic grid over the unit cube, 32-bit, last axis fastest.
         unit: positions in [0, 1]^3; outside they are clamped.
     """
-    return _Locate.apply(index, unit) if fast(unit) else locate_reference(index, unit)
+    return _Locate.apply(index, unit) if has_fast(unit) else locate_reference(index, unit)
 
 
 def mark_rows(seen: Int[Tensor, "V"], rows: Int[Tensor, "N 8"], step: int) -> None:
     """Writes `step` into `seen` at the rows that were read; both tensors are 32-bit."""
-    if not fast(seen):
+    if not has_fast(seen):
         seen.index_fill_(0, rows.flatten().long(), step)
-        return
-    from nerf_lightning.kernels.cpu import voxels, workers
-
-    voxels.mark(seen.numpy(), rows.numpy(), step, workers())
+    else:
+        cpu.voxels.mark(seen, rows, step)
 
 
 def interpolate_rows(
@@ -97,13 +91,10 @@ def voxel_value(
     values: Float[Tensor, "V"], index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N"]:
     """Interpolates one value per vertex at positions in [0, 1]^3; fast without gradients, as samplers call it."""
-    if not fast(values, unit) or (torch.is_grad_enabled() and (values.requires_grad or unit.requires_grad)):
+    if not has_fast(values, unit, constants=(values, unit) if torch.is_grad_enabled() else ()):
         return interpolate_rows(values, *locate_reference(index, unit))
-    from nerf_lightning.kernels.cpu import voxels, workers
-
-    places, out = unit.detach().T.contiguous(), torch.empty(len(unit))
-    arrays = values.detach().numpy(), index.numpy(), side_of(index) - 1, places.numpy()
-    voxels.interpolate(*arrays, out.numpy(), workers())
+    out = torch.empty(len(unit))
+    cpu.voxels.interpolate(values, index, side_of(index) - 1, unit.T, out)
     return out
 
 
@@ -112,35 +103,26 @@ class _Read(torch.autograd.Function):
     def forward(
         ctx, density: Tensor, colour: Tensor, views: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
     ) -> tuple[Tensor, Tensor]:
-        from nerf_lightning.kernels.cpu import voxels, workers
-
         raw, rgb, basis = torch.empty(len(rows)), torch.empty(3, len(rows)), basis.T.contiguous()
-        found = rows.numpy(), weights.numpy()
-        voxels.read(density.detach().numpy(), colour.detach().numpy(), *found, raw.numpy(), rgb.numpy(), workers())
+        cpu.voxels.read(density, colour, rows, weights, raw, rgb)
         if len(basis):
-            lanes = (0,) * len(basis)
-            voxels.add_views(views.detach().numpy(), *found, basis.numpy(), rgb.numpy(), lanes, workers())
-        # Only what the weights' gradient reads, where that is asked for.
-        ctx.save_for_backward(rows, weights, basis, *((density, colour, views) if ctx.needs_input_grad[4] else ()))
-        ctx.table = len(density)
+            cpu.voxels.add_views(views, rows, weights, basis, rgb, (0,) * len(basis))
+        ctx.save_for_backward(density, colour, views, rows, weights, basis)
         return raw, rgb.T
 
     @staticmethod
     def backward(ctx, raw: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, Tensor, None, Tensor | None, None]:
-        from nerf_lightning.kernels.cpu import voxels, workers
-
-        rows, weights, basis, *read = ctx.saved_tensors
-        found, above, moved = (rows.numpy(), weights.numpy()), rgb.T.contiguous().numpy(), None
-        lanes = (0,) * len(basis)
-        density, colour, views = (torch.zeros(ctx.table, *width) for width in ((), (3,), (3 * len(basis),)))
-        voxels.scatter(density.numpy(), colour.numpy(), *found, raw.contiguous().numpy(), above, workers())
+        *tables, rows, weights, basis = ctx.saved_tensors
+        rgb, moved, lanes = rgb.T.contiguous(), None, (0,) * len(basis)
+        density, colour, views = (torch.zeros(table.shape) for table in tables)
+        cpu.voxels.scatter(density, colour, rows, weights, raw, rgb)
         if lanes:
-            voxels.scatter_views(views.numpy(), *found, basis.numpy(), above, lanes, workers())
-        if read:
-            values, moved = [table.detach().numpy() for table in read], torch.empty_like(weights)
-            voxels.pull(*values[:2], found[0], raw.contiguous().numpy(), above, moved.numpy(), workers())
+            cpu.voxels.scatter_views(views, rows, weights, basis, rgb, lanes)
+        if ctx.needs_input_grad[4]:
+            moved = torch.empty(weights.shape)
+            cpu.voxels.pull(*tables[:2], rows, raw, rgb, moved)
             if lanes:
-                voxels.pull_views(values[2], found[0], basis.numpy(), above, moved.numpy(), lanes, workers())
+                cpu.voxels.pull_views(tables[2], rows, basis, rgb, moved, lanes)
         return density, colour, views, None, moved, None
 
 
@@ -170,7 +152,7 @@ def read_voxels(
         rows, weights: of the vertices around each sample, as `locate` gives them.
         basis: the basis functions at each sample's direction, constants.
     """
-    if fast(density, colour, views, weights, basis) and not basis.requires_grad:
+    if has_fast(density, colour, views, weights, constants=(basis,)):
         return _Read.apply(density, colour, views, rows, weights, basis)
     return read_voxels_reference(density, colour, views, rows, weights, basis)
 
@@ -178,11 +160,8 @@ def read_voxels(
 class _Roughness(torch.autograd.Function):
     @staticmethod
     def forward(ctx, values: Tensor, vertex: Tensor, index: Tensor, first: int, last: int) -> Tensor:
-        from nerf_lightning.kernels.cpu import voxels, workers
-
-        slope, sums = torch.empty(last - first), np.zeros(workers())
-        tables = values.detach().numpy(), vertex.numpy(), index.numpy(), side_of(index)
-        voxels.roughness(*tables, first, last, slope.numpy(), sums, workers())
+        slope, sums = torch.empty(last - first), np.zeros(cpu.compile.workers())
+        cpu.voxels.roughness(values, vertex, index, side_of(index), first, slope, sums)
         ctx.slope, ctx.run, ctx.rows = slope, slice(first, last), len(values)
         return torch.tensor(sums.sum() / (last - first), dtype=torch.float32)
 
@@ -224,5 +203,5 @@ def roughness(
         vertex: number of each row's vertex in the grid; row 0's is not read.
         index: see `locate`.
     """
-    version = _Roughness.apply if fast(values) else roughness_reference
+    version = _Roughness.apply if has_fast(values) else roughness_reference
     return version(values, vertex, index, first, last)

@@ -229,6 +229,6 @@ class VoxelField(Field):
                 raise RuntimeError("vertices that are none of a cubic grid")
             rows = int(kept.sum()) + 1
             self.set_vertices(
-                kept.to(self.aabb.device), [table.new_empty(rows, table[0].numel()) for table in self.tables]
+                kept.to(self.bounds.aabb.device), [table.new_empty(rows, table[0].numel()) for table in self.tables]
             )
         super()._load_from_state_dict(state_dict, prefix, *rest)

@@ -1,7 +1,6 @@
 """The photos or picture for a run that is read back: those it was trained on, or others. Nothing is downloaded."""
 
 import copy
-import inspect
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,7 +11,7 @@ import torch
 from omegaconf import DictConfig
 
 from nerf_lightning.cameras import Cameras, in_other_frame, transform
-from nerf_lightning.config.build import SceneFrame, build_data, target_of
+from nerf_lightning.config.build import SceneFrame, build_data
 from nerf_lightning.config.literal import escape
 from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
 from nerf_lightning.dataset.formats import checks
@@ -90,7 +89,7 @@ def data_again(
     """
     source = scene.get("source", BUILT_IN)
     at_hand = copy.deepcopy(cfg)
-    if "download" in inspect.signature(target_of(cfg, "dataset")).parameters:
+    if "url" in at_hand.dataset:
         at_hand.dataset.download = False
         if at_hand.dataset.get("path") is None and source != BUILT_IN:
             at_hand.dataset.path = escape(source)

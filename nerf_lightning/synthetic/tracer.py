@@ -9,7 +9,6 @@ from jaxtyping import Float, Int, UInt8
 
 from nerf_lightning.cameras import Cameras, look_at
 from nerf_lightning.kernels.cpu import solids as fast
-from nerf_lightning.kernels.cpu import workers
 from nerf_lightning.synthetic.solids import Solids, bulldozer
 
 SUPERSAMPLING = 3
@@ -34,7 +33,7 @@ def rasterize(solids: Solids, cameras: Cameras, view: int) -> tuple[Int[np.ndarr
     first, last = np.floor(pixels.min(1) - 0.5).clip(0, size), np.ceil(pixels.max(1) + 0.5).clip(0, size)
     solid = np.full(size[::-1], -1, np.int32)
     depth = np.full(size[::-1], np.inf, np.float32)
-    fast.rasterize(solids.cylinder, lift, eye, first.astype(int), last.astype(int), solid, depth, workers())
+    fast.rasterize(solids.cylinder, lift, eye, first.astype(int), last.astype(int), solid, depth)
     return solid, depth
 
 
@@ -64,5 +63,5 @@ def render_view(cameras: Cameras, view: int) -> UInt8[np.ndarray, "H W 4"]:
     fine, solids = cameras.scaled(SUPERSAMPLING), bulldozer()
     rgba = np.zeros((cameras.height, cameras.width, 4), np.uint8)
     K, c2w = fine.K[view].numpy(), fine.c2w[view].numpy()
-    fast.shade(solids.single(), map_shadow(), K, c2w, *rasterize(solids, fine, view), rgba, workers())
+    fast.shade(solids.single(), map_shadow(), K, c2w, *rasterize(solids, fine, view), rgba)
     return rgba

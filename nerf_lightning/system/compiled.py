@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch.utils._pytree import tree_map_only
 
-from nerf_lightning.cameras import InBounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels.constants import KEPT
 
@@ -50,8 +49,6 @@ def _settled(given: Any) -> Any:
     """An argument of a compiled part in a standard form: a view of another tensor would be compiled again."""
     if isinstance(given, torch.Tensor):
         return given.contiguous() if given._base is None else given.clone(memory_format=torch.contiguous_format)
-    if isinstance(given, InBounds):
-        given.bounds.settle()
     return given
 
 

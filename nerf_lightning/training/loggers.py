@@ -78,7 +78,7 @@ def log_summary(logger: Logger, options: Mapping[str, Any], results: Mapping[str
         logger.log_summary(options, results)
         return
     logger.log_hyperparams({key: options[key] for key in OPTIONS if options.get(key) is not None})
-    logger.log_metrics({f"final/{key}": results[key] or 0.0 for key in FIGURES}, results["steps"])
+    logger.log_metrics({f"final/{key}": results[key] for key in FIGURES if results[key] is not None}, results["steps"])
     logger.finalize("success")
 
 

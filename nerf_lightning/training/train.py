@@ -5,7 +5,9 @@ import logging
 import math
 import shlex
 from contextlib import nullcontext, suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
@@ -14,9 +16,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from nerf_lightning.callbacks import Budget, Checkpoints, Live, Results
+from nerf_lightning.callbacks import Budget, Live
 from nerf_lightning.callbacks.attached import ChecksData, attached
-from nerf_lightning.callbacks.checkpoints import check_disk
+from nerf_lightning.callbacks.results import summarize_run
 from nerf_lightning.config.build import (
     build_data,
     build_system,
@@ -33,7 +35,7 @@ from nerf_lightning.config.limits import limits_of
 from nerf_lightning.config.literal import escape
 from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, Scene, draw_rays
 from nerf_lightning.dataset.plausible import check_scene
-from nerf_lightning.errors import InputError
+from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.refine import format_report, summarize_corrections
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
@@ -46,6 +48,7 @@ from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND, check_compiler
 from nerf_lightning.system.system import total_loss
 from nerf_lightning.training.loggers import TensorBoard, finishing_wandb, log_summary
+from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.machine import CROWDED, crowding
 from nerf_lightning.utils.memory import check_memory, keep_freed_memory, out_of_memory
@@ -103,32 +106,39 @@ def train(
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt.text)
     system = prepare_system(cfg, data, device, any(doubt.far_off for doubt in doubts))
-    results = Results("results.json", cfg.method, cfg.seed, [doubt.text for doubt in doubts])
-    trainer = build_trainer(cfg, folder, device, results)
+    trainer = build_trainer(cfg, folder, device)
     check_processes(trainer)
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
         if isinstance(callback, ChecksData):
             callback.check(data)
     if trainer.is_global_zero:
-        if (checkpoints := attached(trainer, Checkpoints)) is not None:
-            check_disk(folder / checkpoints.folder, system)
         if checkpoint is None:
             clear(folder)
         trainer.callbacks.insert(0, Described(cfg, data, folder))  # type: ignore[attr-defined]
     with trainer.precision_plugin.train_step_context():
         warm_up(system, data, trainer.strategy.root_device)
-    fit(trainer, system, data, checkpoint, folder)
-    trainer.test(system, data, verbose=False)
+    summarize = partial(summarize_run, trainer, system, cfg.method, cfg.seed, [doubt.text for doubt in doubts])
+    path = folder / "results.json"
+    try:
+        fit(trainer, system, data, checkpoint, folder)
+        trainer.test(system, data, verbose=False)
+    except BaseException as error:
+        if trainer.is_global_zero and has_trained(trainer, error):
+            with suppress(NoRoom):  # on a full disk what happened first is to be told
+                write_json(path, summarize(error))
+        raise
+    results = summarize()
     if trainer.is_global_zero:
+        write_json(path, results)
         report_photos(system, data, results, folder)
         if trainer.logger is not None:
-            log_summary(trainer.logger, resolved(cfg), results.summary)
-        report(results.summary, folder, trainer.logger)
+            log_summary(trainer.logger, resolved(cfg), results)
+        report(results, folder, trainer.logger)
     live = attached(trainer, Live)
     if live is not None:
         in_sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
-        live.finish(results.summary["psnr"], stay=not in_sweep)
-    quality: float | None = results.summary["psnr"]
+        live.finish(results["psnr"], stay=not in_sweep)
+    quality: float | None = results["psnr"]
     return math.nan if quality is None else quality  # views of a field that has broken down may have none
 
 
@@ -175,26 +185,31 @@ def fit(
     try:
         trainer.fit(system, data, ckpt_path=checkpoint, weights_only=True)
     except Exception as error:
-        if checkpoint is None and trainer.global_step == 0 and trainer.is_global_zero and out_of_memory(error):
-            clear(folder)  # nothing was trained
+        if not has_trained(trainer, error) and checkpoint is None and trainer.is_global_zero:
+            clear(folder)
         if checkpoint is None or Budget.of(trainer).state.clock.started or isinstance(error, InputError):
             raise
         found = f"{type(error).__name__}: {error}"  # only the checkpoint has been at work yet
         raise InputError(checkpoint, "", found, "a state of this run to continue from", "start the run anew") from error
 
 
-def report_photos(system: System, data: RayDataModule | PixelDataModule, results: Results, folder: Path) -> None:
+def has_trained(trainer: L.Trainer, error: BaseException) -> bool:
+    """Whether an error came after the start of training, and not from a first step that did not fit into memory."""
+    return Budget.of(trainer).state.clock.started and not (trainer.global_step == 0 and out_of_memory(error))
+
+
+def report_photos(system: System, data: RayDataModule | PixelDataModule, results: dict[str, Any], folder: Path) -> None:
     """Saves corrected cameras, and prints what training has found out about the photos."""
     if isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.is_finite:
         assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
         if "poses" in system.corrections.enabled_at:
             cameras = system.corrections.poses.refine_cameras(data.scene.train.cameras)
             save_scene(data, folder, cameras, summarize_corrections(system.corrections)["focal_factor"])
-        found = results.summary["psnr_aligned"]
+        found = results["psnr_aligned"]
         aligned = "" if found is None else f"; {found:.2f} dB held out with held-out photos corrected too"
         print(format_report(system.corrections, data.scene.train.name) + aligned)
-    if results.misfits:
-        named = join_truncated([f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results.misfits], MAX_NAMED)
+    if results["misfits"]:
+        named = join_truncated([f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results["misfits"]], MAX_NAMED)
         print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}")
 
 

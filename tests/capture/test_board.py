@@ -8,11 +8,11 @@ from nerf_lightning.capture.poses.calibrate import calibrate
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
 from nerf_lightning.capture.tags.board import Board, board_detector
 from nerf_lightning.capture.tags.detect import Sighting
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.errors import InputError
 from tests.helpers.tag_views import camera
 
-LENS = Lens(640, 480, 600.0, 600.0, 320.0, 240.0)
+LENS = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
 BOARD, TAG, FAMILY = Board(5, 7, 0.03), 0.022, "DICT_4X4_50"
 CELL = 80
 """Pixels a square in the print."""

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.capture import count_flips
+from nerf_lightning.cameras import Distortion
 from nerf_lightning.capture.poses.flips import resolve_flips
 from nerf_lightning.capture.poses.geometry import (
     angle_between,
@@ -74,7 +75,7 @@ def test_resolve_flips_of_scattered_photos_keeps_their_best():
 
 
 def test_folds_of_turning_polynomial_is_true():
-    assert not folds(LENS) and not folds(replace(LENS, distortion=(0.0, 0.0, 0.0, 0.0, 0.0)))
-    assert not folds(replace(LENS, distortion=(-0.3, 0.1, 0.0, 0.0, 0.0)))
-    assert folds(replace(LENS, distortion=(0.16, -1.0, 0.0, 0.0, 0.0)))  # turns back, and never reaches the corner
-    assert folds(replace(LENS, distortion=(-4.0, 0.0, 0.0, 0.0, 30.0)))  # turns back, and comes again
+    assert not folds(LENS) and not folds(replace(LENS, distortion=Distortion()))
+    assert not folds(replace(LENS, distortion=Distortion(k1=-0.3, k2=0.1)))
+    assert folds(replace(LENS, distortion=Distortion(k1=0.16, k2=-1.0)))  # turns back, and never reaches the corner
+    assert folds(replace(LENS, distortion=Distortion(k1=-4.0, k3=30.0)))  # turns back, and comes again

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.synthetic.viewpoints import in_frame, object_cameras, sheet_cameras
+from nerf_lightning.cameras import Distortion
 from nerf_lightning.capture.pack import pack
 from nerf_lightning.capture.photo_status import PhotoStatus, calibration_statuses, photo_statuses, subsample_photos
 from nerf_lightning.capture.poses.calibrate import calibrate
@@ -19,11 +20,11 @@ from nerf_lightning.capture.report.write import write_report
 from nerf_lightning.capture.run import Capture, PlacedPhoto
 from nerf_lightning.capture.tags.detect import Mark, Sighting
 from nerf_lightning.capture.tags.layout import SQUARE
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.drawing.ink import magnification, readable, shortened
 from tests.helpers.tag_views import SIX as SHEET
 
-LENS = Lens(320, 240, 290.0, 290.0, 160.0, 120.0, (-0.2, 0.0, 0.0, 0.0, 0.0))
+LENS = Intrinsics(320, 240, 290.0, 290.0, 160.0, 120.0, Distortion(k1=-0.2))
 TURNED = "240x320 pixels, held the other way: 320x240 is what was calibrated"
 
 
@@ -119,7 +120,7 @@ def test_collect_residuals_counts_used_photos_alone(capture):
 
 
 def test_displacement_is_the_lens_polynomial():
-    lens = Lens(200, 100, 100.0, 100.0, 100.0, 50.0, (-0.1, 0.0, 0.0, 0.0, 0.0))
+    lens = Intrinsics(200, 100, 100.0, 100.0, 100.0, 50.0, Distortion(k1=-0.1))
     # At a tangent of 1, k1 pulls in by a tenth: 10 pixels at a focal length of 100.
     moved = displacement(lens, np.array([[200.0, 50.0], [100.0, 50.0]]))
     np.testing.assert_allclose(moved, [[-10, 0], [0, 0]], atol=1e-9)

@@ -4,12 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nerf_lightning.cameras import Distortion
 from nerf_lightning.capture.poses.calibrate import calibrate
 from nerf_lightning.capture.poses.geometry import angle_between, inverse
 from nerf_lightning.capture.poses.solve import place_tags, solve
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import SQUARE
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.errors import InputError
 from tests.helpers.tag_views import LENS, ONE, SIX, SIZE, cameras, sightings
 
@@ -75,8 +76,8 @@ def test_calibrate_with_unknown_layout_finds_lens():
 
 def test_calibrate_with_few_photos_frees_few_parameters():
     found = calibrate(FOLDER, sightings(SIX, cameras(3)), None)
-    assert found.lens.distortion == (0, 0, 0, 0, 0) and set(found.deviations) == {"focal"}
-    straight = replace(LENS, distortion=(0.0, 0.0, 0.0, 0.0, 0.0), cx=512.0, cy=384.0)
+    assert not any(found.lens.distortion) and set(found.deviations) == {"focal"}
+    straight = replace(LENS, distortion=Distortion(), cx=512.0, cy=384.0)
     many = calibrate(FOLDER, sightings(SIX, cameras(10), straight), None)
     assert max(abs(k) for k in many.lens.distortion) < 0.02
 
@@ -113,6 +114,6 @@ def test_calibrate_with_too_few_or_frontal_photos_raises():
 
 
 def test_calibrate_with_small_coverage_warns():
-    far = Lens(1024, 768, 900.0, 900.0, 512.0, 384.0)
+    far = Intrinsics(1024, 768, 900.0, 900.0, 512.0, 384.0)
     found = calibrate(FOLDER, sightings(SIX, cameras(6, distance=1.2), far), None)
     assert any("of the picture" in text for text in found.warnings)

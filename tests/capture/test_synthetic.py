@@ -7,13 +7,14 @@ import pytest
 from benchmarks.synthetic.photos import Flaws, render_photo
 from benchmarks.synthetic.tabletop import INK, PAPER, Tabletop
 from benchmarks.synthetic.viewpoints import sheet_cameras
+from nerf_lightning.cameras import Distortion
 from nerf_lightning.capture.poses.geometry import inverse, project
 from nerf_lightning.capture.tags.detect import tag_detector
 from nerf_lightning.capture.tags.layout import TagLayout, flat_pose
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from tests.helpers.tag_views import SIX as SHEET
 
-LENS = Lens(320, 240, 290.0, 292.0, 163.0, 118.0, (-0.25, 0.08, 0.001, -0.0015, -0.01))
+LENS = Intrinsics(320, 240, 290.0, 292.0, 163.0, 118.0, Distortion(k1=-0.25, k2=0.08, p1=0.001, p2=-0.0015, k3=-0.01))
 EXACT = Flaws(blur=0, noise=0)
 
 
@@ -42,7 +43,7 @@ def test_render_photo_of_sheet_shows_corners_where_they_project():
 @pytest.mark.parametrize("share", [0.25, 0.75])
 def test_render_photo_pixel_is_as_dark_as_its_share_of_ink(share):
     # One metre above the paper a pixel is 1 mm wide, and the principal point is a pixel's corner.
-    lens = Lens(40, 30, 1000.0, 1000.0, 20.0, 15.0)
+    lens = Intrinsics(40, 30, 1000.0, 1000.0, 20.0, 15.0)
     edge = SHEET.corners(0)[0, :2]  # the printed top left
     # The tag's left edge comes to lie at x = 20 + 1 - share, its top edge at y = 15 + 1 - share.
     shift = (1 - share) / 1000

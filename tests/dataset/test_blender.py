@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.dataset import Reading, load_blender, load_npz
+from nerf_lightning.dataset import PhotoLoadOptions, load_blender, load_npz
 from nerf_lightning.dataset.resize import area_resize
 
 ANGLE = 2 * float(np.arctan(0.5 * 8 / 10))  # focal 10 at 8 pixels width
@@ -99,7 +99,7 @@ def test_area_resize_alpha_leaves_no_dark_rim():
 
 @pytest.mark.real_data
 def test_lego_is_the_same_scene_in_both_formats(real_data: Path):
-    blender = load_blender(real_data / "nerf_synthetic" / "lego", reading=Reading(resize=200))
+    blender = load_blender(real_data / "nerf_synthetic" / "lego", options=PhotoLoadOptions(resize=200))
     course = load_npz(real_data / "lego_200x200.npz")
     assert (blender.name, len(blender.train), len(blender.val)) == ("lego", 100, 10)
     for split in ("train", "val"):

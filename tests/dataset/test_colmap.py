@@ -14,7 +14,7 @@ from nerf_lightning.cameras import Distortion, Projection
 from nerf_lightning.cameras.lenses import to_directions, undistort
 from nerf_lightning.dataset import Scene, Views, open_scene
 from nerf_lightning.dataset.formats.colmap_model import MODELS, make_optics
-from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from tests.helpers.colmap_files import cameras_of, photos, write_colmap, write_llff, write_transforms
 
 
@@ -91,7 +91,7 @@ def test_make_optics_agrees_with_pycolmap():
         np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], flat, atol=3e-5, err_msg=model)
 
 
-def rays_of(optics: Optics, uv: np.ndarray) -> np.ndarray:
+def rays_of(optics: Intrinsics, uv: np.ndarray) -> np.ndarray:
     """Directions of places in a photo, camera frame."""
     seen = torch.from_numpy((uv - (optics.cx, optics.cy)) / (optics.fx, optics.fy))
     flat = undistort(seen, torch.tensor([optics.distortion], dtype=torch.float64))
@@ -125,9 +125,9 @@ def test_open_scene_points_and_depths_decide_near(views: Views, tmp_path: Path):
 )
 def test_sees_every_pixel_only_extreme_lens_is_refused(focal: float, distortion: Distortion, projection: Projection):
     """Their borders unfold in double precision; between, or in single precision, rays go elsewhere."""
-    assert not Optics(640, 480, focal, focal, 320, 240, distortion, projection).sees_every_pixel()
+    assert not Intrinsics(640, 480, focal, focal, 320, 240, distortion, projection).sees_every_pixel()
     for focal, k1 in ((1e5, 900.0), (6000.0, -0.3)):
-        assert Optics(6000, 4000, focal, focal, 3000, 2000, Distortion(k1=k1)).sees_every_pixel(), (
+        assert Intrinsics(6000, 4000, focal, focal, 3000, 2000, Distortion(k1=k1)).sees_every_pixel(), (
             "strong, but it unfolds"
         )
 

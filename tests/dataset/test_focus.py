@@ -4,8 +4,7 @@ from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import RayDataModule, Views
-from nerf_lightning.dataset.focus import EVERY, SIDE, Focus
-from nerf_lightning.dataset.views import Runs
+from nerf_lightning.dataset.focus import EVERY, Focus
 from nerf_lightning.synthetic.objects import MARBLE, make_scene
 
 SIZES = [(40, 20), (16, 16), (7, 33)]
@@ -18,7 +17,7 @@ def photos(masked: bool = False) -> Views:
     numbers = torch.arange(count)
     known = None
     if masked:  # a third of the pixels in one photo, half of a tile in another
-        known = Runs.of((numbers % 3 > 0) | (numbers > 800) & (numbers < 1000))
+        known = (numbers % 3 > 0) | (numbers > 800) & (numbers < 1000)
     pixels = torch.stack([numbers // 256, numbers % 256, 0 * numbers], dim=1).to(torch.uint8)
     return Views(pixels, Cameras(torch.eye(3).repeat(3, 1, 1), torch.eye(4).repeat(3, 1, 1), sizes), known)
 
@@ -51,6 +50,12 @@ def test_focus_weights_make_the_draw_unbiased(masked: bool):
         torch.testing.assert_close(share[part].sum(), known[part].sum() / known.sum(), rtol=0.05, atol=0)
 
 
+def test_views_draw_finds_known_pixels():
+    views = photos(masked=True)
+    number = torch.randint(int(views.known.sum()), (3000,), generator=seeded())
+    assert torch.equal(views.draw(3000, seeded()), views.known.nonzero()[:, 0][number])
+
+
 def test_focus_draws_where_the_error_is():
     views = photos()
     errors = torch.zeros(len(views.pixels))
@@ -61,18 +66,6 @@ def test_focus_draws_where_the_error_is():
     places, weights = taught(views, 0 * errors).draw(20_000, seeded(100))
     assert ((places >= 800) & (places < 1056)).float().mean() == pytest.approx(256 / len(errors), abs=0.02)
     torch.testing.assert_close(weights, torch.ones_like(weights), rtol=1e-5, atol=0)
-
-
-def test_focus_tiles_hold_their_pixels():
-    focus = Focus(photos(), 0.5)
-    assert focus.known.tolist() == [256, 256, 128, 64, 64, 32, 256, 112, 112, 7]
-    places, _ = focus.draw(50_000, seeded())
-    assert len(places.unique()) == sum(width * height for width, height in SIZES), "each pixel is drawn"
-    left, top, width, height, view = focus._places(focus.drawn)
-    number = places - focus.views.starts[view]
-    column, row = number % focus.views.widths[view], number // focus.views.widths[view]
-    assert ((left <= column) & (column < left + width) & (top <= row) & (row < top + height)).all()
-    assert width.max() == height.max() == SIDE
 
 
 def test_focus_state_resumes_exactly():

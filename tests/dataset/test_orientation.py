@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from nerf_lightning.dataset import Reading, Views, open_scene
+from nerf_lightning.dataset import PhotoLoadOptions, Views, open_scene
 from nerf_lightning.errors import InputError
 from tests.helpers.colmap_files import cameras_of, write_colmap, write_llff, write_transforms
 from tests.helpers.exif_tags import tags
@@ -45,7 +45,7 @@ def test_open_scene_exif_orientation_that_fits_is_applied(
     difference = (scene.train.image(0).float() - views.image(1)[..., :3]).abs().mean()
     assert float(difference) < 4, "JPEG's rounding"
     with pytest.raises(InputError, match="found 40x48 pixels, expected 48x40"):
-        open_scene(str(folder), reading=Reading(orientation="stored"))
+        open_scene(str(folder), options=PhotoLoadOptions(orientation="stored"))
 
 
 def test_open_scene_square_photos_stay_as_stored(
@@ -57,7 +57,5 @@ def test_open_scene_square_photos_stay_as_stored(
     with caplog.at_level(logging.WARNING):
         stored = open_scene(str(folder))
     assert "taken to be about the pixels as stored (dataset.orientation=exif" in caplog.text
-    turned = open_scene(str(folder), reading=Reading(orientation="exif"))
+    turned = open_scene(str(folder), options=PhotoLoadOptions(orientation="exif"))
     assert torch.equal(stored.train.image(0), torch.rot90(turned.train.image(0), 1))
-    with pytest.raises(InputError, match="dataset.orientation: found 'up', expected one of auto, stored, exif"):
-        Reading(orientation="up")

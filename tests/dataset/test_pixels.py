@@ -1,7 +1,12 @@
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.dataset import Picture, PixelDataModule
+from nerf_lightning.dataset import Picture, PixelDataModule, builtin_picture, pixel_grid
+from nerf_lightning.sources import from_picture
 
 HEIGHT, WIDTH = 4, 7
 
@@ -36,12 +41,39 @@ def test_picture_sha256_tells_pictures_apart(picture: Picture):
     other = Picture("labels", "test", picture.image.clone())
     assert other.sha256() == picture.sha256()
     other.image[0, 0, 0] += 1
-    turned = Picture("labels", "test", picture.image.reshape(WIDTH, HEIGHT, 3))
-    assert len({picture.sha256(), other.sha256(), turned.sha256()}) == 3
-    assert picture.describe()["resolution"] == [WIDTH, HEIGHT]
+    assert other.sha256() != picture.sha256()
 
 
-@pytest.mark.parametrize(("side", "expected"), [(7, 8192), (1024, 8192), (2048, 32768)])
-def test_pixel_data_large_picture_draws_more(side: int, expected: int):
-    data = PixelDataModule(Picture("black", "test", torch.zeros(side, side, 3, dtype=torch.uint8)))
-    assert data.pixels == len(data.draw(0).uv) == expected
+def test_pixel_data_large_picture_draws_more():
+    for side, expected in ((1024, 8192), (2048, 32768)):
+        data = PixelDataModule(Picture("black", "test", torch.zeros(side, side, 3, dtype=torch.uint8)))
+        assert data.pixels == len(data.draw(0).uv) == expected
+
+
+def board(height: int, width: int) -> torch.Tensor:
+    """Every other pixel white."""
+    y, x = np.mgrid[:height, :width]
+    return torch.from_numpy(np.where((x + y) % 2, 0, 200).astype(np.uint8)[..., None].repeat(3, axis=2))
+
+
+def test_pixel_grid_is_row_by_row():
+    grid = pixel_grid(2, 4)
+    assert grid.tolist() == [[x, y] for y in (0.25, 0.75) for x in (0.125, 0.375, 0.625, 0.875)]
+
+
+@pytest.mark.parametrize("max_side", [None, 6])
+def test_from_picture_file_is_known_up_to_its_size(max_side, tmp_path: Path):
+    path = tmp_path / "Board.png"
+    imageio.imwrite(path, board(8, 12).numpy())
+    picture = from_picture(str(path), max_side=max_side).scene
+    assert picture.size == ((12, 8) if max_side is None else (6, 4)) and picture.name == "board"
+    assert torch.equal(picture.at(12, 8), board(8, 12))
+    assert max_side is None or (picture.image == 100).all(), "averages"
+    assert picture.at(24, 16) is None
+
+
+def test_from_picture_builtin_is_known_at_any_size():
+    picture = from_picture(max_side=16).scene
+    assert picture.size == (16, 16) and from_picture().scene.size == (256, 256)
+    assert torch.equal(picture.at(*picture.size), picture.image)
+    assert torch.equal(picture.at(40, 40), builtin_picture(40))

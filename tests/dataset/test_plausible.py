@@ -13,7 +13,6 @@ from nerf_lightning.dataset import Scene, Views, load_npz, plausible, save_npz
 from nerf_lightning.dataset.extent import border_colour
 from nerf_lightning.dataset.kind import check_visible
 from nerf_lightning.dataset.plausible import check_bounds, check_scene
-from nerf_lightning.dataset.views import Runs
 from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.synthetic.corruptions import change_poses, flip_axes, shuffle_poses
@@ -130,7 +129,7 @@ def test_check_visible_nothing_to_see_raises(pile: Scene):
     with pytest.raises(InputError, match="alpha is 0 everywhere"):
         check_visible("photos", transparent)
     with pytest.raises(InputError, match="masks that leave out every pixel"):
-        check_visible("photos", replace(views, known=Runs.of(torch.zeros(len(views.pixels), dtype=torch.bool))))
+        check_visible("photos", replace(views, known=torch.zeros(len(views.pixels), dtype=torch.bool)))
 
 
 def test_border_colour_is_the_background(pile: Scene, tmp_path: Path):

@@ -4,11 +4,10 @@ from itertools import islice
 import pytest
 import torch
 
-from nerf_lightning.cameras import Bounds, Cameras, Rays, orbit_around
-from nerf_lightning.dataset import RayBatch, RayDataModule, Scene, Views
-from nerf_lightning.dataset.loader import StepLoader
+from nerf_lightning.cameras import Bounds, Cameras, orbit_around
+from nerf_lightning.dataset import RayDataModule, Scene, Views
+from nerf_lightning.dataset.loader import BatchLoader
 from nerf_lightning.dataset.rays import draw_rays, plainness
-from nerf_lightning.errors import InputError
 from nerf_lightning.renderer import over
 
 VIEWS, HEIGHT, WIDTH = 3, 4, 6
@@ -31,8 +30,8 @@ def scene() -> Scene:
 
 
 def test_draw_rays_colours_belong_to_their_rays(scene: Scene):
-    batch = draw_rays(scene.train, 200, torch.Generator().manual_seed(0))
-    assert len(batch.rays) == len(batch.pixels) == 200
+    batch = draw_rays(scene.train, 50, torch.Generator().manual_seed(0))
+    assert len(batch.rays) == len(batch.pixels) == 50
     for i, (view, row, col, _) in enumerate(batch.pixels.tolist()):
         K, c2w = scene.train.cameras.K[view].double(), scene.train.cameras.c2w[view].double()
         inside = torch.linalg.inv(K) @ torch.tensor([col + 0.5, row + 0.5, 1]).double()
@@ -60,15 +59,6 @@ def test_plainness_step_and_slope_are_told_apart():
     torch.testing.assert_close(second, torch.full_like(second, float(torch.tensor(-1 / 2.55).exp())))
 
 
-def test_draw_rays_is_uniform_over_all_pixels(scene: Scene):
-    pixels = draw_rays(scene.train, 36_000, torch.Generator().manual_seed(0)).pixels.long()
-    counts = torch.bincount((pixels[:, 0] * HEIGHT + pixels[:, 1]) * WIDTH + pixels[:, 2])
-    assert len(counts) == VIEWS * HEIGHT * WIDTH
-    expected = 36_000 / len(counts)
-    chi_square = float(((counts - expected) ** 2 / expected).sum())
-    assert abs(chi_square - 71) < 5 * (2 * 71) ** 0.5  # 71 degrees of freedom
-
-
 def test_ray_data_batch_depends_on_seed_and_step_alone(scene: Scene):
     def pixels(seed: int, step: int) -> list:
         return RayDataModule(scene, rays=50, seed=seed).draw(step).pixels.tolist()
@@ -87,15 +77,13 @@ def test_ray_data_held_out_views_come_whole_and_in_order(scene: Scene):
         assert torch.equal(batch.rays.directions, scene.val.cameras.view_rays(view).directions)
 
 
-@pytest.mark.parametrize(("alpha", "expected"), [(255, 0.2), (0, 0.5), (51, 0.2 * 0.2 + 0.8 * 0.5)])
-def test_over_alpha_blends_with_background(alpha: int, expected: float):
-    rays = Rays(torch.zeros(2, 3), torch.eye(3)[:2])
-    batch = RayBatch(rays, torch.tensor([[51, 51, 51, alpha], [255, 0, 0, 255]], dtype=torch.uint8))
-    target = over(batch.pixels, torch.full((2, 3), 0.5))
-    torch.testing.assert_close(target, torch.tensor([[expected] * 3, [1.0, 0, 0]]))
+def test_over_alpha_blends_with_background():
+    pixels = torch.tensor([[51, 51, 51, alpha] for alpha in (255, 0, 51)], dtype=torch.uint8)
+    expected = torch.tensor([0.2, 0.5, 0.2 * 0.2 + 0.8 * 0.5])[:, None].expand(3, 3)
+    torch.testing.assert_close(over(pixels, torch.full((3, 3), 0.5)), expected)
 
 
-@pytest.mark.parametrize(("first", "samples_per_ray"), [(100, 0.5), (100, 40.0), (1000, 3.0)])
+@pytest.mark.parametrize(("first", "samples_per_ray"), [(100, 0.5), (1000, 3.0)])
 def test_note_samples_settles_at_the_aim(first: int, samples_per_ray: float, scene: Scene):
     data = RayDataModule(scene, rays=first, samples=6000)
     most = 0
@@ -119,15 +107,9 @@ def test_ray_data_state_keeps_the_number_of_rays(scene: Scene):
     assert other.rays == data.rays
 
 
-@pytest.mark.parametrize(("rays", "samples", "key"), [(0, None, "dataset.rays"), (5, 0, "dataset.samples")])
-def test_ray_data_less_than_one_raises(rays, samples, key, scene: Scene):
-    with pytest.raises(InputError, match=key):
-        RayDataModule(scene, rays, samples)
-
-
-def test_step_loader_asks_for_the_step_at_each_batch(scene: Scene):
+def test_batch_loader_asks_for_the_step_at_each_batch(scene: Scene):
     steps = iter([0, 1, 5, 5])
-    loader = StepLoader(lambda step: step * 10, lambda: next(steps))
+    loader = BatchLoader(lambda step: step * 10, iter(lambda: next(steps), None))
     assert list(islice(loader, 4)) == [0, 10, 50, 50]
     assert len(loader) > 10**9
     first = next(iter(RayDataModule(scene, rays=5, seed=1).train_dataloader()))

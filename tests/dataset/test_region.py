@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras, Layout
-from nerf_lightning.dataset import Reading, Scene, Views, open_scene
+from nerf_lightning.dataset import PhotoLoadOptions, Scene, Views, open_scene
 from nerf_lightning.dataset.region import PAN_DEPTH, find_region
 from tests.helpers.camera_paths import CENTRE, RADIUS, forward, pan, ring, walk
 from tests.helpers.colmap_files import cameras_of, photos, write_colmap, write_transforms
@@ -118,7 +118,7 @@ def inside_a_ball(cameras: Cameras, radius: float = 3.0) -> UInt8[Tensor, "V H W
 def test_open_scene_without_depth_matches_photos(c2w: torch.Tensor, layout: Layout, tmp_path: Path):
     c2w = c2w.clone()
     c2w[:, :3, 3] -= CENTRE
-    scene = open_scene(str(folder_of(tmp_path, c2w, inside_a_ball)), reading=Reading(holdout=8))
+    scene = open_scene(str(folder_of(tmp_path, c2w, inside_a_ball)), options=PhotoLoadOptions(holdout=8))
     assert size_of(scene) * (PAN_DEPTH if layout == Layout.PAN else 1) == pytest.approx(3, rel=0.2)
     assert scene.points is not None and len(scene.points) > 50
     places = scene.points.double() @ scene.to_source[:3, :3].double().T + scene.to_source[:3, 3]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from nerf_lightning.callbacks.render_plan import RenderPlan
+from nerf_lightning.callbacks import Evaluation
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, Scene
@@ -51,10 +51,7 @@ def test_its_figures_stand_beside_those_of_held_out_views(scene: Scene, tmp_path
 
 
 def test_where_there_is_not_time_for_all_some_of_it_is_evaluated(scene: Scene, tmp_path: Path, monkeypatch, capsys):
-    share = RenderPlan.share
-    monkeypatch.setattr(
-        RenderPlan, "share", lambda self, job, *given: 0.5 if job == "test" else share(self, job, *given)
-    )
+    monkeypatch.setattr(Evaluation, "share", lambda self, trainer, system, pixels=None: 0.5 if pixels is None else 1.0)
     train(composed(OPTIONS, tmp_path), scene=scene)
     assert (results(tmp_path)["test"]["views"], results(tmp_path)["test"]["views_in_split"]) == (2, 5)
     assert "dB on 2 of 5 test views, after" in capsys.readouterr().out

@@ -140,7 +140,7 @@ def test_region_of_is_within_the_scene():
 def test_sample_volume_cells_are_cubic():
     system = ball_system()
     bounds = replace(system.field.bounds, aabb=torch.tensor([[-1.0, -0.5, -0.26], [1.0, 0.5, 0.26]]), pixel=0.02)
-    system.field._bounds, system.field.aabb = bounds, bounds.aabb
+    system.field.bounds = bounds
     volume = sample_volume(system, 20)
     assert volume.density.shape == (20, 10, 6)
     torch.testing.assert_close(volume.places(torch.tensor([[9.5, 4.5, 2.5]]))[0], torch.zeros(3), atol=1e-6, rtol=0)

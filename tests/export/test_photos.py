@@ -10,7 +10,6 @@ import torch
 from nerf_lightning.cameras import Bounds, Cameras, Distortion, Lenses, Projection, in_other_frame, orbit_around
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.dataset.formats.transforms import load_transforms
-from nerf_lightning.dataset.views import Runs
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.photos import write_photos
 
@@ -26,7 +25,7 @@ def photographed(count: int, channels: int, lens: Distortion, projection: Projec
     cameras = replace(Cameras.of_size(K, c2w, WIDTH, HEIGHT), lenses=lenses)
     known = None
     if masked:
-        known = Runs.of(torch.rand(count * HEIGHT * WIDTH, generator=generator) < 0.7)
+        known = torch.rand(count * HEIGHT * WIDTH, generator=generator) < 0.7
     return Views(pixels.view(-1, channels), cameras, known, tuple(f"shots/{count}_{i}.jpg" for i in range(count)))
 
 

@@ -1,9 +1,7 @@
 """What torch.compile makes of fields and trainings, beside what they are without it: a process of its own, where no types are
 checked, as the checks would be compiled too. Prints what it found as JSON.
 
-python compile_models.py mlp voxels FOLDER     some fields, and a training where there is a folder for it; without the
-                                               compiler's kernels, which take most of the time
-python compile_models.py whole                 one field as users have it
+python compile_models.py BACKEND FIELD... [--train FOLDER]
 """
 
 import copy
@@ -24,12 +22,11 @@ from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import Samples
-from nerf_lightning.system.compiled import BACKEND, part
+from nerf_lightning.system.compiled import part
 from nerf_lightning.training import train as training
 from tests.helpers.growth import grow
 from tests.helpers.train_models import MODELS
 
-TRACED, DIFFERENTIATED = "eager", "aot_eager"  # as inductor has it up to its kernels, in a tenth of the time
 BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 FIELDS = {
     "mlp": lambda: MLPField(BOX, depth=2, width=8, skip=1, position_frequencies=2, density="exp"),
@@ -56,10 +53,9 @@ def outcome(field: Field, renderer: VolumeRenderer | None, rays: Rays, samples: 
     return [density, *(value.detach() for value in values), *gradients]
 
 
-def check_field(name: str, backend: str | None = None) -> dict[str, float]:
+def check_field(name: str, backend: str) -> dict[str, float]:
     """The largest difference, of the largest value in its tensor, and how many graphs were made at first, and anew."""
     field, renderer = FIELDS[name](), VolumeRenderer() if name == "mlp" else None  # the same for all
-    backend = backend or (TRACED if renderer is None and name != "voxels" else DIFFERENTIATED)
     keys, worst, before, graphs = list(field.state_dict()), 0.0, counters["stats"]["unique_graphs"], []
     for rays, count, progress in SIZES:
         grow(field, progress)
@@ -80,24 +76,21 @@ def check_field(name: str, backend: str | None = None) -> dict[str, float]:
     return {"worst": worst, "compiled": fresh[0], "again": fresh[1] + fresh[3]}
 
 
-def trained(name: str, folder: Path, *more: str) -> float:
-    """The held-out PSNR of a small run."""
-    options = [one for one in MODELS[name] if one != "model.grown=1"]
-    cfg = composed([f"model={name}", *options, "device=cpu", "kernels=reference", "~logger", *more], folder)
-    return training.train(cfg)
+def train(folder: Path, backend: str) -> list[float]:
+    """The held-out PSNR of a small run, compiled and not."""
+    training.BACKEND = backend
+    options = [*MODELS["siren"], "model=siren", "model.depth=1", "budget.steps=30", "callbacks.snapshots=null"]
+    options += ["device=cpu", "kernels=reference", "~logger"]
+    return [training.train(composed([*options, f"compile={on}"], folder / on)) for on in ("true", "false")]
 
 
 if __name__ == "__main__":
     warnings.filterwarnings("error", category=UserWarning)
     torch.manual_seed(0)
     use_kernels("reference")
-    if sys.argv[1] == "whole":
-        print(json.dumps(check_field("voxels", BACKEND)))
-        sys.exit()
-    found: dict[str, object] = {name: check_field(name) for name in sys.argv[1:] if name in FIELDS}
-    if sys.argv[-1] not in FIELDS:
-        training.BACKEND = DIFFERENTIATED
-        folder = Path(sys.argv[-1])
-        options = ("budget.steps=30", "model.depth=1", "callbacks.snapshots=null")
-        found["trained"] = [trained("siren", folder / on, f"compile={on}", *options) for on in ("true", "false")]
+    backend, *names = sys.argv[1:]
+    folder = Path(names.pop()) if "--train" in names else None
+    found: dict[str, object] = {"fields": {name: check_field(name, backend) for name in names if name in FIELDS}}
+    if folder is not None:
+        found["trained"] = train(folder, backend)
     print(json.dumps(found))

@@ -1,7 +1,7 @@
 """A device that exists only in the dispatcher: what runs on it would run on a GPU, though the machine has none.
 
 Its tensors keep their numbers in a CPU tensor, but refuse to meet CPU tensors and know no `.numpy()`. Autograd, modules, fused
-optimisers, mixed precision and Lightning's Trainer work on it (`accelerator="pretend"`); what is asked of
+optimisers and Lightning's Trainer work on it (`accelerator="pretend"`); what is asked of
 it passes the dispatcher, so `benchmarks.count` counts it. Random numbers come from the CPU's generators, as a generator cannot
 live here.
 """
@@ -11,8 +11,6 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch.accelerators import Accelerator, AcceleratorRegistry
-from lightning.pytorch.plugins import MixedPrecision
-from lightning.pytorch.trainer.connectors import accelerator_connector
 from torch.utils import _pytree as pytree
 from torch.utils import backend_registration
 
@@ -20,8 +18,6 @@ from nerf_lightning.kernels import sums
 
 NAME = "pretend"
 MOVES = ("aten::_to_copy", "aten::copy_", "aten::_copy_from")
-HALVED = ("mm", "bmm", "addmm", "baddbmm", "linear", "matmul")
-"""Operations that mixed precision runs in halves, as on a GPU."""
 
 
 class Pretend(torch.Tensor):
@@ -110,22 +106,6 @@ def copied(source: torch.Tensor, target: torch.Tensor, non_blocking: bool = Fals
     return target
 
 
-def in_halves(function: Any) -> Any:
-    """An operation that casts what is single precision, as mixed precision has it."""
-
-    def cast(x: Any) -> Any:
-        if isinstance(x, Pretend) and x.dtype == torch.float32:
-            return x.to(torch.get_autocast_dtype(NAME))
-        return x
-
-    def call(*args: Any, **kwargs: Any) -> Any:
-        with torch._C._ExcludeDispatchKeyGuard(torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastPrivateUse1)):
-            args, kwargs = pytree.tree_map(cast, (args, kwargs))
-            return function(*args, **kwargs)
-
-    return call
-
-
 class Module(backend_registration._DummyBackendModule):
     """`torch.pretend`."""
 
@@ -139,9 +119,6 @@ class Module(backend_registration._DummyBackendModule):
 
     def synchronize(self) -> None:
         Module.waited += 1
-
-    def get_amp_supported_dtype(self) -> list[torch.dtype]:
-        return [torch.float16, torch.bfloat16]
 
 
 class PretendAccelerator(Accelerator):
@@ -181,23 +158,13 @@ def missing() -> str:
     return ""
 
 
-_kept: list[Any] = []
-"""Registrations end when they are forgotten."""
-
-
 def register() -> None:
     """Makes the device known to torch and Lightning, where it can be. Before anything is differentiated: autograd counts the
     devices once."""
-    if not missing() and not _kept:
+    if not missing():
         backend_registration._setup_privateuseone_for_python_backend(NAME, backend_module=Module())
         for name, made in (("empty.memory_format", empty), ("empty_strided", empty_strided), ("_copy_from", copied)):
             torch.library.impl(f"aten::{name}", "PrivateUse1")(made)
-        halves = torch.library.Library("aten", "IMPL", "AutocastPrivateUse1")
-        for name in HALVED:
-            halves.impl(name, in_halves(getattr(torch.ops.aten, name)))
-        others = torch.library.Library("_", "IMPL", "AutocastPrivateUse1")
-        others.fallback(torch.library.fallthrough_kernel)
-        _kept.extend((halves, others))
         AcceleratorRegistry.register(NAME, PretendAccelerator)
 
 
@@ -206,14 +173,13 @@ register()
 
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> torch.device:
-    """The device. Generators made for it are the CPU's, and mixed precision is that of the device."""
+    """The device. Generators made for it are the CPU's."""
     why = missing()
     if why:
         pytest.skip(why)
-    generator, mixed = torch.Generator, MixedPrecision
+    generator = torch.Generator
     monkeypatch.setattr(Module, "there", True)
     monkeypatch.setattr(torch, "Generator", lambda device="cpu": generator("cpu" if NAME in str(device) else device))
-    monkeypatch.setattr(accelerator_connector, "MixedPrecision", lambda flag, _: mixed(flag, NAME))
     return torch.device(NAME, 0)
 
 

@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras
-from nerf_lightning.cameras.orbit import look_at
+from nerf_lightning.cameras import Bounds, Cameras, look_at
 
 BOX = Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3]))
 

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from nerf_lightning.cameras import look_at
+from nerf_lightning.cameras import Distortion, look_at
 from nerf_lightning.capture.poses.geometry import inverse, project
 from nerf_lightning.capture.tags.detect import Mark, Sighting
 from nerf_lightning.capture.tags.layout import SQUARE, TagLayout, flat_pose
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 
 SIZE = 0.06
-LENS = Lens(1024, 768, 900.0, 900.0, 520.0, 380.0, (-0.2, 0.05, 0.0, 0.0, 0.0))
-SMALL = Lens(400, 300, 350.0, 350.0, 203.0, 148.0, (-0.1, 0.02, 0.0, 0.0, 0.0))
+LENS = Intrinsics(1024, 768, 900.0, 900.0, 520.0, 380.0, Distortion(k1=-0.2, k2=0.05))
+SMALL = Intrinsics(400, 300, 350.0, 350.0, 203.0, 148.0, Distortion(k1=-0.1, k2=0.02))
 SIX = TagLayout("DICT_4X4_50", SIZE, {3 * r + c: flat_pose(0.09 * c, -0.09 * r) for r in (0, 1) for c in (0, 1, 2)})
 ONE = TagLayout("DICT_4X4_50", SIZE, {0: flat_pose(0.0, 0.0)})
 
@@ -41,7 +41,12 @@ def cameras(count: int, seed: int = 0, tilt: float = 40.0, distance: float = 0.4
 
 
 def sightings(
-    layout: TagLayout, c2w: np.ndarray, lens: Lens = LENS, noise: float = 0.1, seed: int = 0, folder: Path = Path("x")
+    layout: TagLayout,
+    c2w: np.ndarray,
+    lens: Intrinsics = LENS,
+    noise: float = 0.1,
+    seed: int = 0,
+    folder: Path = Path("x"),
 ) -> list[Sighting]:
     """What photos from these cameras show of a layout, without the tags that are not wholly in the frame."""
     rng, seen = np.random.default_rng(seed), []

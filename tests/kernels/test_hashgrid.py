@@ -60,13 +60,3 @@ def test_hash_interpolate_any_levels_match_loop_over_corners(cells: Levels, size
         use_kernels(choice)
         single = hash_interpolate(tables.float(), unit, cells, sizes)
         torch.testing.assert_close(single.double(), expected, atol=1e-5 + 1e-6 * max(max(cells)), rtol=0)
-
-
-@pytest.mark.parametrize("cells", [(5, 5, 5), (3, 5, 4), (5, 8)])
-def test_hash_interpolate_dense_level_reproduces_linear_function(cells: tuple[int, ...], kernels: str):
-    sides = [torch.arange(side + 1) / side for side in cells]
-    places = torch.cartesian_prod(*reversed(sides)).flip(1)  # the first axis fastest
-    slopes = torch.randn(len(cells), 2)
-    tables, unit = places @ slopes + 0.1, torch.rand(200, len(cells))
-    actual = hash_interpolate(tables, unit, [cells], [len(tables)])
-    torch.testing.assert_close(actual, unit @ slopes + 0.1, atol=1e-5, rtol=1e-5)

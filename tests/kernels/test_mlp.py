@@ -41,13 +41,6 @@ def test_mlp_any_widths_match_loop_over_neurons(widths: tuple[int, ...], further
         assert torch.equal(mlp(x, pairs(flat)), mlp(x, pairs(flat), extra))
 
 
-def test_mlp_further_inputs_get_no_gradient(kernels: str):
-    flat, x = network((4, 8, 2), 3), torch.randn(20, 4, requires_grad=True)
-    extra = torch.randn(20, 3, requires_grad=True)
-    mlp(x, pairs(flat), extra).sum().backward()
-    assert extra.grad is None and x.grad.abs().max() > 0
-
-
 def test_mlp_one_and_two_threads_agree():
     inputs = [torch.randn(1000, 12), *network((12, 32, 32, 7))]
     one, two = (

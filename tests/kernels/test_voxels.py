@@ -4,7 +4,6 @@ from torch import Tensor
 
 from nerf_lightning.kernels import (
     locate,
-    mark_rows,
     read_voxels,
     roughness,
     spherical_harmonics,
@@ -12,7 +11,6 @@ from nerf_lightning.kernels import (
 )
 
 SIDE = 6
-NAN = float("nan")
 
 
 def sparse_index(side: int = SIDE) -> Tensor:
@@ -66,33 +64,6 @@ def test_read_voxels_any_position_matches_loop_over_vertices(kernels: str):
         turned = by_hand(views.view(-1, 3, 3), index, position) @ basis[n].double()
         expected = by_hand(colour, index, position) + turned
         torch.testing.assert_close(rgb[n].double(), expected, atol=1e-5, rtol=1e-5)
-
-
-def test_read_voxels_nan_input_shows(kernels: str):
-    index, unit = torch.arange(1, SIDE**3 + 1, dtype=torch.int32), places(20)
-    unit[3, 0], unit[5, 2], unit[7] = NAN, NAN, NAN
-    free = [table.requires_grad_() for table in tables(index, 3)]
-    raw, rgb = read_voxels(*free, *locate(index, unit), basis_of(len(unit), 3))
-    bad = unit.isnan().any(1)
-    assert raw[bad].isnan().all() and rgb[bad].isnan().all()
-    assert raw[~bad].isfinite().all() and rgb[~bad].isfinite().all()
-    with torch.no_grad():
-        assert torch.equal(voxel_value(free[0], index, unit).isnan(), bad)
-    (raw.sum() + rgb.sum()).backward()
-    assert all(table.grad.isnan().any() for table in free)
-    free[0].data[:] = NAN
-    with torch.no_grad():
-        assert voxel_value(free[0], index, places(3)).isnan().all()
-
-
-def test_mark_rows_notes_step_at_rows_read(kernels: str):
-    index = torch.arange(1, SIDE**3 + 1, dtype=torch.int32)
-    seen = torch.zeros(SIDE**3 + 1, dtype=torch.int32)
-    mark_rows(seen, locate(index, torch.tensor([[0.05, 0.05, 0.05]]))[0], 3)
-    mark_rows(seen, locate(index, torch.tensor([[0.95, 0.95, 0.95]]))[0], 7)
-    near = [(i * SIDE + j) * SIDE + k + 1 for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    assert (seen == 3).nonzero()[:, 0].tolist() == near
-    assert (seen == 7).nonzero()[:, 0].tolist() == [SIDE**3 + 1 - row for row in reversed(near)]
 
 
 def test_roughness_matches_loop_over_neighbours(kernels: str):

@@ -1,4 +1,7 @@
+"""Fields of pictures: what they learn, where their vertices and frequencies lie, and their first weights."""
+
 import functools
+import math
 from collections.abc import Callable
 
 import pytest
@@ -74,16 +77,6 @@ def test_hash_grid_2d_finest_level_has_vertex_at_pixel_centre(size: tuple[int, i
         assert moved.max() < 1e-3, "and no other pixel's"
 
 
-@pytest.mark.parametrize(("size", "octaves"), [((1, 1), 1), ((64, 64), 6), ((256, 192), 8), ((60, 100), 7)])
-def test_picture_mlp_octaves_end_at_half_of_nyquist(size: tuple[int, int], octaves: int):
-    field = PictureMLP(size, None, width=8, depth=2)
-    assert field.frequencies == octaves
-    assert size == (1, 1) or 2 ** (octaves - 1) / 2 == pytest.approx(field.nyquist / 2, rel=0.42), (
-        "to the nearest octave"
-    )
-    assert field.net[0].in_features == 2 * (1 + 2 * octaves)
-
-
 def inputs_of(field: PictureField, uv: Tensor) -> Tensor:
     """What the first layer of a field's network sees."""
     seen: list[Tensor] = []
@@ -92,11 +85,32 @@ def inputs_of(field: PictureField, uv: Tensor) -> Tensor:
     return seen[0]
 
 
-@pytest.mark.parametrize("size", [(8, 4), (3, 10), (1, 1)])
-def test_picture_field_centred_pixels_stay_square(size: tuple[int, int]):
-    width, height = size
-    places = PictureField(size).centred(pixel_grid(height, width)).view(height, width, 2)
-    step = 2 / max(size)
-    torch.testing.assert_close(places.diff(dim=1), torch.tensor([step, 0.0]).expand(height, width - 1, 2))
-    torch.testing.assert_close(places.diff(dim=0), torch.tensor([0.0, step]).expand(height - 1, width, 2))
-    torch.testing.assert_close(places.mean((0, 1)), torch.zeros(2), atol=1e-6, rtol=0)
+@pytest.mark.parametrize("size", [(64, 32), (32, 64)])
+def test_fourier_field_cycles_are_of_longer_side(size: tuple[int, int]):
+    field, uv = FourierField(size, features=5, width=8), torch.rand(20, 2)
+    lengths = (uv - 0.5) * torch.tensor(size) / 64
+    angles = torch.tensor(
+        [[2 * math.pi * float(place @ field.cycles[:, k]) for k in range(5)] for place in lengths.unbind()]
+    )
+    torch.testing.assert_close(inputs_of(field, uv), torch.cat([angles.sin(), angles.cos()], dim=1), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("width", [32, 100])
+def test_siren_initial_weights_fill_bounds_of_paper(width: int):
+    field = SirenField((64, 64), width=width, depth=3)
+    first, *later = [*field.hidden, field.last]
+    assert len(later) == 3 and first.weight.shape == (width, 2)
+    for layer, bound in [(first, 1 / 2), *((layer, math.sqrt(6 / width) / 30) for layer in later)]:
+        assert bound * 0.9 < float(layer.weight.detach().abs().max()) <= bound * (1 + 1e-6)
+        assert float(layer.weight.detach().std()) == pytest.approx(bound / math.sqrt(3), rel=0.25), "evenly"
+
+
+def test_siren_matches_loop_over_layers():
+    size = (40, 20)
+    field, uv = SirenField(size, width=6, depth=3, reach=0.2), torch.rand(10, 2)
+    first = 0.2 * math.pi * 20
+    h = (2 * uv - 1) * torch.tensor(size) / 40
+    for layer, frequency in zip(field.hidden, (first, 30, 30), strict=True):
+        h = torch.sin(frequency * (h @ layer.weight.T + layer.bias))
+    expected = 0.5 + (h @ field.last.weight.T + field.last.bias) / 2
+    torch.testing.assert_close(field(uv), expected, atol=1e-4, rtol=0)

@@ -3,7 +3,6 @@ import torch
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.errors import InputError
 from nerf_lightning.model import TensoRFField
 from tests.helpers.growth import grow
 
@@ -75,15 +74,3 @@ def test_tensorf_state_of_any_stage_loads(saved_at: float, loaded_at: float):
     assert grow(loaded, saved_at) == [], "what was loaded has the size of its stage"
     grow(loaded, 1.0)
     assert loaded.density_volume.cells == 16
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ({"coarsest": 17}, "model.coarsest"),
-        ({"stages": 1}, "model.stages"),
-    ],
-)
-def test_tensorf_bad_option_is_refused(options: dict, named: str):
-    with pytest.raises(InputError, match=named):
-        field(**options)

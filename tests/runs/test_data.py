@@ -79,7 +79,7 @@ def test_resumed_run_of_a_stranger_uses_no_network(small_run: Path, inside, tmp_
     shutil.copytree(small_run, run)
     config = yaml.safe_load((run / "config.yaml").read_text())
     config["dataset"] = {
-        "_target_": "nerf_lightning.sources.from_download",
+        "_target_": "nerf_lightning.sources.from_photos",
         "url": "http://stranger.example/.profile",
         "folder": str(tmp_path),
         "path": None,

@@ -73,14 +73,6 @@ def test_proposal_sampler_samples_tile_ray():
     torch.testing.assert_close(t[:, 1:] - dt[:, 1:] / 2, t[:, :-1] + dt[:, :-1] / 2, rtol=1e-4, atol=1e-4)
 
 
-def test_proposal_sampler_picture_is_the_same_in_parts():
-    sampler, some = taught(ProposalSampler(AROUND), 10), rays(40)
-    whole, again = sampler(some, ball), sampler(some, ball)
-    parts = [sampler(some[first : first + 7], ball) for first in range(0, 40, 7)]
-    assert torch.equal(whole.t, again.t) and torch.equal(whole.t, torch.cat([part.t for part in parts]))
-    assert whole.proposals is None and sampler.losses(whole, whole.t) == {}
-
-
 def test_interlevel_loss_only_unexpected_weight_costs():
     edges = torch.linspace(0, 1, 5)[None]
     found = torch.tensor([[0.0, 0.2, 0.5, 0.0]])

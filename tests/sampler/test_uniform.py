@@ -1,11 +1,15 @@
+"""Samplers that know no occupancy: equal steps, and steps where the weight is."""
+
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.sampler import UniformSampler
+from nerf_lightning.kernels import inverse_cdf
+from nerf_lightning.sampler import ImportanceSampler, UniformSampler
 
 
 def nowhere(positions: Tensor) -> Tensor:
@@ -50,3 +54,52 @@ def test_uniform_sampler_jitter_stays_in_stratum(count: int, unbounded: bool, bo
         assert share.amin() < 0.05 and share.amax() > 0.95
         if not unbounded:
             assert abs(float(share.mean()) - 0.5) < 0.05
+
+
+@pytest.mark.parametrize("kind", ["random", "one", "none", "sparse"])
+def test_inverse_cdf_any_weights_inverts_cumulated_weights(kind: str):
+    edges = torch.rand(20, 11).cumsum(1)
+    weights = {
+        "random": torch.rand(20, 10),
+        "one": torch.eye(10).repeat(2, 1),
+        "none": torch.zeros(20, 10),
+        "sparse": torch.rand(20, 10) * (torch.rand(20, 10) < 0.3),
+    }[kind]
+    u = torch.rand(20, 40)
+    u[:, :2] = torch.tensor([0.0, 1.0])
+    actual = inverse_cdf(edges, weights, u).numpy()
+    for r in range(20):
+        # The floor lets an empty ray fall back to uniform in the interval's number.
+        cdf = np.concatenate([[0], np.cumsum(weights[r].double().numpy() + 1e-5)])
+        expected = np.interp(u[r].double().numpy(), cdf / cdf[-1], edges[r].double().numpy())
+        # What counts is the probability mass between the two answers: distances jump where there is no weight.
+        mass = np.interp(actual[r], edges[r].double().numpy(), cdf / cdf[-1]) - u[r].double().numpy()
+        assert np.abs(mass).max() < 1e-4
+        if kind in ("random", "none"):
+            np.testing.assert_allclose(actual[r], expected, atol=2e-3)
+        assert actual[r].min() >= edges[r, 0] and actual[r].max() <= edges[r, -1]
+
+
+def ball(radius: float, density: float):
+    return lambda x: density * (x.norm(dim=-1) < radius).float()
+
+
+@pytest.mark.parametrize(
+    ("radius", "unbounded", "training"), [(0.0, False, True), (0.4, False, False), (0.4, True, True)]
+)
+def test_importance_sampler_coarse_and_fine_tile_ray(radius, unbounded, training, box: Bounds, rays: Rays):
+    bounds = replace(box, unbounded=unbounded)
+    chance = Generator().manual_seed(1) if training else None
+    samples = ImportanceSampler(bounds, 12, 20)(rays, ball(radius, 5.0), chance)
+    start, end = (samples.t - samples.dt / 2), (samples.t + samples.dt / 2)
+    near, far = bounds.near_far(rays)
+    assert (samples.dt >= 0).all()
+    for r in range(len(rays)):
+        part = slice(int(samples.offsets[r]), int(samples.offsets[r + 1]))
+        if near[r] >= far[r]:
+            assert part.start == part.stop
+            continue
+        assert part.stop - part.start == 12 + 20
+        torch.testing.assert_close(start[part][1:], end[part][:-1], rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(start[part][0], near[r], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(end[part][-1], far[r], rtol=1e-4, atol=1e-4)

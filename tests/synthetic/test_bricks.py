@@ -65,7 +65,7 @@ def test_solids_aabb_turned_cylinder_is_exact():
 
 
 def test_bricks_images_are_the_same_everywhere(scene):
-    assert scene.sha256().startswith("0aac2172efe6")
+    assert scene.sha256().startswith("7869af40dd6c")
 
 
 def test_bricks_cameras_match_the_paper(scene):

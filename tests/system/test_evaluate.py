@@ -8,10 +8,8 @@ from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.dataset import Picture, PictureBatch, PixelDataModule, ViewBatch
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.renderer import VolumeRenderer
-from nerf_lightning.sampler import Samples, UniformSampler
-from nerf_lightning.sampler.samples import SAMPLES_PER_RAY
+from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system import NeRF2D, NeRF3D, constant
-from nerf_lightning.system.nerf3d import SAMPLED_CHUNKS
 
 ADAM = functools.partial(torch.optim.Adam, lr=0.01)
 
@@ -82,23 +80,6 @@ def test_evaluate_view_any_chunk_gives_same_scores(chunk, slab: NeRF3D):
     assert (result.opacity[:, 8:] > 0.999).all() and (result.opacity[:, :8] == 0).all()
     z = slab_view(0).rays.directions[:, 2].view(12, 16)[:, 8:]
     torch.testing.assert_close(result.depth[:, 8:] * z, torch.full_like(z, 3.5), atol=0.02, rtol=0)
-
-
-def test_render_many_samples_a_ray_take_smaller_chunks(slab: NeRF3D, monkeypatch):
-    slab.chunk = slab.sampler.chunk = 80 * SAMPLES_PER_RAY
-    found, ask = [], slab.sampler.forward
-
-    def asked(rays: Rays, *given) -> Samples:
-        found.append(ask(rays, *given))
-        return found[-1]
-
-    monkeypatch.setattr(slab.sampler, "forward", asked)
-    rays = slab_view(0).rays
-    seen = slab.render(rays)
-    assert len(seen.rgb) == len(rays)
-    first, *others = (len(one.t) for one in found)
-    most = SAMPLED_CHUNKS * slab.chunk
-    assert first > most >= max(others) > most - 200, "200 a ray: known from the second part on"
 
 
 def test_render_rays_past_bounds_show_background(slab: NeRF3D):

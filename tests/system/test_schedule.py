@@ -28,11 +28,6 @@ def test_schedule_falls_to_final_factor(schedule, final):
     assert values[100] == pytest.approx(halfway)
 
 
-def test_constant_schedule_stays():
-    assert {constant(p) for p in STEPS} == {1.0}
-    assert {constant(p, 0, 0.1) for p in STEPS if p >= 0.1} == {1.0}
-
-
 @SCHEDULES
 def test_schedule_inverse_root_lowers_rate_of_many_steps(schedule):
     assert schedule(0.5, 0, inverse_root=100) == schedule(0.5, 9999) == schedule(0.5)

@@ -2,24 +2,19 @@
 
 import json
 import resource
-import shutil
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
-from nerf_lightning.callbacks import Checkpoints, HeldOut, Progress
-from nerf_lightning.callbacks.checkpoints import check_disk
+from nerf_lightning.callbacks import Evaluation, HeldOut, Progress
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.cli.app import fail
 from nerf_lightning.config.compose import composed
-from nerf_lightning.errors import NoRoom
 from nerf_lightning.model import TensoRFField
-from nerf_lightning.runs.folder import load_run
 from nerf_lightning.runs.owner import LOCK, MARKER
 from nerf_lightning.system import System
 from nerf_lightning.training.train import train
@@ -80,7 +75,7 @@ MOMENTS = {
     "in a step": (Progress, "on_train_batch_end", STOP),
     "before a measurement": (HeldOut, "measure", STOP),
     "while a view is rendered": (System, "evaluate_held_out", STOP),
-    "in the test": (Checkpoints, "on_test_batch_end", 12),
+    "in the test": (Evaluation, "on_test_batch_end", 12),
 }
 
 
@@ -156,22 +151,6 @@ def lift_limit(limit: Callable[[int], None]) -> Callable[[Exception], None]:
         fail(error)
 
     return lift_and_fail
-
-
-def test_checkpoints_that_do_not_fit_are_refused_before_training(undisturbed: Path, inside, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
-        code, _, err = inside(*SMALL)
-    assert code == 2 and err.count("\n") == 1 and "MB for checkpoints" in err, err
-    assert not list(Path().iterdir())
-    system, folder = load_run(undisturbed).system, undisturbed / "checkpoints"
-    size = (folder / "last.ckpt").stat().st_size
-    one = 4 * 3 * sum(p.numel() for p in system.parameters())
-    assert one <= size < one + 60_000, "the rest does not grow with the model"
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=one))
-    check_disk(folder, system)  # two are there already, and are replaced
-    with pytest.raises(NoRoom):
-        check_disk(undisturbed / "elsewhere", system)
 
 
 def test_growing_field_counts_its_last_size():

@@ -18,7 +18,7 @@ SMALL = (
     ("source", "kept"),
     [
         (["dataset=photos", "dataset.path=published.npz"], "from_photos"),
-        (["dataset=lego", "dataset.url=http://stranger.example/published.npz", "dataset.folder=."], "from_download"),
+        (["dataset=lego", "dataset.url=http://stranger.example/published.npz", "dataset.folder=."], "from_photos"),
         (["dataset=bricks", "dataset.size=16", "dataset.train_views=4", "dataset.val_views=2"], "from_photos"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
@@ -33,7 +33,7 @@ def test_a_moved_run_goes_on_and_is_measured(source: list[str], kept: str, insid
     assert code == 0, err
     config = yaml.safe_load((tmp_path / "moved" / "config.yaml").read_text(encoding="utf-8"))
     dataset = config["dataset"]
-    assert dataset["_target_"] == f"nerf_lightning.dataset.{kept}"
+    assert dataset["_target_"] == f"nerf_lightning.sources.{kept}"
     assert (dataset["path"], dataset["rays"]) == (str(tmp_path / "elsewhere.npz"), 64)
     assert config["budget"]["steps"] == 4
     (tmp_path / "elsewhere.npz").rename(tmp_path / "last.npz")

@@ -11,7 +11,7 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
-from nerf_lightning.callbacks.results import peak_memory_bytes
+from nerf_lightning.callbacks.evaluation import peak_memory_bytes
 from nerf_lightning.config.build import build_system, build_trainer, device_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.limits import Limits, limits_of

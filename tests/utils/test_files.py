@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerf_lightning.callbacks.checkpoints import InPlace
+from nerf_lightning.callbacks.checkpoints import AtomicCheckpointIO
 from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.utils.files import (
     atomic,
@@ -55,8 +55,8 @@ def test_full_disk_keeps_what_was_there(tmp_path: Path):
     path.write_text("old")
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (5000, hard))
-        with pytest.raises(NoRoom, match="a.ckpt: found no space left"), atomic(path) as temporary:
-            InPlace().save_checkpoint({"weights": torch.zeros(5000)}, temporary)
+        with pytest.raises(NoRoom, match="a.ckpt: found no space left"):
+            AtomicCheckpointIO().save_checkpoint({"weights": torch.zeros(5000)}, path)
         with pytest.raises(NoRoom), atomic_folder(tmp_path / "b") as folder:
             (folder / "c").write_bytes(bytes(9000))
     finally:

@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_matrix
 
+from nerf_lightning.cameras import Distortion
 from nerf_lightning.capture.poses.geometry import to_matrix
 from nerf_lightning.capture.tags.detect import Mark
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 
 LENS_PARAMETERS = ("focal", "aspect", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """fx = focal, fy = focal * aspect; distortion in OpenCV's order."""
@@ -22,7 +23,7 @@ class Bundle:
     Photos and tags are numbered; `marks[p]` maps a tag's number to its mark in photo p.
     """
 
-    lens: Lens
+    lens: Intrinsics
     w2c: Float[np.ndarray, "P 4 4"]
     """World to camera, by photo."""
     tags: Float[np.ndarray, "T 4 4"]
@@ -32,17 +33,19 @@ class Bundle:
     """How far the corners of each tag stand out of its plane, alternately up and down, metres: paper is seldom flat."""
 
 
-def lens_vector(lens: Lens) -> Float[np.ndarray, "9"]:
-    return np.array([lens.fx, lens.fy / lens.fx, lens.cx, lens.cy, *lens.distortion])
+def lens_vector(lens: Intrinsics) -> Float[np.ndarray, "9"]:
+    return np.array([lens.fx, lens.fy / lens.fx, lens.cx, lens.cy, *lens.opencv])
 
 
-def lens_with(lens: Lens, vector: Float[np.ndarray, "9"]) -> Lens:
+def lens_with(lens: Intrinsics, vector: Float[np.ndarray, "9"]) -> Intrinsics:
     focal, aspect, cx, cy, *distortion = (float(v) for v in vector)
     k1, k2, p1, p2, k3 = distortion
-    return replace(lens, fx=focal, fy=focal * aspect, cx=cx, cy=cy, distortion=(k1, k2, p1, p2, k3))
+    return replace(
+        lens, fx=focal, fy=focal * aspect, cx=cx, cy=cy, distortion=Distortion(k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
+    )
 
 
-def simplified(lens: Lens, free: tuple[str, ...]) -> Lens:
+def simplified(lens: Intrinsics, free: tuple[str, ...]) -> Intrinsics:
     """The lens with plain values (square pixels, centred, no distortion) for what is not free; unchanged for ()."""
     if not free:
         return lens

@@ -11,7 +11,7 @@ import numpy as np
 from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS
 from nerf_lightning.capture.poses.solve import Pose, Solved, misfits, packed, select_model, solve
 from nerf_lightning.capture.tags.detect import Mark, Sighting
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ TILT_ADVICE = "tilt the camera by 20 to 45 degrees in several photos, in differe
 class Calibration:
     """A calibrated lens, and the photos and figures behind it."""
 
-    lens: Lens
+    lens: Intrinsics
     deviations: dict[str, float]
     """Standard deviations of the free parameters; the others kept their plain values."""
     rms: float
@@ -67,7 +67,7 @@ class Calibration:
     warnings: list[str]
 
 
-def first_lens(sightings: Sequence[Sighting]) -> Lens:
+def first_lens(sightings: Sequence[Sighting]) -> Intrinsics:
     """A lens to start from: only the focal length is fitted, with each mark as a target of its own (Zhang 2000, by OpenCV)."""
     width, height = sightings[0].width, sightings[0].height
     marks = [mark for sighting in sightings for mark in sighting.marks.values()]
@@ -87,7 +87,7 @@ def first_lens(sightings: Sequence[Sighting]) -> Lens:
         if np.isfinite(K).all() and 0.2 < K[0, 0] / max(width, height) < 20:
             found.append((error, float(K[0, 0])))
     focal = min(found)[1] if found else 1.2 * max(width, height)
-    return Lens(width, height, focal, focal, width / 2, height / 2)
+    return Intrinsics(width, height, focal, focal, width / 2, height / 2)
 
 
 def calibrate(folder: Path, sightings: Sequence[Sighting], layout: dict[int, Pose] | None) -> Calibration:
@@ -176,7 +176,7 @@ def reprojection_message(error: float, usual: float) -> str:
     return f"reprojection error {error:.1f} pixels (median {usual:.2f} pixels)"
 
 
-def _fit(folder: Path, lens: Lens, used: list[Sighting], layout: dict[int, Pose] | None) -> Solved:
+def _fit(folder: Path, lens: Intrinsics, used: list[Sighting], layout: dict[int, Pose] | None) -> Solved:
     """Poses and layout from the first guess of the lens, then the best lens model that the number of photos allows."""
     marks: list[dict[int, Mark]] = [s.marks for s in used]
     rough = MODELS[1][1] if len(used) >= MODELS[1][0] else MODELS[0][1]

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d, shift
 
 from nerf_lightning.capture.poses.geometry import inverse, move, normalised
 from nerf_lightning.capture.poses.pose import Hypothesis
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 
 Observation = tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 2"]]
 """Points in the world, metres, and their pixels in one photo."""
@@ -39,7 +39,7 @@ MIN_PHOTOS = 4
 
 
 def resolve_flips(
-    lens: Lens, hypotheses: Sequence[Sequence[Hypothesis]], observations: Sequence[Observation]
+    lens: Intrinsics, hypotheses: Sequence[Sequence[Hypothesis]], observations: Sequence[Observation]
 ) -> list[int]:
     """Chooses a pose for each photo: the one nearest to its posterior mean direction given all photos.
 
@@ -121,7 +121,7 @@ class Chart:
 def _squared_errors(
     directions: Float[np.ndarray, "C 3"],
     across: Float[np.ndarray, "C 3"],
-    lens: Lens,
+    lens: Intrinsics,
     w2c: Float[np.ndarray, "4 4"],
     points: Float[np.ndarray, "M 3"],
     pixels: Float[np.ndarray, "M 2"],

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 
 
 def to_matrix(vector: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
@@ -40,19 +40,21 @@ def move(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]) -> 
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def project(lens: Lens, w2c: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M 2"]:
+def project(
+    lens: Intrinsics, w2c: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]
+) -> Float[np.ndarray, "M 2"]:
     """Where a photo shows points of the world; pixel centres at +0.5, as in `lens`."""
     vector = to_vector(w2c)
-    pixels, _ = cv2.projectPoints(points.reshape(-1, 1, 3), vector[:3], vector[3:], lens.K, np.array(lens.distortion))
+    pixels, _ = cv2.projectPoints(points.reshape(-1, 1, 3), vector[:3], vector[3:], lens.K, lens.opencv)
     return np.asarray(pixels).reshape(-1, 2)
 
 
-def folds(lens: Lens) -> bool:
+def folds(lens: Intrinsics) -> bool:
     """Whether the radial distortion turns back before the picture's farthest corner, so that two directions share a pixel.
 
     No lens does that, but a polynomial fitted only to the middle of the picture may.
     """
-    k1, k2, _, _, k3 = lens.distortion
+    k1, k2, _, _, k3 = lens.opencv
     x, y = max(lens.cx, lens.width - lens.cx) / lens.fx, max(lens.cy, lens.height - lens.cy) / lens.fy
     r = np.linspace(0, 4, 4001)
     distorted = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
@@ -61,11 +63,11 @@ def folds(lens: Lens) -> bool:
     return not len(reached) or bool(len(turns) and turns[0] < reached[0])
 
 
-def normalised(lens: Lens, pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
+def normalised(lens: Intrinsics, pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
     """Pixels as tangents x / z, y / z in the camera frame, the lens's distortion undone."""
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
     undistort = getattr(cv2, "undistortPointsIter", None)  # OpenCV 4 took the criteria under another name
-    given = pixels.reshape(-1, 1, 2), lens.K, np.array(lens.distortion)
+    given = pixels.reshape(-1, 1, 2), lens.K, lens.opencv
     if undistort is not None:
         return np.asarray(undistort(*given, None, None, stop)).reshape(-1, 2)
     return np.asarray(cv2.undistortPoints(*given, None, None, None, stop)).reshape(-1, 2)

@@ -17,7 +17,7 @@ from nerf_lightning.capture.poses.geometry import (
     to_vector,
 )
 from nerf_lightning.capture.tags.detect import Mark
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 
 SAME = np.radians(1.0)
 """Solutions that differ by less count as one."""
@@ -35,18 +35,18 @@ class Hypothesis:
     """Sum of squared reprojection distances, pixels^2."""
 
 
-def squares_of(lens: Lens, pose: Float[np.ndarray, "4 4"], points: np.ndarray, pixels: np.ndarray) -> float:
+def squares_of(lens: Intrinsics, pose: Float[np.ndarray, "4 4"], points: np.ndarray, pixels: np.ndarray) -> float:
     """Sum of squared distances between projected points and their pixels; infinite where one is behind the camera."""
     if (move(pose, points)[:, 2] <= 0).any():
         return float("inf")
     return float(((project(lens, pose, points) - pixels) ** 2).sum())
 
 
-def polished(lens: Lens, pose: Float[np.ndarray, "4 4"], points: np.ndarray, pixels: np.ndarray) -> Hypothesis:
+def polished(lens: Intrinsics, pose: Float[np.ndarray, "4 4"], points: np.ndarray, pixels: np.ndarray) -> Hypothesis:
     """The nearest minimum of the reprojection error (Levenberg-Marquardt)."""
     vector = to_vector(pose)
     turn, shift = cv2.solvePnPRefineLM(
-        points, pixels, lens.K, np.array(lens.distortion), vector[:3, None].copy(), vector[3:, None].copy()
+        points, pixels, lens.K, lens.opencv, vector[:3, None].copy(), vector[3:, None].copy()
     )
     better = to_matrix(np.concatenate([turn.reshape(3), shift.reshape(3)]))
     candidates = [Hypothesis(p, squares_of(lens, p, points, pixels)) for p in (better, pose)]
@@ -62,7 +62,7 @@ def distinct(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     return kept[:HYPOTHESES]
 
 
-def mark_poses(lens: Lens, mark: Mark) -> list[Hypothesis]:
+def mark_poses(lens: Intrinsics, mark: Mark) -> list[Hypothesis]:
     """Tag to camera from one flat mark: one solution or two, best first.
 
     A flat target seen from afar looks the same from two sides (Collins and Bartoli 2014, "Infinitesimal plane-based pose
@@ -76,7 +76,9 @@ def mark_poses(lens: Lens, mark: Mark) -> list[Hypothesis]:
     return distinct([polished(lens, pose, mark.points, mark.pixels) for pose in poses])
 
 
-def photo_poses(lens: Lens, marks: dict[int, Mark], tags: dict[int, Float[np.ndarray, "4 4"]]) -> list[Hypothesis]:
+def photo_poses(
+    lens: Intrinsics, marks: dict[int, Mark], tags: dict[int, Float[np.ndarray, "4 4"]]
+) -> list[Hypothesis]:
     """World to camera from all marks of a photo together, best first.
 
     Args:

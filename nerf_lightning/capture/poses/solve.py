@@ -13,7 +13,7 @@ from nerf_lightning.capture.poses.geometry import folds, inverse
 from nerf_lightning.capture.poses.pose import Hypothesis, mark_poses, photo_poses, points_and_pixels
 from nerf_lightning.capture.poses.refine import Refined, refine, rms_length
 from nerf_lightning.capture.tags.detect import Mark
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 
 Pose = Float[np.ndarray, "4 4"]
 AGREE_ANGLE = np.radians(10.0)
@@ -30,7 +30,7 @@ OUTLIER_PIXELS = 1.0
 class Solved:
     """Cameras and tags in one frame."""
 
-    lens: Lens
+    lens: Intrinsics
     tags: dict[int, Pose]
     """Tag to world."""
     w2c: dict[int, Pose]
@@ -92,7 +92,7 @@ def place_tags(pairs: Mapping[tuple[int, int], tuple[Pose, int]], reference: int
 
 
 def solve(
-    lens: Lens, marks: Sequence[dict[int, Mark]], layout: dict[int, Pose] | None, free_lens: tuple[str, ...] = ()
+    lens: Intrinsics, marks: Sequence[dict[int, Mark]], layout: dict[int, Pose] | None, free_lens: tuple[str, ...] = ()
 ) -> Solved | None:
     """Places photos and tags, and refines everything together.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerf_lightning.capture.poses.solve import Pose
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.placing.structure import SIDE, find_features, match_photos, write_copies
 from nerf_lightning.dataset.resize import fit_size
 
@@ -36,7 +36,7 @@ class LocalizedPhoto:
 
 
 def place_by_texture(
-    paths: Sequence[Path], lens: Lens, w2c: Mapping[str, Pose], untagged: Sequence[str]
+    paths: Sequence[Path], lens: Intrinsics, w2c: Mapping[str, Pose], untagged: Sequence[str]
 ) -> tuple[dict[str, LocalizedPhoto], dict[str, str]]:
     """Places photos against points that placed photos show; those and the lens stay as they are, and so do scale and frame.
 
@@ -59,7 +59,7 @@ def place_by_texture(
     pycolmap.set_random_seed(0)
     width, height = fit_size(lens.width, lens.height, SIDE)
     x, y = width / lens.width, height / lens.height
-    parameters = [lens.fx * x, lens.fy * y, lens.cx * x, lens.cy * y, *lens.distortion, 0.0, 0.0, 0.0]
+    parameters = [lens.fx * x, lens.fy * y, lens.cx * x, lens.cy * y, *lens.opencv, 0.0, 0.0, 0.0]
     camera = pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=parameters)
     camera.has_prior_focal_length = True
     names = {f"{number:06d}.png": path.name for number, path in enumerate(paths)}

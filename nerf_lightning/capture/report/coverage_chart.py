@@ -10,7 +10,7 @@ from matplotlib.patches import Polygon
 from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS, lens_vector
 from nerf_lightning.capture.poses.calibrate import Calibration
 from nerf_lightning.capture.poses.geometry import project
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.drawing.ink import BLUE, DPI, SKY, as_picture
 
 UNITS = {"focal": "px", "cx": "px", "cy": "px"}
@@ -47,13 +47,13 @@ def describe_lens(found: Calibration) -> str:
     return "set free:  " + ",   ".join(free) + (f";   kept plain: {', '.join(fixed)}" if fixed else "")
 
 
-def displacement(lens: Lens, pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
+def displacement(lens: Intrinsics, pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
     """How far the distortion moves points that a pinhole camera would show at these pixels."""
     rays = (pixels - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
     return project(lens, np.eye(4), np.column_stack([rays, np.ones(len(rays))])) - pixels
 
 
-def _draw_distortion(figure: Figure, axes: Axes, lens: Lens) -> None:
+def _draw_distortion(figure: Figure, axes: Axes, lens: Intrinsics) -> None:
     """How far, and in which direction, the lens moves points."""
     as_picture(axes, lens.width, lens.height)
     x, y = np.meshgrid(np.linspace(0, lens.width, 97), np.linspace(0, lens.height, 73))

@@ -8,14 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from nerf_lightning.capture.photo_status import PhotoStatus, subsample_photos
-from nerf_lightning.dataset.lens import Lens
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.drawing.ink import BLUE, DPI, FONT, SKY, VERMILLION, as_picture, magnification, readable, shortened
 
 MAX_NAMES = 60
 """Photos whose names fit below the bars."""
 
 
-def error_chart(folders: Mapping[str, Sequence[PhotoStatus]], lens: Lens) -> Figure:
+def error_chart(folders: Mapping[str, Sequence[PhotoStatus]], lens: Intrinsics) -> Figure:
     """For each folder, the error of every photo, and the residuals of all corners by their place in the picture."""
     figure = Figure(figsize=(18, 6.5 * len(folders)), dpi=DPI, layout="constrained")
     grid = figure.subplots(len(folders), 2, squeeze=False, width_ratios=(1.15, 1))
@@ -46,7 +46,7 @@ def _draw_bars(axes: Axes, title: str, statuses: Sequence[PhotoStatus]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _draw_residuals(axes: Axes, title: str, statuses: Sequence[PhotoStatus], lens: Lens) -> None:
+def _draw_residuals(axes: Axes, title: str, statuses: Sequence[PhotoStatus], lens: Intrinsics) -> None:
     as_picture(axes, lens.width, lens.height)
     seen, residuals = collect_residuals(statuses)
     if not len(seen):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.memory import check_memory
 
@@ -126,7 +126,7 @@ def check_split_size(where: object, key: str, count: int) -> None:
         raise InputError(where, key, "0 views", "at least one", "a scene needs training and held-out views")
 
 
-def check_optics(where: object, key: str, optics: Optics) -> Optics:
+def check_optics(where: object, key: str, optics: Intrinsics) -> Intrinsics:
     """The optics, if a camera can have its size, intrinsics and distortion."""
     o = optics
     if not (1 <= o.width <= MAX_PIXELS and 1 <= o.height <= MAX_PIXELS):

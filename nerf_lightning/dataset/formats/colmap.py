@@ -10,7 +10,7 @@ from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.orientation import choose_orientations
 from nerf_lightning.dataset.posed import Hints, build_scene
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
+from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions, Shot
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.text import join_truncated
 
@@ -48,7 +48,11 @@ def find_models(place: Path) -> list[Path]:
 
 
 def load_colmap(
-    place: Path, name: str | None = None, reading: Reading = AS_IT_IS, photos: Path | None = None, upright: bool = False
+    place: Path,
+    name: str | None = None,
+    options: PhotoLoadOptions = AS_IT_IS,
+    photos: Path | None = None,
+    upright: bool = False,
 ) -> Scene:
     """Reads a COLMAP model (world-to-camera poses, inverted here) and its photos, sorted by name.
 
@@ -58,7 +62,7 @@ def load_colmap(
     Args:
         place: the scene's folder, or the model's.
         name: defaults to the scene's folder's name.
-        reading: see there.
+        options: see there.
         photos: their folder; None looks for it.
         upright: whether the model is of photos turned as their EXIF data say.
 
@@ -84,14 +88,14 @@ def load_colmap(
     masks = find_masks(found_files, scene_folder)
     stated = [(image.optics.width, image.optics.height) for image, _ in placed]
     turned = (
-        [upright] * len(placed) if upright else choose_orientations(folder, found_files, stated, reading.orientation)
+        [upright] * len(placed) if upright else choose_orientations(folder, found_files, stated, options.orientation)
     )
     shots = [
         Shot(image.name, file, image.c2w, image.optics, mask, turn)
         for (image, file), mask, turn in zip(placed, masks, turned, strict=True)
     ]
     named = place if scene_folder.resolve().is_relative_to(place.resolve()) else scene_folder
-    return build_scene(place, name or named.resolve().name, shots, reading, hints=Hints(points=points))
+    return build_scene(place, name or named.resolve().name, shots, options, hints=Hints(points=points))
 
 
 def find_photo_folder(model: Path, place: Path, names: list[str]) -> Path:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf_lightning.cameras import Distortion, Projection
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.optics import Optics
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.parsing import read_content
 
@@ -46,7 +46,7 @@ class Image:
     """One placed photo."""
 
     name: str
-    optics: Optics
+    optics: Intrinsics
     c2w: Float[np.ndarray, "4 4"]
     """Camera to world, OpenCV frame, the model's unit."""
 
@@ -94,7 +94,9 @@ def _read_all(path: Path, parse: Callable[[Path], Iterable[Row]]) -> list[Row]:
         raise InputError(path, "", f"a damaged file ({error})", "a whole COLMAP file", "copy it again") from error
 
 
-def make_optics(where: object, key: str, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Optics:
+def make_optics(
+    where: object, key: str, model: str, width: int, height: int, parameters: tuple[float, ...]
+) -> Intrinsics:
     """A camera in COLMAP's terms."""
     names = parameter_names(where, key, model)
     if len(names) != len(parameters):
@@ -103,7 +105,7 @@ def make_optics(where: object, key: str, model: str, width: int, height: int, pa
     focal = named.pop("f", 0.0)
     fx, fy, cx, cy = (named.pop(name, focal) for name in ("fx", "fy", "cx", "cy"))
     projection = Projection.FISHEYE if "FISHEYE" in model else Projection.PERSPECTIVE
-    return checks.check_optics(where, key, Optics(width, height, fx, fy, cx, cy, Distortion(**named), projection))
+    return checks.check_optics(where, key, Intrinsics(width, height, fx, fy, cx, cy, Distortion(**named), projection))
 
 
 def parameter_names(where: object, key: str, model: str) -> list[str]:

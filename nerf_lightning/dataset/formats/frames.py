@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from nerf_lightning.cameras import Distortion, Projection, in_other_frame
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.optics import Optics, equirectangular
+from nerf_lightning.dataset.intrinsics import Intrinsics, equirectangular
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.parsing import read_json
 
@@ -118,7 +118,7 @@ def read_size(frame: Frame) -> tuple[int, int] | None:
     return round(width), round(height)
 
 
-def read_optics(frame: Frame, width: int, height: int) -> Optics:
+def read_optics(frame: Frame, width: int, height: int) -> Intrinsics:
     """Intrinsics of one frame for photos of a size, in pixels of that size."""
     values = frame.values
     model = values.get("camera_model") or "OPENCV"
@@ -146,7 +146,7 @@ def read_optics(frame: Frame, width: int, height: int) -> Optics:
     cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
     distortion = Distortion(**{key: frame.number(key) or 0.0 for key in names})
     projection = Projection.FISHEYE if fisheye else Projection.PERSPECTIVE
-    return checks.check_optics(frame.where, "", Optics(width, height, fx, fy, cx, cy, distortion, projection))
+    return checks.check_optics(frame.where, "", Intrinsics(width, height, fx, fy, cx, cy, distortion, projection))
 
 
 def read_focal(frame: Frame, axis: str, side: int, fisheye: bool) -> float | None:

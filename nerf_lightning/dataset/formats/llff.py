@@ -6,12 +6,12 @@ import numpy as np
 
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.formats.names import list_images
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.masks import find_masks
-from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.dataset.orientation import choose_orientations
 from nerf_lightning.dataset.posed import Hints, build_scene
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
+from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions, Shot
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.parsing import Header, read_npy
 
@@ -19,7 +19,7 @@ POSES = "poses_bounds.npy"
 PHOTO_FOLDERS = ("images", "images_2", "images_4", "images_8", "")
 
 
-def load_llff(folder: Path, name: str | None = None, reading: Reading = AS_IT_IS) -> Scene:
+def load_llff(folder: Path, name: str | None = None, options: PhotoLoadOptions = AS_IT_IS) -> Scene:
     """Reads poses_bounds.npy and the photos beside it, in the order of their names.
 
     A row holds a pose of 3 x 5 numbers (rotation with columns down, right, backward; centre; height, width and focal length in
@@ -28,7 +28,7 @@ def load_llff(folder: Path, name: str | None = None, reading: Reading = AS_IT_IS
     Args:
         folder: holds poses_bounds.npy and `images`, or photos of another size in `images_2`, `images_4` or `images_8`.
         name: defaults to the folder's name.
-        reading: see there.
+        options: see there.
 
     Raises:
         InputError: a damaged file, or as many photos as poses are not there.
@@ -48,14 +48,14 @@ def load_llff(folder: Path, name: str | None = None, reading: Reading = AS_IT_IS
     cameras = []
     for photo, (height, width, focal) in zip(photos, columns[:, :, 4].tolist(), strict=True):
         width, height, focal = checks.parse_array(path, photo.name, [width, height, focal], 3).tolist()
-        optics = Optics(round(width), round(height), focal, focal, width / 2, height / 2)
+        optics = Intrinsics(round(width), round(height), focal, focal, width / 2, height / 2)
         cameras.append(checks.check_optics(path, photo.name, optics))
-    turned = choose_orientations(folder, photos, [(one.width, one.height) for one in cameras], reading.orientation)
+    turned = choose_orientations(folder, photos, [(one.width, one.height) for one in cameras], options.orientation)
     parts = zip(photos, c2w, cameras, find_masks(photos, folder), turned, strict=True)
     shots = [Shot(photo.name, photo, *rest) for photo, *rest in parts]
     nearest = float(rows[:, 15].min())
     hints = Hints(nearest=nearest if 0 < nearest <= checks.FARTHEST else None)
-    return build_scene(folder, name or folder.resolve().name, shots, reading, hints=hints)
+    return build_scene(folder, name or folder.resolve().name, shots, options, hints=hints)
 
 
 def find_photos(folder: Path, count: int) -> list[Path]:

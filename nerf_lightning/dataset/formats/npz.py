@@ -15,10 +15,10 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.posed import Hints, PosedViews, assemble_scene, split_shots
+from nerf_lightning.dataset.posed import Hints, assemble_scene, split_shots
 from nerf_lightning.dataset.resize import fit_size, resize_views
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import AS_IT_IS, Reading
+from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions
 from nerf_lightning.dataset.size import choose_resize
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
@@ -33,12 +33,12 @@ PAIRS = {"images_train": "c2ws_train", "images_val": "c2ws_val", "images_test": 
 OTHERS = ("focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
 
 
-def load_npz(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -> Scene:
+def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS_IT_IS) -> Scene:
     """Reads the course format. Poses are OpenCV camera to world already: nothing is converted.
 
     Entries, with V views a split:
         images_train, images_val, images_test: (V, H, W, 3 or 4), uint8 or floats in [0, 1]; without val, test is held out, or
-            every `reading.holdout`-th of train.
+            every `options.holdout`-th of train.
         c2ws_train, c2ws_val, c2ws_test: (V, 4, 4); the last without images is the orbit, made up like the training cameras if
             absent.
         focal: pixels, with the principal point in the middle; or K: (3, 3), for all views, which then rules.
@@ -52,39 +52,38 @@ def load_npz(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -
     """
     data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS), partial(_check_headers, path))
     count, height, width, channels = data["images_train"].shape
-    longest = choose_resize(path, [(width, height)] * count, channels, reading.resize)
+    longest = choose_resize(path, [(width, height)] * count, channels, options.resize)
     K = _intrinsics(path, data, width, height)
 
-    def read_poses(key: str) -> tuple[Float[np.ndarray, "V 4 4"], Cameras]:
+    def read_poses(key: str) -> Cameras:
         c2w = checks.check_poses(path, key + "[{}]", data[key])
         checks.check_split_size(path, key, len(c2w))
-        return c2w, Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height)
+        return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height)
 
-    def read_views(key: str) -> PosedViews:
-        c2w, cameras = read_poses(PAIRS[key])
-        views = Views.of(torch.from_numpy(_bytes(path, key, data[key])), cameras)
-        return PosedViews(resize_views(views, longest), c2w)
+    def read_views(key: str) -> Views:
+        views = Views.of(torch.from_numpy(_bytes(path, key, data[key])), read_poses(PAIRS[key]))
+        return resize_views(views, longest)
 
     train, *held_out = (read_views(key) for key in PAIRS if key in data)
     if not held_out:
-        log.warning("%s: no held-out photos: every %d-th training photo is held out", path, reading.holdout)
-        split = split_shots(path, len(train.c2w), reading.holdout)
-        train, val = (PosedViews(train.views[torch.tensor(part)], train.c2w[part]) for part in (split.train, split.val))
+        log.warning("%s: no held-out photos: every %d-th training photo is held out", path, options.holdout)
+        split = split_shots(path, len(train), options.holdout)
+        train, val = (train[torch.tensor(part)] for part in (split.train, split.val))
         held_out = [val]
     near, far = (checks.parse_number(path, key, data[key]) if key in data else None for key in ("near", "far"))
     checks.check_near_far(path, near, far)
     has_path = "c2ws_test" in data and "images_test" not in data
     hints = Hints(
         keep_frame=True,
-        path=read_poses("c2ws_test")[1].resized(fit_size(width, height, longest)) if has_path else None,
+        path=read_poses("c2ws_test").resized(fit_size(width, height, longest)) if has_path else None,
         background=_background(path, data["background"]) if "background" in data else None,
-        bounds=_bounds(path, data, reading),
+        bounds=_bounds(path, data, options),
         to_source=checks.check_similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,
         near=near,
         far=far,
     )
     name = name or re.sub(r"_\d+x\d+$", "", path.stem)
-    return assemble_scene(path, name, train, held_out[0], held_out[1] if held_out[1:] else None, reading, hints)
+    return assemble_scene(path, name, [train, *held_out], options, hints)
 
 
 def _check_headers(path: Path, headers: Headers) -> None:
@@ -131,13 +130,13 @@ def _background(path: Path, colour: Shaped[np.ndarray, "..."]) -> tuple[float, f
     return red, green, blue
 
 
-def _bounds(path: Path, data: Mapping[str, np.ndarray], reading: Reading) -> Bounds | None:
+def _bounds(path: Path, data: Mapping[str, np.ndarray], options: PhotoLoadOptions) -> Bounds | None:
     """The box that a file states."""
     if "aabb" not in data:
         return None
     aabb = torch.from_numpy(checks.check_box(path, "aabb", data["aabb"])).float()
     unbounded = bool(checks.parse_number(path, "unbounded", data.get("unbounded", np.array(0))))
-    return Bounds(aabb, unbounded if reading.bounded == "auto" else reading.bounded == "false")
+    return Bounds(aabb, unbounded if options.bounded == "auto" else options.bounded == "false")
 
 
 def save_npz(scene: Scene, path: Path) -> None:

@@ -12,12 +12,12 @@ from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset.formats.decode import image_header
 from nerf_lightning.dataset.formats.frames import Frame, read_frames, read_optics, read_size
 from nerf_lightning.dataset.formats.names import find_images, fold_name, keep_present
+from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.masks import find_masks
-from nerf_lightning.dataset.optics import Optics
 from nerf_lightning.dataset.orientation import choose_orientations
 from nerf_lightning.dataset.posed import Hints, Split, build_scene, split_shots
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import AS_IT_IS, Reading, Shot
+from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions, Shot
 from nerf_lightning.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -27,7 +27,7 @@ Photo = tuple[Frame, Path]
 """A frame, and its file."""
 
 
-def load_transforms(path: Path, name: str | None = None, reading: Reading = AS_IT_IS) -> Scene:
+def load_transforms(path: Path, name: str | None = None, options: PhotoLoadOptions = AS_IT_IS) -> Scene:
     """Reads transforms.json: OpenGL camera-to-world poses, converted to OpenCV here.
 
     Frames whose photo is not there are left out with a warning, as instant-ngp does (its own fox is shipped so), unless
@@ -36,7 +36,7 @@ def load_transforms(path: Path, name: str | None = None, reading: Reading = AS_I
     Args:
         path: transforms.json or the folder that holds it.
         name: defaults to the folder's name, or the file's if that is not transforms.json.
-        reading: see there; frames are sorted by file_path, and the file may name its own split.
+        options: see there; frames are sorted by file_path, and the file may name its own split.
 
     Raises:
         InputError: anything missing or malformed, or a lens that is not known here.
@@ -47,21 +47,21 @@ def load_transforms(path: Path, name: str | None = None, reading: Reading = AS_I
     photos = keep_present(file, frames, find_images(file.parent, names, file))
     folder = file.resolve().parent
     split = read_split(file, frames[0].values, names, [frame.name for frame, _ in photos])
-    shots = make_shots(file, photos, folder, reading)
-    return build_scene(path, name or (folder.name if file.stem == "transforms" else file.stem), shots, reading, split)
+    shots = make_shots(file, photos, folder, options)
+    return build_scene(path, name or (folder.name if file.stem == "transforms" else file.stem), shots, options, split)
 
 
-def load_blender(folder: Path, name: str | None = None, reading: Reading = AS_IT_IS) -> Scene:
+def load_blender(folder: Path, name: str | None = None, options: PhotoLoadOptions = AS_IT_IS) -> Scene:
     """Reads transforms_train.json, transforms_val.json and transforms_test.json, as the NeRF paper's renders have them.
 
     Every key of transforms.json counts. Held out is the val split, or test where val has no photos; with both, test is
     measured on at the end. A split whose photos are not there is a camera path; where no photos are held out, every
-    `reading.holdout`-th of the train split is. Photos with alpha stand on white, the format's convention.
+    `options.holdout`-th of the train split is. Photos with alpha stand on white, the format's convention.
 
     Args:
         folder: holds transforms_train.json.
         name: defaults to the folder's name.
-        reading: see there.
+        options: see there.
 
     Raises:
         InputError: anything missing or malformed.
@@ -82,16 +82,16 @@ def load_blender(folder: Path, name: str | None = None, reading: Reading = AS_IT
         present = keep_present(files[split], frames, images)
         parts[split] = list(range(len(photos), len(photos) + len(present)))
         photos += present
-    shots = make_shots(folder, photos, folder, reading)
+    shots = make_shots(folder, photos, folder, options)
     train, *held_out = parts.values()
     if held_out:
         parted = Split(train, *held_out)
     else:
-        parted = split_shots(folder, len(photos), reading.holdout)
-        log.warning("%s: no held-out photos: every %d-th training photo is held out", folder, reading.holdout)
+        parted = split_shots(folder, len(photos), options.holdout)
+        log.warning("%s: no held-out photos: every %d-th training photo is held out", folder, options.holdout)
     cameras = None if path is None else make_path(path, shots[0].optics)
     hints = Hints(alpha_background=WHITE, keep_frame=True, path=cameras)
-    return build_scene(folder, name or folder.resolve().name, shots, reading, parted, hints)
+    return build_scene(folder, name or folder.resolve().name, shots, options, parted, hints)
 
 
 def read_split(file: Path, content: Mapping[str, Any], names: Sequence[str], present: Sequence[str]) -> Split | None:
@@ -128,11 +128,11 @@ def read_split(file: Path, content: Mapping[str, Any], names: Sequence[str], pre
     return Split(train, val, *(part for part in test if part != val))
 
 
-def make_shots(source: Path, photos: Sequence[Photo], folder: Path, reading: Reading) -> list[Shot]:
+def make_shots(source: Path, photos: Sequence[Photo], folder: Path, options: PhotoLoadOptions) -> list[Shot]:
     """Posed photos with their intrinsics and masks."""
     files = [file for _, file in photos]
     stated = [read_size(frame) for frame, _ in photos]
-    turned = choose_orientations(source, files, stated, reading.orientation)
+    turned = choose_orientations(source, files, stated, options.orientation)
     masks = read_masks(source, photos, folder)
     shots = []
     for (frame, file), size, upright, mask in zip(photos, stated, turned, masks, strict=True):
@@ -157,7 +157,7 @@ def read_masks(source: Path, photos: Sequence[Photo], folder: Path) -> list[Path
     return [found.get(frame.where) for frame, _ in photos]
 
 
-def make_path(frames: Sequence[Frame], optics: Optics) -> Cameras:
+def make_path(frames: Sequence[Frame], optics: Intrinsics) -> Cameras:
     """Pinhole cameras along the poses of frames without photos, with the intrinsics of a photo."""
     c2w = torch.from_numpy(np.stack([frame.c2w for frame in frames]))
     K = torch.from_numpy(optics.K).repeat(len(frames), 1, 1)

@@ -4,6 +4,12 @@ Here features and coordinates come first and samples last ([F, N]), so that loop
 Work is split by the number of threads alone, never at random or by load: the same seed and threads give the same bits.
 """
 
-from nerf_lightning.kernels.cpu.compile import workers
+from importlib import import_module
+from types import ModuleType
 
-__all__ = ["workers"]
+
+def __getattr__(name: str) -> ModuleType:
+    """Imports a module when it is first used: where no fast version runs, nobody waits for numba."""
+    if name.startswith("_"):
+        raise AttributeError(name)
+    return import_module(f"{__name__}.{name}")

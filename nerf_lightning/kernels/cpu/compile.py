@@ -1,22 +1,34 @@
 """How the CPU kernels are compiled."""
 
+import functools
+import inspect
 from collections.abc import Callable
-from functools import partial
 
 import numba
 import torch
-from numba.core.dispatcher import Dispatcher
 
 # No fast maths. Numba optimises a function again for every other one it is linked into, and a process that compiles a kernel
 # runs another copy than one that loads it from the cache: where the optimiser may reorder or fuse, their last bits differ.
 # Vector code is written out instead: see `lanes`.
-inner = partial(numba.njit, cache=True, error_model="numpy")
+inner = functools.partial(numba.njit, cache=True, error_model="numpy")
 """Decorates functions that kernels call."""
 
 
-def kernel(function: Callable) -> Dispatcher:
-    """Decorates an entry point; its argument `workers` is the number of pieces its work is split into."""
-    return inner(function, parallel=True)
+def kernel(function: Callable) -> Callable:
+    """Decorates an entry point: it takes tensors, as contiguous arrays, and runs on as many threads as torch.
+
+    What it fills has to be contiguous already: of any other tensor it would fill a copy. An argument `workers`, the last, is
+    not given by callers: it is the number of pieces that the work is to be split into.
+    """
+    compiled, takes_workers = inner(function, parallel=True), "workers" in inspect.signature(function).parameters
+
+    @functools.wraps(function)
+    def run(*arguments):
+        given = [x.detach().contiguous().numpy() if isinstance(x, torch.Tensor) else x for x in arguments]
+        pieces = workers()
+        compiled(*given, pieces) if takes_workers else compiled(*given)
+
+    return run
 
 
 def workers() -> int:

@@ -8,59 +8,48 @@ from nerf_lightning.kernels.cpu.compile import kernel
 
 
 @kernel
-def forward(density, rgb, t, dt, offsets, colour, opacity, depth, before, workers):
+def forward(density, rgb, t, dt, offsets, colour, opacity, depth, before):
     """Fills the sums over each ray, colour [3, R], opacity [R], depth [R], and the transmittance before each sample [N]."""
-    rays = len(offsets) - 1
-    for worker in prange(workers):
-        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
-            optical = 0.0  # in double: the sum over a ray outgrows single precision
-            red, green, blue, covered, distance = 0.0, 0.0, 0.0, 0.0, 0.0
-            for n in range(offsets[ray], offsets[ray + 1]):
-                through = math.exp(-optical)
-                step = density[n] * dt[n]
-                weight = through * -math.expm1(-step)
-                before[n] = through
-                optical += step
-                red += weight * rgb[0, n]
-                green += weight * rgb[1, n]
-                blue += weight * rgb[2, n]
-                covered += weight
-                distance += weight * t[n]
-            colour[0, ray], colour[1, ray], colour[2, ray] = red, green, blue
-            opacity[ray], depth[ray] = covered, distance
+    for ray in prange(len(offsets) - 1):
+        optical = 0.0  # in double: the sum over a ray outgrows single precision
+        red, green, blue, covered, distance = 0.0, 0.0, 0.0, 0.0, 0.0
+        for n in range(offsets[ray], offsets[ray + 1]):
+            through = math.exp(-optical)
+            step = density[n] * dt[n]
+            weight = through * -math.expm1(-step)
+            before[n] = through
+            optical += step
+            red += weight * rgb[0, n]
+            green += weight * rgb[1, n]
+            blue += weight * rgb[2, n]
+            covered += weight
+            distance += weight * t[n]
+        colour[0, ray], colour[1, ray], colour[2, ray] = red, green, blue
+        opacity[ray], depth[ray] = covered, distance
 
 
 @kernel
-def backward(
-    density, rgb, t, dt, offsets, before, colour_above, opacity_above, depth_above, grad_density, grad_rgb, workers
-):
+def backward(density, rgb, t, dt, offsets, before, colour_above, opacity_above, depth_above, grad_density, grad_rgb):
     """Gradients of density [N] and rgb [3, N] from those of colour [3, R], opacity [R] and depth [R].
 
     With g_i the gradient of weight w_i:  d/d density_i = dt_i (T_{i+1} g_i - sum_{j > i} w_j g_j), taken from the far end.
     """
-    rays = len(offsets) - 1
-    for worker in prange(workers):
-        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
-            red, green, blue = colour_above[0, ray], colour_above[1, ray], colour_above[2, ray]
-            behind = 0.0
-            for n in range(offsets[ray + 1] - 1, offsets[ray] - 1, -1):
-                step = density[n] * dt[n]
-                after = before[n] * math.exp(-step)
-                weight = before[n] * -math.expm1(-step)
-                grad_weight = (
-                    red * rgb[0, n]
-                    + green * rgb[1, n]
-                    + blue * rgb[2, n]
-                    + opacity_above[ray]
-                    + depth_above[ray] * t[n]
-                )
-                grad_density[n] = dt[n] * (after * grad_weight - behind)
-                behind += weight * grad_weight
-                grad_rgb[0, n], grad_rgb[1, n], grad_rgb[2, n] = weight * red, weight * green, weight * blue
+    for ray in prange(len(offsets) - 1):
+        red, green, blue = colour_above[0, ray], colour_above[1, ray], colour_above[2, ray]
+        behind = 0.0
+        for n in range(offsets[ray + 1] - 1, offsets[ray] - 1, -1):
+            step = density[n] * dt[n]
+            after = before[n] * math.exp(-step)
+            weight = before[n] * -math.expm1(-step)
+            of_colour = red * rgb[0, n] + green * rgb[1, n] + blue * rgb[2, n]
+            grad_weight = of_colour + opacity_above[ray] + depth_above[ray] * t[n]
+            grad_density[n] = dt[n] * (after * grad_weight - behind)
+            behind += weight * grad_weight
+            grad_rgb[0, n], grad_rgb[1, n], grad_rgb[2, n] = weight * red, weight * green, weight * blue
 
 
 @kernel
-def visible(thickness, offsets, early_stop_eps, min_thickness, dropped, keep, counts, workers):
+def visible(thickness, offsets, early_stop_eps, min_thickness, dropped, keep, counts):
     """Marks samples that light can reach and that hold something, and counts them for each ray [R].
 
     Args:
@@ -68,37 +57,33 @@ def visible(thickness, offsets, early_stop_eps, min_thickness, dropped, keep, co
         min_thickness: alpha threshold, as an optical thickness: a sample below it holds nothing.
         dropped: optical thickness that those of a ray may have together; the later ones stay.
     """
-    rays = len(offsets) - 1
     furthest = -math.log(early_stop_eps)
-    for worker in prange(workers):
-        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
-            optical, thin, kept = 0.0, 0.0, 0
-            for n in range(offsets[ray], offsets[ray + 1]):
-                step = thickness[n]
-                nothing = step < min_thickness  # NaN stays, to be noticed
-                if nothing:
-                    thin += step
-                keep[n] = not (optical > furthest or (nothing and thin <= dropped))
-                kept += keep[n]
-                optical += step
-            counts[ray] = kept
+    for ray in prange(len(offsets) - 1):
+        optical, thin, kept = 0.0, 0.0, 0
+        for n in range(offsets[ray], offsets[ray + 1]):
+            step = thickness[n]
+            nothing = step < min_thickness  # NaN stays, to be noticed
+            if nothing:
+                thin += step
+            keep[n] = not (optical > furthest or (nothing and thin <= dropped))
+            kept += keep[n]
+            optical += step
+        counts[ray] = kept
 
 
 @kernel
-def gather(keep, offsets, kept_offsets, thickness, t, dt, out, out_ray, workers):
+def gather(keep, offsets, kept_offsets, thickness, t, dt, out, out_ray):
     """Packs the kept samples: their thickness, t and dt into out [3, K]."""
-    rays = len(offsets) - 1
-    for worker in prange(workers):
-        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
-            to = kept_offsets[ray]
-            for n in range(offsets[ray], offsets[ray + 1]):
-                if keep[n]:
-                    out[0, to], out[1, to], out[2, to], out_ray[to] = thickness[n], t[n], dt[n], ray
-                    to += 1
+    for ray in prange(len(offsets) - 1):
+        to = kept_offsets[ray]
+        for n in range(offsets[ray], offsets[ray + 1]):
+            if keep[n]:
+                out[0, to], out[1, to], out[2, to], out_ray[to] = thickness[n], t[n], dt[n], ray
+                to += 1
 
 
 @kernel
-def absorb(thickness, offsets, which, furthest, most, optical, going, workers):
+def absorb(thickness, offsets, which, furthest, most, optical, going):
     """Adds up in `optical` [R] what some rays have met, and says which of these go on [A].
 
     Args:
@@ -106,25 +91,21 @@ def absorb(thickness, offsets, which, furthest, most, optical, going, workers):
         furthest: optical thickness behind which light does not reach.
         most: a ray with fewer new samples has no more.
     """
-    rays = len(which)
-    for worker in prange(workers):
-        for n in range(rays * worker // workers, rays * (worker + 1) // workers):
-            met = optical[which[n]]
-            for m in range(offsets[n], offsets[n + 1]):
-                met += thickness[m]
-            optical[which[n]] = met
-            going[n] = offsets[n + 1] - offsets[n] == most and not met > furthest
+    for n in prange(len(which)):
+        met = optical[which[n]]
+        for m in range(offsets[n], offsets[n + 1]):
+            met += thickness[m]
+        optical[which[n]] = met
+        going[n] = offsets[n + 1] - offsets[n] == most and not met > furthest
 
 
 @kernel
-def append(which, offsets, thickness, t, dt, at, out_thickness, out_t, out_dt, out_ray, workers):
+def append(which, offsets, thickness, t, dt, at, out_thickness, out_t, out_dt, out_ray):
     """Writes some rays' [A] samples to where these rays' next ones belong, at [R], which moves on."""
-    rays = len(which)
-    for worker in prange(workers):
-        for n in range(rays * worker // workers, rays * (worker + 1) // workers):
-            ray = which[n]
-            to = at[ray]
-            for m in range(offsets[n], offsets[n + 1]):
-                out_thickness[to], out_t[to], out_dt[to], out_ray[to] = thickness[m], t[m], dt[m], ray
-                to += 1
-            at[ray] = to
+    for n in prange(len(which)):
+        ray = which[n]
+        to = at[ray]
+        for m in range(offsets[n], offsets[n + 1]):
+            out_thickness[to], out_t[to], out_dt[to], out_ray[to] = thickness[m], t[m], dt[m], ray
+            to += 1
+        at[ray] = to

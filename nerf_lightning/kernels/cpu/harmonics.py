@@ -11,27 +11,25 @@ C3D, C3E = float32(0.3731763325901154), float32(1.445305721320277)
 
 
 @kernel
-def evaluate(directions, out, workers):
+def evaluate(directions, out):
     """out [16, N] from unit directions [N, 3]."""
-    samples = len(directions)
     one, three, five = float32(1), float32(3), float32(5)
-    for worker in prange(workers):
-        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            x, y, z = directions[n, 0], directions[n, 1], directions[n, 2]
-            xx, yy, zz = x * x, y * y, z * z
-            out[0, n] = C0
-            out[1, n] = -C1 * y
-            out[2, n] = C1 * z
-            out[3, n] = -C1 * x
-            out[4, n] = C2A * x * y
-            out[5, n] = -C2A * y * z
-            out[6, n] = C2B * (three * zz - one)
-            out[7, n] = -C2A * x * z
-            out[8, n] = C2C * (xx - yy)
-            out[9, n] = -C3A * y * (three * xx - yy)
-            out[10, n] = C3B * x * y * z
-            out[11, n] = -C3C * y * (five * zz - one)
-            out[12, n] = C3D * z * (five * zz - three)
-            out[13, n] = -C3C * x * (five * zz - one)
-            out[14, n] = C3E * z * (xx - yy)
-            out[15, n] = -C3A * x * (xx - three * yy)
+    for n in prange(len(directions)):
+        x, y, z = directions[n, 0], directions[n, 1], directions[n, 2]
+        xx, yy, zz = x * x, y * y, z * z
+        out[0, n] = C0
+        out[1, n] = -C1 * y
+        out[2, n] = C1 * z
+        out[3, n] = -C1 * x
+        out[4, n] = C2A * x * y
+        out[5, n] = -C2A * y * z
+        out[6, n] = C2B * (three * zz - one)
+        out[7, n] = -C2A * x * z
+        out[8, n] = C2C * (xx - yy)
+        out[9, n] = -C3A * y * (three * xx - yy)
+        out[10, n] = C3B * x * y * z
+        out[11, n] = -C3C * y * (five * zz - one)
+        out[12, n] = C3D * z * (five * zz - three)
+        out[13, n] = -C3C * x * (five * zz - one)
+        out[14, n] = C3E * z * (xx - yy)
+        out[15, n] = -C3A * x * (xx - three * yy)

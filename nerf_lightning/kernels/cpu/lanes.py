@@ -19,6 +19,9 @@ class Lanes(types.Type):
         self.width = width
         super().__init__(name=f"Lanes({width})")
 
+    def __len__(self):
+        return self.width
+
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):
@@ -72,30 +75,16 @@ def prefetch(typing, array, row, first):
 
 
 @intrinsic
-def zeros(typing, lanes):
-    """Zeros, one for each entry of the tuple `lanes`."""
+def spread(typing, a, lanes):
+    """One number, once for each entry of the tuple `lanes`, or of another value."""
     width = len(lanes)
 
     def code(context, builder, signature, values):
-        return ir.Constant(ir.VectorType(ir.FloatType(), width), [0.0] * width)
+        empty = ir.Constant(ir.VectorType(ir.FloatType(), width), ir.Undefined)
+        first = builder.insert_element(empty, values[0], ir.IntType(32)(0))
+        return _pick(builder, first, empty, [0] * width)
 
-    return Lanes(width)(lanes), code
-
-
-@intrinsic
-def spread(typing, a, lanes):
-    """One number, once for each entry of the tuple `lanes`."""
-    width = len(lanes)
-    return Lanes(width)(types.float32, lanes), lambda context, builder, signature, values: _spread(
-        builder, values[0], width
-    )
-
-
-def _spread(builder, number, width):
-    index = ir.IntType(32)
-    empty = ir.Constant(ir.VectorType(ir.FloatType(), width), ir.Undefined)
-    first = builder.insert_element(empty, number, index(0))
-    return builder.shuffle_vector(first, empty, ir.Constant(ir.VectorType(index, width), [0] * width))
+    return Lanes(width)(types.float32, lanes), code
 
 
 @intrinsic
@@ -194,14 +183,6 @@ def _multiplied(typing, a, b):
     return a(a, b), lambda context, builder, signature, values: builder.fmul(*values)
 
 
-@intrinsic
-def _scaled(typing, factor, a):
-    def code(context, builder, signature, values):
-        return builder.fmul(_spread(builder, values[0], a.width), values[1])
-
-    return a(types.float32, a), code
-
-
 @overload(operator.add)
 def _add(a, b):
     if isinstance(a, Lanes) and a == b:
@@ -213,4 +194,4 @@ def _multiply(a, b):
     if isinstance(a, Lanes) and a == b:
         return lambda a, b: _multiplied(a, b)
     if a == types.float32 and isinstance(b, Lanes):
-        return lambda a, b: _scaled(a, b)
+        return lambda a, b: _multiplied(spread(a, b), b)

@@ -3,6 +3,7 @@
 Distances, positions and cells are rounded exactly as the torch reference rounds them, so both keep the same samples.
 """
 
+import numpy as np
 from numba import float32, int32, prange, uint8
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
@@ -108,7 +109,7 @@ def when_at_wall(u, cells, clear, axis):
 
 @kernel
 def walk(which, origins, directions, near, far, inside, shift, occupied, resolution, blocks, cells, centre, half, unbounded,
-         samples, step, most, after, found, counts, workers):  # fmt: skip
+         samples, step, most, after, found, counts):  # fmt: skip
     """Writes the next intervals to keep of some rays [A] into found [A, most], and how many into counts [A].
 
     Args:
@@ -117,99 +118,69 @@ def walk(which, origins, directions, near, far, inside, shift, occupied, resolut
         blocks: [cells^3], from `clear`: empty ones are crossed in leaps.
         after: [R], where each ray goes on: at this interval. Moved on.
     """
-    rays = len(which)
-    for worker in prange(workers):
-        for n in range(rays * worker // workers, rays * (worker + 1) // workers):
-            ray = which[n]
-            span, k, kept = span_of(near, far, inside, ray, half, unbounded), int(after[ray]), 0
-            across = crossing(origins[ray, 0], directions[ray, 0], centre[0], half[0], cells)
-            down = crossing(origins[ray, 1], directions[ray, 1], centre[1], half[1], cells)
-            deep = crossing(origins[ray, 2], directions[ray, 2], centre[2], half[2], cells)
-            unsure = float32(0.01) + ROUNDED * span[1] / step  # steps by which a distance may be wrong
-            start = edge(k, shift[ray], span, step, samples, unbounded)
-            while k <= samples and kept < most:
-                end = edge(k + 1, shift[ray], span, step, samples, unbounded)
-                if not end > start:
-                    if start >= span[1]:
-                        break
-                    k, start = k + 1, end
-                    continue
-                t = (start + end) / float32(2)
-                x, y = origins[ray, 0] + t * directions[ray, 0], origins[ray, 1] + t * directions[ray, 1]
-                u, v, w = to_unit(x, y, origins[ray, 2] + t * directions[ray, 2], centre, half, unbounded)
-                clear = int(blocks[flat_cell(u, v, w, cells)])
-                if clear > 0:
-                    if not unbounded:
-                        first = min(when_at_wall(u, cells, clear, across), when_at_wall(v, cells, clear, down))
-                        first = min(first, when_at_wall(w, cells, clear, deep))
-                        leap = int((first - t) / step - unsure)
-                        if leap > 0:
-                            k += leap
-                            end = edge(k + 1, shift[ray], span, step, samples, unbounded)
-                elif occupied[flat_cell(u, v, w, resolution)]:
-                    found[n, kept] = k
-                    kept += 1
+    for n in prange(len(which)):
+        ray = which[n]
+        span, k, kept = span_of(near, far, inside, ray, half, unbounded), int(after[ray]), 0
+        across = crossing(origins[ray, 0], directions[ray, 0], centre[0], half[0], cells)
+        down = crossing(origins[ray, 1], directions[ray, 1], centre[1], half[1], cells)
+        deep = crossing(origins[ray, 2], directions[ray, 2], centre[2], half[2], cells)
+        unsure = float32(0.01) + ROUNDED * span[1] / step  # steps by which a distance may be wrong
+        start = edge(k, shift[ray], span, step, samples, unbounded)
+        while k <= samples and kept < most:
+            end = edge(k + 1, shift[ray], span, step, samples, unbounded)
+            if not end > start:
+                if start >= span[1]:
+                    break
                 k, start = k + 1, end
-            after[ray], counts[n] = k, kept
+                continue
+            t = (start + end) / float32(2)
+            x, y = origins[ray, 0] + t * directions[ray, 0], origins[ray, 1] + t * directions[ray, 1]
+            u, v, w = to_unit(x, y, origins[ray, 2] + t * directions[ray, 2], centre, half, unbounded)
+            clear = int(blocks[flat_cell(u, v, w, cells)])
+            if clear > 0:
+                if not unbounded:
+                    first = min(when_at_wall(u, cells, clear, across), when_at_wall(v, cells, clear, down))
+                    first = min(first, when_at_wall(w, cells, clear, deep))
+                    leap = int((first - t) / step - unsure)
+                    if leap > 0:
+                        k += leap
+                        end = edge(k + 1, shift[ray], span, step, samples, unbounded)
+            elif occupied[flat_cell(u, v, w, resolution)]:
+                found[n, kept] = k
+                kept += 1
+            k, start = k + 1, end
+        after[ray], counts[n] = k, kept
 
 
 @kernel
-def pack(which, near, far, inside, shift, half, unbounded, samples, step, found, offsets, t, dt, ray_of, workers):
+def pack(which, near, far, inside, shift, half, unbounded, samples, step, found, offsets, t, dt, ray_of):
     """Distances and lengths of the intervals that `walk` found, one ray after the other."""
-    rays = len(which)
-    for worker in prange(workers):
-        for n in range(rays * worker // workers, rays * (worker + 1) // workers):
-            ray = which[n]
-            span = span_of(near, far, inside, ray, half, unbounded)
-            for m in range(offsets[n], offsets[n + 1]):
-                k = found[n, m - offsets[n]]
-                start = edge(k, shift[ray], span, step, samples, unbounded)
-                end = edge(k + 1, shift[ray], span, step, samples, unbounded)
-                t[m], dt[m], ray_of[m] = (start + end) / float32(2), end - start, ray
+    for n in prange(len(which)):
+        ray = which[n]
+        span = span_of(near, far, inside, ray, half, unbounded)
+        for m in range(offsets[n], offsets[n + 1]):
+            k = found[n, m - offsets[n]]
+            start = edge(k, shift[ray], span, step, samples, unbounded)
+            end = edge(k + 1, shift[ray], span, step, samples, unbounded)
+            t[m], dt[m], ray_of[m] = (start + end) / float32(2), end - start, ray
 
 
 @kernel
-def coarsen(rows, resolution, size, blocks, workers):
-    """blocks [cells^3]: 0 where any of a block's size^3 cells is occupied, else `FAR`.
-
-    Args:
-        rows: [resolution^2 * cells]: the cells of a block's row as one number, 0 where none is occupied.
-    """
-    cells = resolution // size
-    for worker in prange(workers):
-        for i in range(cells * worker // workers, cells * (worker + 1) // workers):
-            for j in range(cells):
-                block = (i * cells + j) * cells
-                blocks[block : block + cells] = uint8(FAR)
-                for x in range(i * size, (i + 1) * size):
-                    for y in range(j * size, (j + 1) * size):
-                        row = (x * resolution + y) * cells
-                        for k in range(cells):
-                            blocks[block + k] *= uint8(rows[row + k] == 0)
-
-
-@kernel
-def clear(blocks, between, workers):
-    """Turns 0 and `FAR` in blocks [n, n, n] into how many blocks away the nearest 0 is, over corners too, at most `FAR`.
-
-    Args:
-        between: [n, n, n], overwritten.
-    """
-    n = len(blocks)
-    for worker in prange(workers):
-        for i in range(n * worker // workers, n * (worker + 1) // workers):
-            for j in range(n):
-                row = blocks[i, j]
-                for k in range(1, n):
-                    row[k] = min(row[k], uint8(row[k - 1] + uint8(1)))
-                for k in range(n - 2, -1, -1):
-                    row[k] = min(row[k], uint8(row[k + 1] + uint8(1)))
-            for j in range(n):
-                nearest_in_rows(blocks[i], j, between[i, j])
-    for worker in prange(workers):
-        for i in range(n * worker // workers, n * (worker + 1) // workers):
-            for j in range(n):
-                nearest_in_rows(between[:, j], i, blocks[i, j])
+def clear(blocks):
+    """Turns 0 and `FAR` in blocks [n, n, n] into how many blocks away the nearest 0 is, over corners too, at most `FAR`."""
+    n, between = len(blocks), np.empty_like(blocks)
+    for i in prange(n):
+        for j in range(n):
+            row = blocks[i, j]
+            for k in range(1, n):
+                row[k] = min(row[k], uint8(row[k - 1] + uint8(1)))
+            for k in range(n - 2, -1, -1):
+                row[k] = min(row[k], uint8(row[k + 1] + uint8(1)))
+        for j in range(n):
+            nearest_in_rows(blocks[i], j, between[i, j])
+    for i in prange(n):
+        for j in range(n):
+            nearest_in_rows(between[:, j], i, blocks[i, j])
 
 
 @inner
@@ -223,21 +194,17 @@ def nearest_in_rows(rows, here, out):
 
 
 @kernel
-def points(origins, directions, ray, t, out, workers):
+def points(origins, directions, ray, t, out):
     """out [3, N] = origins[ray] + t * directions[ray]."""
-    samples = len(t)
-    for worker in prange(workers):
-        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            r = ray[n]
-            for axis in range(3):
-                out[axis, n] = origins[r, axis] + t[n] * directions[r, axis]
+    for n in prange(len(t)):
+        r = ray[n]
+        for axis in range(3):
+            out[axis, n] = origins[r, axis] + t[n] * directions[r, axis]
 
 
 @kernel
-def mark(places, centre, half, unbounded, marks, resolution, value, workers):
+def mark(places, centre, half, unbounded, marks, resolution, value):
     """Writes a value into the cells that hold places [3, N]. Two workers may write to one cell: the same value."""
-    samples = places.shape[1]
-    for worker in prange(workers):
-        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            u, v, w = to_unit(places[0, n], places[1, n], places[2, n], centre, half, unbounded)
-            marks[flat_cell(u, v, w, resolution)] = value
+    for n in prange(places.shape[1]):
+        u, v, w = to_unit(places[0, n], places[1, n], places[2, n], centre, half, unbounded)
+        marks[flat_cell(u, v, w, resolution)] = value

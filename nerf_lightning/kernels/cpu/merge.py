@@ -8,42 +8,38 @@ from nerf_lightning.kernels.cpu.compile import kernel
 
 
 @kernel
-def pair(thickness, t, dt, offsets, faint, apart, share, counts, workers):
+def pair(thickness, t, dt, offsets, faint, apart, share, counts):
     """Says which samples join the one before, and counts what remains of each ray [R].
 
     Args:
         faint, apart: see `nerf_lightning.kernels.merge`.
         share: [N], of the weight of both what the joining one has; -1 for those that do not join.
     """
-    rays = len(offsets) - 1
-    for worker in prange(workers):
-        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
-            optical, through, before, joins, kept = 0.0, 1.0, 0.0, False, 0
-            for n in range(offsets[ray], offsets[ray + 1]):
-                optical += thickness[n]
-                behind = math.exp(-optical)
-                weight = through - behind
-                both = before + weight
-                joins = n > offsets[ray] and not joins and t[n] - t[n - 1] < apart * (dt[n] + dt[n - 1])
-                joins = joins and min(before, weight) < faint and both < 2  # which it is not where one is NaN
-                share[n] = (weight / both if both > 0 else 0.0) if joins else -1.0
-                kept += not joins
-                through, before = behind, weight
-            counts[ray] = kept
+    for ray in prange(len(offsets) - 1):
+        optical, through, before, joins, kept = 0.0, 1.0, 0.0, False, 0
+        for n in range(offsets[ray], offsets[ray + 1]):
+            optical += thickness[n]
+            behind = math.exp(-optical)
+            weight = through - behind
+            both = before + weight
+            joins = n > offsets[ray] and not joins and t[n] - t[n - 1] < apart * (dt[n] + dt[n - 1])
+            joins = joins and min(before, weight) < faint and both < 2  # which it is not where one is NaN
+            share[n] = (weight / both if both > 0 else 0.0) if joins else -1.0
+            kept += not joins
+            through, before = behind, weight
+        counts[ray] = kept
 
 
 @kernel
-def join(share, offsets, kept_offsets, thickness, t, dt, out, out_ray, workers):
+def join(share, offsets, kept_offsets, thickness, t, dt, out, out_ray):
     """Packs what remains: its thickness, t and dt into out [3, K]."""
-    rays = len(offsets) - 1
-    for worker in prange(workers):
-        for ray in range(rays * worker // workers, rays * (worker + 1) // workers):
-            to = kept_offsets[ray] - 1
-            for n in range(offsets[ray], offsets[ray + 1]):
-                if share[n] < 0:
-                    to += 1
-                    out[0, to], out[1, to], out[2, to], out_ray[to] = thickness[n], t[n], dt[n], ray
-                else:
-                    out[0, to] += thickness[n]
-                    out[1, to] += share[n] * (t[n] - t[n - 1])
-                    out[2, to] += dt[n]
+    for ray in prange(len(offsets) - 1):
+        to = kept_offsets[ray] - 1
+        for n in range(offsets[ray], offsets[ray + 1]):
+            if share[n] < 0:
+                to += 1
+                out[0, to], out[1, to], out[2, to], out_ray[to] = thickness[n], t[n], dt[n], ray
+            else:
+                out[0, to] += thickness[n]
+                out[1, to] += share[n] * (t[n] - t[n - 1])
+                out[2, to] += dt[n]

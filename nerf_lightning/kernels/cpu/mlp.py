@@ -8,7 +8,7 @@ import numpy as np
 from numba import float32, prange
 
 from nerf_lightning.kernels.cpu.compile import inner, kernel
-from nerf_lightning.kernels.cpu.lanes import WIDEST, fused, load, prefetch, spread, store, total, zeros
+from nerf_lightning.kernels.cpu.lanes import WIDEST, fused, load, prefetch, spread, store, total
 
 TILE = 128
 """Samples worked on together; a constant, so that the inner loops need no remainder."""
@@ -68,7 +68,7 @@ def back_input(W, dy, dx):
 def back_weight(dW, db, dy, x):
     """dW += dy x^T, db += the sum of dy: two rows by four columns at a time, each summed in the lanes of a register."""
     outputs, inputs = dW.shape
-    zero = zeros(RUN)
+    zero = spread(float32(0), RUN)
     for o in range(0, outputs, 2):
         for k in range(o, o + 2):
             s = zero

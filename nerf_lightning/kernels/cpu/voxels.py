@@ -35,44 +35,39 @@ def corners(unit, n, index, cells):
 
 
 @kernel
-def locate(index, cells, unit, rows, weights, workers):
+def locate(index, cells, unit, rows, weights):
     """Fills rows [N, 8] and weights [N, 8] for unit [3, N]."""
-    samples = unit.shape[1]
-    for worker in prange(workers):
-        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            r, w = corners(unit, n, index, cells)
-            for c in range(8):
-                rows[n, c], weights[n, c] = r[c], w[c]
+    for n in prange(unit.shape[1]):
+        r, w = corners(unit, n, index, cells)
+        for c in range(8):
+            rows[n, c], weights[n, c] = r[c], w[c]
 
 
 @kernel
-def slope(cells, unit, above, grad, workers):
+def slope(cells, unit, above, grad):
     """Fills grad [3, N], the gradient in the places, from that in the weights, `above` [N, 8]."""
-    samples = unit.shape[1]
-    for worker in prange(workers):
-        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            x, fx = cell_of(unit[0, n], cells)
-            y, fy = cell_of(unit[1, n], cells)
-            z, fz = cell_of(unit[2, n], cells)
-            dx, dy, dz = trilinear_slope(above[n], fx, fy, fz)
-            grad[0, n] = steepness(unit[0, n], cells) * dx
-            grad[1, n] = steepness(unit[1, n], cells) * dy
-            grad[2, n] = steepness(unit[2, n], cells) * dz
+    for n in prange(unit.shape[1]):
+        x, fx = cell_of(unit[0, n], cells)
+        y, fy = cell_of(unit[1, n], cells)
+        z, fz = cell_of(unit[2, n], cells)
+        dx, dy, dz = trilinear_slope(above[n], fx, fy, fz)
+        grad[0, n] = steepness(unit[0, n], cells) * dx
+        grad[1, n] = steepness(unit[1, n], cells) * dy
+        grad[2, n] = steepness(unit[2, n], cells) * dz
 
 
 @kernel
-def mark(seen, rows, step, workers):
+def mark(seen, rows, step):
     """seen [V] = step at all rows [N, 8]. Two workers may write to one row: the same value."""
-    samples = rows.shape[0]
-    for worker in prange(workers):
-        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            for corner in range(8):
-                seen[rows[n, corner]] = step
+    for n in prange(rows.shape[0]):
+        for corner in range(8):
+            seen[rows[n, corner]] = step
 
 
-@inner
-def interpolate_run(values, index, cells, unit, out, first, last):
-    for n in range(first, last):
+@kernel
+def interpolate(values, index, cells, unit, out):
+    """out [N] from values [V] and unit [3, N]."""
+    for n in prange(len(out)):
         r, w = corners(unit, n, index, cells)
         low = (w[0] * values[r[0]] + w[1] * values[r[1]]) + (w[2] * values[r[2]] + w[3] * values[r[3]])
         high = (w[4] * values[r[4]] + w[5] * values[r[5]]) + (w[6] * values[r[6]] + w[7] * values[r[7]])
@@ -80,33 +75,23 @@ def interpolate_run(values, index, cells, unit, out, first, last):
 
 
 @kernel
-def interpolate(values, index, cells, unit, out, workers):
-    """out [N] from values [V] and unit [3, N]."""
-    samples = len(out)
-    for worker in prange(workers):
-        first, last = samples * worker // workers, samples * (worker + 1) // workers
-        interpolate_run(values, index, cells, unit, out, first, last)
+def read(density, colour, rows, weights, raw, rgb):
+    """raw [N] from density [V], and rgb [3, N] from colour [V, 3]."""
+    for n in prange(len(raw)):
+        s, a, b, c = float32(0), float32(0), float32(0), float32(0)
+        for corner in range(8):
+            row, weight = rows[n, corner], weights[n, corner]
+            s += weight * density[row]
+            a += weight * colour[row, 0]
+            b += weight * colour[row, 1]
+            c += weight * colour[row, 2]
+        raw[n], rgb[0, n], rgb[1, n], rgb[2, n] = s, a, b, c
 
 
 @kernel
-def read(density, colour, rows, weights, raw, rgb, workers):
-    """raw [N] from density [V], and rgb [3, N] from colour [V, 3]."""
-    samples = len(raw)
-    for worker in prange(workers):
-        for n in range(samples * worker // workers, samples * (worker + 1) // workers):
-            s, a, b, c = float32(0), float32(0), float32(0), float32(0)
-            for corner in range(8):
-                row, weight = rows[n, corner], weights[n, corner]
-                s += weight * density[row]
-                a += weight * colour[row, 0]
-                b += weight * colour[row, 1]
-                c += weight * colour[row, 2]
-            raw[n], rgb[0, n], rgb[1, n], rgb[2, n] = s, a, b, c
-
-
-@inner
-def pull_run(density, colour, rows, raw, rgb, grad, first, last):
-    for n in range(first, last):
+def pull(density, colour, rows, raw, rgb, grad):
+    """Fills grad [N, 8], the gradient in the weights, from those of raw [N] and rgb [3, N]."""
+    for n in prange(len(raw)):
         s, a, b, c = raw[n], rgb[0, n], rgb[1, n], rgb[2, n]
         for corner in range(8):
             row = rows[n, corner]
@@ -114,70 +99,49 @@ def pull_run(density, colour, rows, raw, rgb, grad, first, last):
 
 
 @kernel
-def pull(density, colour, rows, raw, rgb, grad, workers):
-    """Fills grad [N, 8], the gradient in the weights, from those of raw [N] and rgb [3, N]."""
-    samples = len(raw)
-    for worker in prange(workers):
-        first, last = samples * worker // workers, samples * (worker + 1) // workers
-        pull_run(density, colour, rows, raw, rgb, grad, first, last)
-
-
-@inner
-def add_views_run(views, rows, weights, basis, rgb, lanes, start, end):
-    terms = len(lanes)
-    tile = np.empty((TILE, terms), np.float32)
-    for first in range(start, end, TILE):
-        count = min(TILE, end - first)
-        turn(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
-        for k in range(count):
-            n = first + k
-            row, weight = rows[n, 0], weights[n, 0]
-            a = weight * load(views, row, 0, lanes)
-            b = weight * load(views, row, terms, lanes)
-            c = weight * load(views, row, 2 * terms, lanes)
-            for corner in range(1, 8):
-                row, weight = rows[n, corner], weights[n, corner]
-                a = a + weight * load(views, row, 0, lanes)
-                b = b + weight * load(views, row, terms, lanes)
-                c = c + weight * load(views, row, 2 * terms, lanes)
-            given = load(tile, k, 0, lanes)
-            rgb[0, n] += total(a * given)
-            rgb[1, n] += total(b * given)
-            rgb[2, n] += total(c * given)
-
-
-@kernel
 def add_views(views, rows, weights, basis, rgb, lanes, workers):
     """Adds to rgb [3, N] the interpolated views [V, 3 B] times basis [B, N]; `lanes` is a tuple of length B."""
-    samples = rows.shape[0]
+    samples, terms = rows.shape[0], len(lanes)
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
-        add_views_run(views, rows, weights, basis, rgb, lanes, start, end)
-
-
-@inner
-def pull_views_run(views, rows, basis, rgb, grad, lanes, start, end):
-    terms = len(lanes)
-    tile = np.empty((TILE, terms), np.float32)
-    for first in range(start, end, TILE):
-        count = min(TILE, end - first)
-        turn(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
-        for k in range(count):
-            n = first + k
-            given = load(tile, k, 0, lanes)
-            for corner in range(8):
-                row = rows[n, corner]
-                mixed = rgb[0, n] * load(views, row, 0, lanes) + rgb[1, n] * load(views, row, terms, lanes)
-                grad[n, corner] += total((mixed + rgb[2, n] * load(views, row, 2 * terms, lanes)) * given)
+        tile = np.empty((TILE, terms), np.float32)
+        for first in range(start, end, TILE):
+            count = min(TILE, end - first)
+            turn(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
+            for k in range(count):
+                n = first + k
+                row, weight = rows[n, 0], weights[n, 0]
+                a = weight * load(views, row, 0, lanes)
+                b = weight * load(views, row, terms, lanes)
+                c = weight * load(views, row, 2 * terms, lanes)
+                for corner in range(1, 8):
+                    row, weight = rows[n, corner], weights[n, corner]
+                    a = a + weight * load(views, row, 0, lanes)
+                    b = b + weight * load(views, row, terms, lanes)
+                    c = c + weight * load(views, row, 2 * terms, lanes)
+                given = load(tile, k, 0, lanes)
+                rgb[0, n] += total(a * given)
+                rgb[1, n] += total(b * given)
+                rgb[2, n] += total(c * given)
 
 
 @kernel
 def pull_views(views, rows, basis, rgb, grad, lanes, workers):
     """Adds to grad [N, 8] what the views [V, 3 B] times basis [B, N] contribute to the gradient in the weights."""
-    samples = rows.shape[0]
+    samples, terms = rows.shape[0], len(lanes)
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
-        pull_views_run(views, rows, basis, rgb, grad, lanes, start, end)
+        tile = np.empty((TILE, terms), np.float32)
+        for first in range(start, end, TILE):
+            count = min(TILE, end - first)
+            turn(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
+            for k in range(count):
+                n = first + k
+                given = load(tile, k, 0, lanes)
+                for corner in range(8):
+                    row = rows[n, corner]
+                    mixed = rgb[0, n] * load(views, row, 0, lanes) + rgb[1, n] * load(views, row, terms, lanes)
+                    grad[n, corner] += total((mixed + rgb[2, n] * load(views, row, 2 * terms, lanes)) * given)
 
 
 @inner
@@ -237,36 +201,29 @@ def scatter_views_run(grad, rows, weights, basis, rgb, lanes, first, last):
 
 @kernel
 def scatter_views(grad, rows, weights, basis, rgb, lanes, workers):
-    """Adds to the gradient [V, 3 B] from that of rgb [3, N]."""
+    """Adds to the gradient [V, 3 B] from that of rgb [3, N]; a function of its own, as it is a third slower within the loop."""
     ends = borders(rows, len(grad), workers)
     for worker in prange(workers):
         scatter_views_run(grad, rows, weights, basis, rgb, lanes, ends[worker], ends[worker + 1])
 
 
-@inner
-def roughness_run(values, vertex, index, side, start, first, last, slope):
-    """The sum of squared differences; `slope` gets each row's sum of plain ones."""
-    squares = 0.0
-    for row in range(first, last):
-        at = int64(vertex[row])
-        place, stride = (at // (side * side), at // side % side, at % side), (side * side, side, 1)
-        difference = float32(0)
-        for axis in range(3):
-            for sign in (-1, 1):
-                if 0 <= place[axis] + sign < side:
-                    other = index[at + sign * stride[axis]]
-                    if other > 0:
-                        d = values[row] - values[other]
-                        difference += d
-                        squares += d * d
-        slope[row - start] = difference
-    return squares
-
-
 @kernel
-def roughness(values, vertex, index, side, first, last, slope, sums, workers):
-    """For rows first to last of values [V]: the differences to all neighbours into slope, their squares into sums [workers]."""
-    rows = last - first
+def roughness(values, vertex, index, side, first, slope, sums, workers):
+    """For the rows from `first` on of values [V], as many as fit slope: the differences to all neighbours into slope, their
+    squares into sums [workers]."""
+    rows = len(slope)
     for worker in prange(workers):
-        a, b = first + rows * worker // workers, first + rows * (worker + 1) // workers
-        sums[worker] = roughness_run(values, vertex, index, side, first, a, b, slope)
+        squares = 0.0
+        for n in range(rows * worker // workers, rows * (worker + 1) // workers):
+            at, value, difference = int64(vertex[first + n]), values[first + n], float32(0)
+            place, stride = (at // (side * side), at // side % side, at % side), (side * side, side, 1)
+            for axis in range(3):
+                for sign in (-1, 1):
+                    if 0 <= place[axis] + sign < side:
+                        other = index[at + sign * stride[axis]]
+                        if other > 0:
+                            d = value - values[other]
+                            difference += d
+                            squares += d * d
+            slope[n] = difference
+        sums[worker] = squares

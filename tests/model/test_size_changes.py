@@ -1,4 +1,4 @@
-"""Larger fields that take up what smaller ones have learned: the same function, and then more of it."""
+"""Larger fields that take up what smaller ones have learned, and fields left with what some cells need."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ from nerf_lightning.model import (
     TensoRFField,
     VoxelField,
 )
-from tests.helpers.growth import grow
+from nerf_lightning.model.layers.pruning import vertices_in
 
 BOX = Bounds(torch.tensor([[-1.0, -0.5, 0.2], [1.5, 2.0, 1.0]]))
 
@@ -46,10 +46,8 @@ def mlp(width: int = 8, depth: int = 2, skip: int | None = None) -> Field:
 
 SAME = [
     (hashgrid, {}, {"entries": 13, "width": 12}),
-    (tensorf, {}, {"finest": 12, "width": 16, "components": 8, "colours": 8}),
-    (tensorf, {"degree": 1}, {"degree": 3, "colours": 8}),
-    (voxels, {}, {"degree": 2}),
-    (voxels, {}, {"finest": 12}),
+    (tensorf, {"degree": 1}, {"degree": 3, "finest": 12, "width": 16, "components": 8, "colours": 8}),
+    (voxels, {}, {"degree": 2, "finest": 12}),
     (mlp, {"depth": 4, "skip": 2}, {"depth": 4, "skip": 2, "width": 16}),
 ]
 
@@ -73,18 +71,7 @@ def test_warm_start_larger_field_is_same_function_and_learns(make: Callable[...,
         optimizer.step()
     for (name, parameter), old in zip(larger.named_parameters(), before, strict=True):
         moved = (parameter.detach() - old).abs().flatten(1 if parameter.ndim > 1 and "net" in name else 0).amax(-1)
-        assert (moved > 0).any(), name
-        if "net" in name or "trunk" in name:
-            assert (moved > 0).float().mean() > 0.5, f"{name}: new neurons learn too"
-
-
-def test_warm_start_voxels_grow_on_from_taken_size():
-    smaller, larger = voxels(finest=6), voxels(coarsest=4, finest=12)
-    larger.warm_start_from(smaller)
-    assert isinstance(larger, VoxelField)
-    assert larger.growth.resolutions[0] == 6 and larger.growth.resolutions[-1] == 12
-    grow(larger, 1.0)
-    assert len(larger.index) == 13**3
+        assert (moved > 0).float().mean() > (0.5 if "net" in name or "trunk" in name else 0), f"{name} learns"
 
 
 def hashgrid2d(levels: int = 2, finest: int = 8, width: int = 8) -> PictureField:
@@ -99,11 +86,7 @@ def picture_mlp(frequencies: int = 2, width: int = 8) -> PictureField:
 
 @pytest.mark.parametrize(
     ("make", "large"),
-    [
-        (hashgrid2d, {"levels": 3, "finest": 16}),
-        (hashgrid2d, {"width": 16}),
-        (picture_mlp, {"width": 20, "frequencies": 3}),
-    ],
+    [(hashgrid2d, {"levels": 3, "finest": 16, "width": 16}), (picture_mlp, {"width": 20, "frequencies": 3})],
 )
 def test_warm_start_larger_picture_field_is_same_function(make: Callable[..., PictureField], large: dict):
     smaller, larger = make(), make(**large)
@@ -112,10 +95,26 @@ def test_warm_start_larger_picture_field_is_same_function(make: Callable[..., Pi
     torch.testing.assert_close(larger(uv), smaller(uv), rtol=1e-4, atol=1e-5)
 
 
-def test_warm_start_mismatched_network_starts_anew():
-    """A level that is missing, other encodings: nothing is half taken over in a network."""
-    larger, smaller = hashgrid(), HashGridField(BOX, levels=2, log2_entries=6, coarsest=5, finest=7, width=8)
-    before = larger.density_net[0].weight.detach().clone()
-    larger.warm_start_from(smaller)
-    assert torch.equal(larger.density_net[0].weight, before)
-    assert Field(BOX).warm_start_from(Field(BOX)) is None
+@pytest.mark.parametrize("cells", [1, 3, 8, 13])
+def test_vertices_in_reached_cells_are_their_corners(cells: int):
+    reached = torch.zeros(8, 8, 8, dtype=torch.bool)
+    reached[2, 5, 7] = reached[0, 0, 3] = True
+    expected = torch.zeros(cells + 1, cells + 1, cells + 1, dtype=torch.bool)
+    for cell in reached.nonzero():
+        places = (cell + torch.rand(3000, 3)) / 8
+        low = (places * cells).long().clamp(max=cells - 1)
+        for corner in torch.cartesian_prod(*[torch.arange(2)] * 3):
+            expected[tuple((low + corner).T)] = True
+    assert torch.equal(vertices_in(reached, cells), expected)
+
+
+@pytest.mark.parametrize("make", [hashgrid, tensorf, voxels, mlp])
+def test_prune_reached_places_keep_their_values(make: Callable[[], Field]):
+    field, reached = make(), torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)) < 0.02
+    cells = reached.nonzero().repeat(20, 1)
+    positions = BOX.to_world((cells + torch.rand(len(cells), 3)) / 8)
+    directions = normalize(torch.randn(len(positions), 3), dim=1)
+    before = [part.detach() for part in field(positions, directions)[:2]]
+    field.prune(reached)
+    for found, was in zip(field(positions, directions)[:2], before, strict=True):
+        torch.testing.assert_close(found, was)

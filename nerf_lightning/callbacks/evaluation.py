@@ -1,0 +1,144 @@
+"""Evaluation: the figures of a trained field."""
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from statistics import fmean, median
+from typing import Any
+
+import lightning as L
+import psutil
+import torch
+
+from nerf_lightning.callbacks.attached import agreed, data_of
+from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.callbacks.rendering import Renders
+from nerf_lightning.callbacks.throughput import TRAIN_SECONDS
+from nerf_lightning.dataset import Scene, Views
+from nerf_lightning.dataset.rays import view_batch
+from nerf_lightning.dataset.subset import WHOLE, PixelSubset
+from nerf_lightning.system import RENDERED_PIXELS, NeRF3D, System, aligned_psnr, misfits, psnr_of_photos
+from nerf_lightning.utils.text import subsample
+
+FIGURES = (
+    *("psnr", "ssim", "psnr_worst_view", "psnr_aligned", "rows_measured", "test", "render_seconds_per_view"),
+    *("peak_memory_bytes", "misfits"),
+)
+"""Keys of results.json."""
+
+
+class Evaluation(Renders):
+    """Measures all held-out views after training, then the scene's test split and how well photos fit.
+
+    Where rendering would take longer than training (see `Renders`), held-out views are measured on strips of rows that lie
+    evenly in each view, and fewer views of the test split, evenly chosen.
+    """
+
+    weight = 30.0
+
+    def __init__(self) -> None:
+        self.figures: dict[str, Any] = dict.fromkeys(FIGURES)
+        """For results.json; None for what is not measured, or not yet."""
+        self.views: list[dict[str, float]] = []
+        """PSNR, SSIM, seconds of rendering, and the PSNR of one plain colour, of each held-out view."""
+        self.photos: list[float] = []
+        """PSNR of the training photos; none of a picture."""
+        self._rows = 1.0  # share of each held-out view's that is measured
+        self._pixels = 0  # measured
+
+    def pixels_left(self, trainer: L.Trainer) -> float:
+        data, scene = data_of(trainer), data_of(trainer).scene
+        pixels = self._rows * sum(map(data.pixels_held_out, range(len(self.views), data.held_out_views)))
+        if isinstance(scene, Scene):
+            aligned = self.figures["psnr_aligned"] is not None or not is_corrected(trainer.lightning_module)
+            pixels += 0 if aligned else RENDERED_PIXELS * len(scene.val)
+            pixels += 0 if scene.test is None or self.figures["test"] is not None else len(scene.test.pixels)
+        return pixels
+
+    def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
+        data = data_of(trainer)
+        pixels = sum(map(data.pixels_held_out, range(data.held_out_views)))
+        self._rows = agreed(trainer, self.share(trainer, pl_module, pixels))
+        data.test_on(PixelSubset(rows=self._rows))
+
+    def on_test_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
+        Budget.of(trainer).plan.start(f"held-out view {batch_idx + 1} of {data_of(trainer).held_out_views}")
+
+    def on_test_batch_end(
+        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        plan, pixels = Budget.of(trainer).plan, batch.height * batch.width
+        plan.stop()
+        plan.note(pixels, outputs["seconds"])
+        self.views.append(outputs)
+        self._pixels += pixels
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        data, figures = data_of(trainer), self.figures
+        data.test_on(WHOLE)
+        figures |= figures_of(self.views)
+        figures["rows_measured"] = round(self._pixels / sum(map(data.pixels_held_out, range(len(self.views)))), 4)
+        figures["render_seconds_per_view"] = statistic_of(self.views, median, "seconds")
+        if trainer.logger is not None:
+            known = {f"val/{key}": figures[key] for key in ("psnr", "ssim") if figures[key] is not None}
+            trainer.logger.log_metrics({**known, TRAIN_SECONDS: Budget.of(trainer).seconds}, trainer.global_step)
+        if isinstance(pl_module, NeRF3D) and isinstance(data.scene, Scene):
+            train, val, test = data.scene.train, data.scene.val, data.scene.test
+            if is_corrected(pl_module):
+                share = self.share(trainer, pl_module)
+                with Budget.of(trainer).plan.rendering("aligned held-out photos"):
+                    figures["psnr_aligned"] = round(fmean(aligned_psnr(pl_module, val, share)), 4)
+            figures["test"] = None if test is None else self._measure_test(trainer, pl_module, test)
+            self.photos = psnr_of_photos(pl_module, train)
+            figures["misfits"] = [
+                {"photo": train.name(i), "number": i, "psnr": round(self.photos[i], 2)} for i in misfits(self.photos)
+            ]
+        figures["peak_memory_bytes"] = peak_memory_bytes(pl_module.device)  # charts and films take more
+
+    def _measure_test(self, trainer: L.Trainer, system: System, views: Views) -> dict[str, Any]:
+        """Figures of as many views of the test split as there is time for."""
+        share, plan, measured = self.share(trainer, system), Budget.of(trainer).plan, []
+        chosen = subsample(len(views), max(1, int(share * len(views))))
+        for number, view in enumerate(chosen, 1):
+            with plan.rendering(f"test view {number} of {len(chosen)}"):
+                (result,) = system.evaluate_views([view_batch(views, view)])
+                measured.append({"psnr": result.psnr, "ssim": result.ssim})
+            plan.note(result.pixels, result.seconds)
+        return {**figures_of(measured), "views": len(measured), "views_in_split": len(views)}
+
+
+def is_corrected(system: L.LightningModule) -> bool:
+    """Whether cameras or light of the training photos were corrected."""
+    return isinstance(system, NeRF3D) and system.corrections is not None and bool(system.corrections.enabled_at)
+
+
+def figures_of(views: Sequence[dict[str, float]]) -> dict[str, Any]:
+    """Means over views, and the worst of them."""
+    return {
+        "psnr": statistic_of(views, fmean, "psnr"),
+        "ssim": statistic_of(views, fmean, "ssim"),
+        "psnr_worst_view": statistic_of(views, min, "psnr"),
+    }
+
+
+def statistic_of(views: Sequence[dict[str, float]], statistic: Callable[..., float], key: str) -> float | None:
+    """A statistic over the views that have a finite figure; None where no view has."""
+    values = [view[key] for view in views if math.isfinite(view[key])]
+    return round(statistic(values), 4) if values else None
+
+
+def peak_memory_bytes(device: torch.device) -> int:
+    """The most memory this process has held so far.
+
+    On CUDA, the peak of its tensors on the device; on MPS, which keeps no such count, what its driver holds now.
+    """
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    if device.type == "mps":
+        return torch.mps.driver_allocated_memory()
+    if sys.platform == "win32":
+        return psutil.Process().memory_info().peak_wset
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

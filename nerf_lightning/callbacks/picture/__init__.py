@@ -1,1 +1,0 @@
-"""Charts and comparisons of 2D runs."""

@@ -1,0 +1,208 @@
+"""What a 2D run leaves beside its figures: charts, a GIF, and comparisons with JPEG and bicubic interpolation."""
+
+import math
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import cv2
+import imageio.v3 as imageio
+import lightning as L
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from nerf_lightning.callbacks.attached import ChecksData, attached, data_of
+from nerf_lightning.callbacks.evaluation import Evaluation
+from nerf_lightning.callbacks.results import artifact_bytes, quality_curve
+from nerf_lightning.callbacks.snapshots import FOLDER
+from nerf_lightning.dataset import Picture, PixelDataModule, RayDataModule, pixel_grid
+from nerf_lightning.drawing.ink import BLUE, DPI, pixels_of
+from nerf_lightning.drawing.panels import averaged, narrowed, panel, to_bytes, write_animation, write_png
+from nerf_lightning.drawing.spectra import spectrum_chart
+from nerf_lightning.errors import InputError
+from nerf_lightning.system import NeRF2D, System
+from nerf_lightning.utils.files import atomic, known, write_json
+from nerf_lightning.utils.options import Count, FramesPerSecond
+
+Image = UInt8[np.ndarray, "H W 3"]
+QUALITIES = (*range(5, 90, 5), *range(90, 101))
+"""Of the JPEGs that are tried: bytes grow fastest near 100."""
+SAMPLINGS = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+"""Colours at half resolution, and at full."""
+MAX_PIXELS = 1 << 28
+"""Of an enlarged picture."""
+
+
+def error_chart(rgb: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], title: str) -> Figure:
+    """The error of every pixel, averaged over the colours, with a colour bar."""
+    error = (rgb - truth).abs_().mean(-1).mul_(255).numpy()
+    height, width = error.shape
+    figure = Figure(figsize=(8, 1 + 7 * min(max(height / width, 0.2), 3)), dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    # The largest errors would make all others look dark.
+    top = max(float(np.percentile(error, 99.9)), 1e-3)
+    edges = (-0.5, width - 0.5, height - 0.5, -0.5)
+    shown = axes.imshow(averaged(error), extent=edges, vmin=0, vmax=top, cmap="inferno")
+    axes.set(title=title, xlabel="column, pixels", ylabel="row, pixels")
+    figure.colorbar(shown, ax=axes, label="absolute error, mean over colours, 1/255", shrink=0.8)
+    return figure
+
+
+def curve_chart(curve: list[list[float]], title: str) -> Figure:
+    """PSNR over training seconds and over steps."""
+    figure = Figure(figsize=(12, 4.5), dpi=DPI, layout="constrained")
+    for axes, column, label in zip(figure.subplots(1, 2), (0, 1), ("training seconds", "step"), strict=True):
+        points = [(p[column], p[2]) for p in curve if p[column] > 0]  # on a logarithmic axis
+        if points:
+            axes.plot(*zip(*points, strict=True), "o-", color=BLUE, markersize=4)
+            axes.set_xscale("log")
+        axes.set(xlabel=label, ylabel="PSNR, dB")
+        axes.grid(alpha=0.3, which="both")
+    figure.suptitle(title)
+    return figure
+
+
+class PictureCharts(L.Callback):
+    """Writes error.png, spectrum.png and curve.png into the run folder after the test."""
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        if not trainer.is_global_zero:
+            return
+        data, folder = data_of(trainer), Path(trainer.default_root_dir)
+        (result,) = pl_module.evaluate_held_out(data, [0])
+        title = f"{data.scene.name}, step {trainer.global_step}, {result.psnr:.2f} dB"
+        write_png(folder / "error.png", pixels_of(error_chart(result.rgb, result.truth, title)))
+        spectrum = spectrum_chart(result.truth.numpy(), result.rgb.numpy(), title)
+        write_png(folder / "spectrum.png", pixels_of(spectrum))
+        write_png(folder / "curve.png", pixels_of(curve_chart(quality_curve(trainer), title)))
+
+
+class TrainingGif(L.Callback):
+    """Makes training.gif of the snapshots, where there are any, after training.
+
+    Args:
+        fps: frames a second; the last one stays for three.
+        width: most pixels across; wider snapshots are shrunk.
+    """
+
+    def __init__(self, fps: FramesPerSecond = 3, width: Count = 640):
+        self.fps = fps
+        self.width = width
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        folder = Path(trainer.default_root_dir)
+        files = sorted((folder / FOLDER).glob("step_*.png"))
+        if not files or not trainer.is_global_zero:
+            return
+        height, width, _ = narrowed(imageio.imread(files[-1]), self.width).shape
+        pictures = (imageio.imread(file) for file in [*files, files[-1], files[-1]])
+        frames = (cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA) for one in pictures)
+        with atomic(folder / "training.gif") as temporary:
+            write_animation(temporary, frames, 1 / self.fps)
+
+
+def quality_of(image: Image, truth: Image) -> float:
+    """PSNR in dB, infinite if the two are equal."""
+    return math.inf if np.array_equal(image, truth) else round(cv2.PSNR(image, truth), 4)
+
+
+def words(psnr_db: float) -> str:
+    return "without loss" if psnr_db == math.inf else f"{psnr_db:.2f} dB"
+
+
+def jpegs(image: Image) -> list[dict[str, Any]]:
+    """Quality, size in bytes and PSNR of JPEGs of a picture."""
+    found, bgr = [], np.ascontiguousarray(image[..., ::-1])
+    for quality, sampling in product(QUALITIES, SAMPLINGS):
+        options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
+        _, coded = cv2.imencode(".jpg", bgr, options)
+        decoded = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+        assert decoded is not None  # encoded one line above
+        found.append({"quality": quality, "bytes": len(coded), "psnr": quality_of(decoded, bgr)})
+    return found
+
+
+def shrunk(image: Image, limit: int) -> dict[str, Any]:
+    """The picture shrunk to `limit` bytes at three bytes a pixel, then enlarged again by bicubic interpolation."""
+    height, width = image.shape[:2]
+    scale = min(1.0, (limit / image.nbytes) ** 0.5)
+    small = (max(1, int(width * scale)), max(1, int(height * scale)))
+    less = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+    back = cv2.resize(less, (width, height), interpolation=cv2.INTER_CUBIC)
+    return {"width": small[0], "height": small[1], "bytes": less.nbytes, "psnr": quality_of(back, image)}
+
+
+class Baselines(L.Callback):
+    """After the test, compares the field with a JPEG and with a shrunk picture of the same bytes: prints, baselines.json."""
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+        evaluation, scene = attached(trainer, Evaluation), data_of(trainer).scene
+        if evaluation is None or not isinstance(scene, Picture) or not trainer.is_global_zero:
+            return
+        image, size, quality = scene.image.numpy(), artifact_bytes(pl_module), evaluation.figures["psnr"]
+        coded, small = jpegs(image), shrunk(image, size)
+        same = max((one for one in coded if one["bytes"] <= size), key=lambda one: one["psnr"], default=None)
+        good = [one for one in coded if quality is not None and one["psnr"] >= quality]
+        found = {
+            "bytes": size,
+            "picture_bytes": image.nbytes,
+            "field": quality,
+            "jpeg": same,
+            "bicubic": small,
+            "jpeg_as_good": min(good, key=lambda one: one["bytes"], default=None),
+        }
+        write_json(Path(trainer.default_root_dir) / "baselines.json", known(found))
+        text = f"in {size / 1e3:,.1f} kB (the picture's pixels have {image.nbytes / 1e3:,.1f} kB): JPEG "
+        text += "none that small" if same is None else words(same["psnr"])
+        text += f"; shrunk and enlarged by bicubic interpolation {words(small['psnr'])}"
+        if good:
+            text += f"; a JPEG as good as the field has {min(one['bytes'] for one in good) / 1e3:,.1f} kB"
+        print(text)
+
+
+class Enlarge(ChecksData):
+    """Renders a 2D field at another scale after the test: enlarged.png alone, enlarged_panel.png beside bicubic.
+
+    If the picture was shrunk for training (`dataset.max_side`) or is the built-in one, the true larger picture is known, and
+    both are compared with it: printed, and in enlarged.json.
+
+    Args:
+        scale: factor on width and height; None does nothing.
+
+    Raises:
+        InputError: from `check`, where scale is not above 0, or makes a picture beyond `MAX_PIXELS`.
+    """
+
+    def __init__(self, scale: float | None = None):
+        self.scale = scale
+
+    def check(self, data: RayDataModule | PixelDataModule) -> None:
+        if self.scale is None or not isinstance(data, PixelDataModule):
+            return
+        width, height = data.scene.size
+        if not (self.scale > 0 and self.scale**2 * width * height <= MAX_PIXELS):
+            expected = f"above 0, for a picture of at most {MAX_PIXELS} pixels"
+            raise InputError("render.scale", "", str(self.scale), expected)
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: NeRF2D) -> None:
+        scene, folder = data_of(trainer).scene, Path(trainer.default_root_dir)
+        if self.scale is None or not isinstance(scene, Picture) or not trainer.is_global_zero:
+            return
+        width, height = (max(1, round(side * self.scale)) for side in scene.size)
+        rgb = pl_module.colours(pixel_grid(height, width).to(pl_module.device)).cpu()
+        field, truth = to_bytes(rgb.view(height, width, 3)), scene.at(width, height)
+        method = cv2.INTER_CUBIC if self.scale > 1 else cv2.INTER_AREA  # bicubic alone would skip pixels when shrinking
+        bicubic = cv2.resize(scene.image.numpy(), (width, height), interpolation=method)
+        scores: dict[str, Any] = {"scale": self.scale, "width": width, "height": height, "field": None, "bicubic": None}
+        names, shown = "bicubic | field", [bicubic, field]
+        text = "no larger original to judge by (dataset.max_side=... shrinks a picture for training and keeps it)"
+        if truth is not None:
+            scores |= {"field": quality_of(field, truth.numpy()), "bicubic": quality_of(bicubic, truth.numpy())}
+            names, shown = "bicubic | field | truth", [*shown, truth.numpy()]
+            text = f"field {words(scores['field'])}, bicubic {words(scores['bicubic'])}"
+        write_png(folder / "enlarged.png", field)
+        write_png(folder / "enlarged_panel.png", panel(shown, f"{names}    {width}x{height}"))
+        write_json(folder / "enlarged.json", known(scores))
+        print(f"{self.scale:g} times as large ({width}x{height}): {text}")

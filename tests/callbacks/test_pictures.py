@@ -1,0 +1,208 @@
+import functools
+import json
+import math
+from pathlib import Path
+
+import cv2
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nerf_lightning.callbacks import Baselines, Budget, Enlarge, Evaluation, HeldOut, PictureCharts, TrainingGif
+from nerf_lightning.callbacks.pictures import curve_chart, error_chart, jpegs, quality_of, shrunk, words
+from nerf_lightning.dataset import Picture, PixelDataModule
+from nerf_lightning.dataset.picture import builtin_picture
+from nerf_lightning.drawing.panels import narrowed
+from nerf_lightning.errors import InputError
+from nerf_lightning.model import PictureField
+from nerf_lightning.sources import from_picture
+from nerf_lightning.system import NeRF2D, constant
+
+CURVE = [[0.5, 10, 20.0], [1.5, 100, 25.0], [4.0, 300, 31.0]]
+
+
+# error.png, spectrum.png, curve.png
+
+
+def test_error_chart_shows_error_of_each_pixel():
+    truth = torch.zeros(20, 30, 3)
+    rgb = truth.clone()
+    rgb[3, 7] = torch.tensor([0.1, -0.2, 0.3])
+    rgb[4] = 10 / 255
+    figure = error_chart(rgb, truth, "sunset")
+    (shown,) = figure.axes[0].images
+    expected = np.zeros((20, 30))
+    expected[3, 7], expected[4] = 0.2 * 255, 10
+    np.testing.assert_allclose(shown.get_array(), expected, rtol=1e-5)
+    low, high = shown.get_clim()
+    assert low == 0 and 10 < high < 0.2 * 255, "one pixel far off does not darken the rest"
+
+
+def test_curve_chart_runs_over_seconds_and_steps():
+    figure = curve_chart(CURVE, "sunset")
+    for axes, column in zip(figure.axes, (0, 1), strict=True):
+        (line,) = axes.lines
+        assert list(line.get_xdata()) == [point[column] for point in CURVE]
+        assert list(line.get_ydata()) == [20, 25, 31]
+
+
+def test_picture_charts_after_test_are_written(clock, system, trainer_with, tmp_path: Path):
+    charts, held_out = PictureCharts(), HeldOut([])
+    held_out.curve = CURVE
+    charts.on_test_end(trainer_with(Budget(steps=1), Evaluation(), held_out, charts), system)
+    names = {"error.png", "spectrum.png", "curve.png"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    for name in names:
+        picture = imageio.imread(tmp_path / name)
+        assert min(picture.shape[:2]) > 300 and picture.std() > 1
+
+
+# final.png, and what TensorBoard gets
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "most", "size"), [(40, 60, 60, (40, 60)), (40, 60, 30, (20, 30)), (2, 60, 6, (1, 6))]
+)
+def test_narrowed_keeps_proportion(height: int, width: int, most: int, size: tuple[int, int]):
+    assert narrowed(np.zeros((height, width, 3), np.uint8), most).shape == (*size, 3)
+
+
+# training.gif
+
+
+def frames_of(path: Path) -> list[tuple[int, int, tuple[int, int]]]:
+    """Brightness, milliseconds and size of each frame."""
+    frames = []
+    with Image.open(path) as gif:
+        assert gif.info["loop"] == 0, "for ever"
+        for number in range(gif.n_frames):
+            gif.seek(number)
+            frames.append((gif.convert("L").getpixel((1, 1)), gif.info["duration"], gif.size))
+    return frames
+
+
+def test_training_gif_shows_snapshots_in_order(trainer_with, system, tmp_path: Path):
+    gif, levels = TrainingGif(fps=5), [10, 200, 60, 120]
+    gif.on_test_end(trainer_with(gif), system)
+    assert not list(tmp_path.iterdir()), "no snapshots, no GIF"
+    (tmp_path / "snapshots").mkdir()
+    for number, level in reversed([*enumerate(levels)]):
+        path = tmp_path / "snapshots" / f"step_{10 * number:07d}.png"
+        imageio.imwrite(path, np.full((20, 30, 3), level, np.uint8))
+    gif.on_test_end(trainer_with(gif), system)
+    frames = frames_of(tmp_path / "training.gif")
+    assert [level for level, _, _ in frames[:4]] == levels and {level for level, _, _ in frames[3:]} == {120}
+    assert [duration for _, duration, _ in frames[:3]] == [200] * 3
+    assert sum(duration for _, duration, _ in frames[3:]) == 600
+    assert {size for _, _, size in frames} == {(30, 20)}
+
+
+# baselines.json
+
+
+@pytest.fixture(scope="module")
+def sunset() -> np.ndarray:
+    return builtin_picture(40).numpy()
+
+
+def test_quality_of_lossless_is_infinite(sunset):
+    assert quality_of(sunset, sunset.copy()) == math.inf and words(math.inf) == "without loss"
+    off_by_one = np.where(sunset > 127, sunset - 1, sunset + 1).astype(np.uint8)
+    assert quality_of(sunset, off_by_one) == pytest.approx(20 * math.log10(255), abs=1e-4)
+
+
+def test_shrunk_picture_keeps_proportions_within_bytes(sunset):
+    wide = sunset[:20]
+    assert [shrunk(wide, 2400 // n**2)["width"] for n in (1, 2, 4, 5)] == [40, 20, 10, 8]
+    limits = (30, 100, 700, 1500, 2399)
+    found = [shrunk(wide, limit) for limit in limits]
+    for one, limit in zip(found, limits, strict=True):
+        assert one["bytes"] == 3 * one["width"] * one["height"] <= limit
+    qualities = [one["psnr"] for one in found]
+    assert qualities == sorted(qualities) and qualities[-1] > qualities[0] + 3
+
+
+@pytest.mark.parametrize(("size", "quality"), [(2000, 25.0), (2000, None), (100, 25.0)])
+def test_baselines_after_test_compare_same_bytes(
+    size, quality, sunset, trainer_with, system, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("nerf_lightning.callbacks.pictures.artifact_bytes", lambda system: size)
+    evaluation = Evaluation()
+    evaluation.figures["psnr"] = quality
+    trainer = trainer_with(evaluation)
+    trainer.datamodule = from_picture(max_side=40)
+    Baselines().on_test_end(trainer, system)
+    found, text = json.loads((tmp_path / "baselines.json").read_text()), capsys.readouterr().out
+    coded = jpegs(sunset)
+    small = [one["psnr"] for one in coded if one["bytes"] <= size]
+    good = [one["bytes"] for one in coded if quality is not None and one["psnr"] >= quality]
+    assert (found["bytes"], found["picture_bytes"], found["field"]) == (size, 4800, quality)
+    assert (found["jpeg"]["psnr"] == max(small) if small else found["jpeg"] is None) and (size > 100) == bool(small)
+    assert found["jpeg_as_good"]["bytes"] == min(good) if good else found["jpeg_as_good"] is None
+    assert found["bicubic"] == shrunk(sunset, size)
+    assert ("none that small" in text) == (size == 100) and ("as good as" in text) == (quality is not None)
+
+
+# enlarged.png
+
+
+class Ramp(PictureField):
+    """Red grows to the right, green downward."""
+
+    def __init__(self, size: tuple[int, int]):
+        super().__init__(size)
+        self.blue = torch.nn.Parameter(torch.tensor(0.5))
+
+    def forward(self, uv: torch.Tensor) -> torch.Tensor:
+        return torch.cat([uv, self.blue.expand(len(uv), 1)], dim=1)
+
+
+def ramp(width: int, height: int) -> np.ndarray:
+    """What `Ramp` looks like in so many pixels."""
+    red, green = ((np.arange(n) + 0.5) / n for n in (width, height))
+    colours = np.stack(np.broadcast_arrays(red, green[:, None], 0.5), axis=-1)
+    return np.rint(colours.astype(np.float32) * 255).astype(np.uint8)
+
+
+@pytest.fixture
+def enlarge(trainer_with, tmp_path: Path):
+    """Enlarges a `Ramp` that stands for what a field has learned of a dataset; returns enlarged.json."""
+
+    def call(data: PixelDataModule, scale: float | None) -> dict:
+        trainer, system = trainer_with(), NeRF2D(Ramp(data.scene.size), functools.partial(torch.optim.SGD), constant)
+        trainer.datamodule = data
+        Enlarge(scale).on_test_end(trainer, system)
+        return json.loads((tmp_path / "enlarged.json").read_text())
+
+    return call
+
+
+@pytest.mark.parametrize(("scale", "side"), [(0.5, 12), (2.65, 64)])
+def test_enlarge_built_in_picture_is_compared_with_truth(scale, side, enlarge, tmp_path: Path):
+    scores = enlarge(from_picture(max_side=24), scale)
+    made = imageio.imread(tmp_path / "enlarged.png")
+    truth, small = builtin_picture(side).numpy(), builtin_picture(24).numpy()
+    assert np.array_equal(made, ramp(side, side)), "a field is seen at the finer pixels' centres"
+    method = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+    bicubic = quality_of(cv2.resize(small, (side, side), interpolation=method), truth)
+    size = {"scale": scale, "width": side, "height": side}
+    assert scores == {**size, "field": quality_of(ramp(side, side), truth), "bicubic": bicubic}
+
+
+def test_enlarge_without_larger_original_gives_no_scores(enlarge, tmp_path: Path, capsys):
+    photo = np.random.default_rng(0).integers(0, 256, (20, 40, 3)).astype(np.uint8)
+    imageio.imwrite(tmp_path / "photo.png", photo)
+    scores = enlarge(from_picture(str(tmp_path / "photo.png")), 3)
+    assert scores["field"] is None and scores["bicubic"] is None
+    assert imageio.imread(tmp_path / "enlarged.png").shape == (60, 120, 3)
+    assert "3 times as large (120x60): no larger original" in capsys.readouterr().out
+
+
+def test_enlarge_scale_out_of_range_is_refused_before_training():
+    data = PixelDataModule(Picture("square", "made", torch.zeros(4, 4, 3, dtype=torch.uint8)))
+    Enlarge(2.0**12).check(data)
+    for scale in (2.0**12 + 1, 0.0, math.nan):
+        with pytest.raises(InputError, match="render.scale"):
+            Enlarge(scale).check(data)

@@ -1,0 +1,95 @@
+"""Activations, encodings, levels of a hash grid, and how finely colours depend on the direction."""
+
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from nerf_lightning.cameras import Bounds
+from nerf_lightning.kernels import hash_interpolate
+from nerf_lightning.model import HashGrid, HashGridField, TensoRFField, density_activation, sinusoidal, truncated_exp
+from nerf_lightning.model.hashgrid import level_resolutions
+
+
+def test_truncated_exp_any_input_keeps_gradient():
+    x = torch.tensor([-1e4, -20.0, -1.0, 0.0, 3.0, 15.0, 16.0, 1e4], requires_grad=True)
+    y = truncated_exp(x)
+    torch.testing.assert_close(y, torch.tensor([math.exp(min(v, 15)) for v in x.tolist()]))
+    y.sum().backward()
+    torch.testing.assert_close(x.grad, torch.tensor([math.exp(max(-15, min(v, 15))) for v in x.tolist()]))
+    assert (x.grad > 0).all(), "neither vanishes"
+    assert torch.autograd.gradcheck(truncated_exp, torch.linspace(-10, 10, 9).double().requires_grad_())
+
+
+@pytest.mark.parametrize(
+    ("name", "at_zero", "at_three"),
+    [("relu", 0.0, 3.0), ("softplus", math.log1p(math.exp(-1)), math.log1p(math.exp(2))), ("exp", 1.0, math.exp(3))],
+)
+def test_density_activation_any_name_gives_formula(name, at_zero, at_three):
+    values = density_activation(name)(torch.tensor([0.0, 3.0, -5.0]))
+    torch.testing.assert_close(values[:2], torch.tensor([at_zero, at_three]))
+    assert values.min() >= 0
+
+
+@pytest.mark.parametrize(("name", "dtype"), [("softplus", torch.float16), ("exp", torch.bfloat16)])
+def test_density_activation_half_precision_stays_finite(name: str, dtype: torch.dtype):
+    x = torch.tensor([-1e4, -20.0, 0.0, 12.0, 1e4], dtype=dtype, requires_grad=True)
+    values = density_activation(name)(x)
+    values.float().sum().backward()
+    assert values.isfinite().all() and x.grad.isfinite().all()
+    assert values[3] > 0.9 * (11 if name == "softplus" else math.exp(12)), "e^12 is beyond half precision"
+
+
+@pytest.mark.parametrize(("frequencies", "shape"), [(0, (5, 3)), (1, (2,)), (4, (2, 3, 1))])
+def test_sinusoidal_any_shape_matches_loop(frequencies, shape):
+    x = torch.randn(shape)
+    rows = []
+    for row in x.reshape(-1, shape[-1]).tolist():
+        out = list(row)
+        for octave in range(frequencies):
+            out += [math.sin(2**octave * math.pi * v) for v in row]
+            out += [math.cos(2**octave * math.pi * v) for v in row]
+        rows.append(out)
+    expected = torch.tensor(rows).view(*shape[:-1], shape[-1] * (1 + 2 * frequencies))
+    torch.testing.assert_close(sinusoidal(x, frequencies), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("levels", "coarsest", "finest", "expected"),
+    [(1, 16, 256, [16]), (2, 3, 50, [3, 50]), (5, 16, 256, [16, 32, 64, 128, 256]), (3, 7, 7, [7, 7, 7])],
+)
+def test_level_resolutions_grow_from_coarsest_to_finest(levels, coarsest, finest, expected):
+    assert level_resolutions(levels, coarsest, finest) == expected
+
+
+def test_hash_grid_small_levels_have_one_entry_a_vertex():
+    grid = HashGrid(levels=3, log2_entries=9, features=4, coarsest=4, finest=16)
+    assert grid.resolutions == [4, 8, 16] and grid.sizes == [125, 512, 512]
+    assert grid.tables.shape == (125 + 512 + 512, 4) and grid.width == 12
+    assert 0 < grid.tables.abs().max() <= 1e-4
+    unit = torch.rand(7, 3)
+    assert torch.equal(grid(unit), hash_interpolate(grid.tables, unit, grid.cells, grid.sizes))
+
+
+BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("kind", [TensoRFField, HashGridField])
+def test_colours_vary_with_direction_up_to_degree(kind: type, degree: int, kernels: str):
+    """Where every ReLU stays open, the logits of a colour are a polynomial of that degree in the direction: around a circle
+    their Fourier series ends there."""
+    field = kind(BOX, degree=degree, width=8)
+    first, *others = field.colour_net
+    first.bias.data += 4.0
+    for layer in others:
+        layer.weight.data -= layer.weight.data.mean(1, keepdim=True)  # so that the 4 is not seen behind it
+        layer.bias.data.fill_(4.0 if layer is not others[-1] else 0.0)
+    turn = torch.arange(16) * (2 * torch.pi / 16)
+    plane = torch.linalg.qr(torch.randn(3, 2)).Q
+    directions = normalize(torch.stack([turn.cos(), turn.sin()], dim=1) @ plane.T, dim=1)
+    logits = torch.special.logit(field(torch.full((16, 3), 0.3), directions)[1].double())
+    waves = torch.fft.rfft(logits - logits.mean(0), dim=0).abs()
+    assert waves[degree + 1 :].max() < 1e-3
+    assert degree == 0 or waves[degree].max() > 1e-2
