@@ -7,7 +7,7 @@ import re
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.text import join_truncated
@@ -121,6 +121,7 @@ def _count_shared(wanted: tuple[str, ...], own: tuple[str, ...]) -> int:
     return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
+@runtime_checkable
 class Named(Protocol):
     @property
     def name(self) -> str: ...
