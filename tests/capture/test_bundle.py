@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nerf_lightning.cameras import Distortion
 from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS, Bundle, Problem, lens_vector, refine, simplified
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, project, to_matrix
 from nerf_lightning.capture.tags.detect import Mark
@@ -23,7 +24,9 @@ def bundle(photos: int = 8, noise: float = 0.0, off: float = 0.0, seed: int = 0)
 
 def test_problem_jacobian_matches_differences():
     made = replace(bundle(3, noise=0.5, off=0.05), twists=1e-3 * np.arange(6.0))
-    made = replace(made, lens=replace(LENS, distortion=(-0.2, 0.05, 0.001, -0.002, 0.01), fy=910.0))
+    made = replace(
+        made, lens=replace(LENS, distortion=Distortion(k1=-0.2, k2=0.05, p1=0.001, p2=-0.002, k3=0.01), fy=910.0)
+    )
     problem = Problem(made, LENS_PARAMETERS, frozenset({0}), True)
     x = problem.start[problem.free]
     x[9:] += 1e-2 * np.random.default_rng(0).standard_normal(len(x) - 9)
@@ -86,7 +89,7 @@ def test_refine_of_twisted_tag_finds_twist():
 
 
 def test_simplified_lens_has_plain_values():
-    lens = replace(LENS, fy=910.0, distortion=(-0.2, 0.05, 0.01, 0.02, 0.03))
+    lens = replace(LENS, fy=910.0, distortion=Distortion(k1=-0.2, k2=0.05, p1=0.01, p2=0.02, k3=0.03))
     assert simplified(lens, ()) == lens == simplified(lens, LENS_PARAMETERS)
-    plain = replace(LENS, cx=512.0, cy=384.0, distortion=(-0.2, 0.0, 0.0, 0.0, 0.0))
+    plain = replace(LENS, cx=512.0, cy=384.0, distortion=Distortion(k1=-0.2))
     assert simplified(lens, ("focal", "k1")) == plain
