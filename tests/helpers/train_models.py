@@ -51,7 +51,7 @@ class Stop(Exception):
 
 
 @patch.dict(corrections.MIN_GAIN, poses=-1.0, light=-1.0)  # refine=auto begins with its first trial
-@patch.multiple(corrections, FIRST=2, EARLY=2)
+@patch.multiple(corrections, FIRST_TRIAL_STEP=2, EARLY_STEPS=2)
 def fingerprints(folder: Path, stop: int) -> dict[str, str]:
     save = Checkpoints.on_train_batch_end
 

@@ -41,21 +41,6 @@ def test_resample_path_open_keeps_its_ends_and_fewer_are_spread():
     assert torch.equal(resample_path(circle(12), 4, closed=True).c2w, circle(12).c2w[torch.tensor([1, 4, 7, 10])])
 
 
-@pytest.mark.parametrize("elevation", [0.0, 0.5, -0.3])
-def test_spiral_winds_up_to_the_axis_at_the_same_distance(elevation: float):
-    spiral = spiral_like(circle(36, elevation), 60)
-    offset = spiral.centres - CENTRE
-    torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), 3.0), atol=0.02, rtol=0)
-    torch.testing.assert_close(spiral.c2w[:, :3, 2], -offset / 3.0, atol=0.01, rtol=0)  # all look at the middle
-    # From the circle's side of its plane, a quarter of the way to the axis is left at the top.
-    toward = UP if elevation >= 0 else -UP
-    angle = torch.acos((offset @ toward / 3.0).clamp(-1, 1))
-    assert float(angle[0]) == pytest.approx(math.pi / 2 - abs(elevation), abs=0.02)
-    assert float(angle.min()) == pytest.approx((math.pi / 2 - abs(elevation)) / 4, abs=0.02)
-    steps = (spiral.centres.roll(-1, 0) - spiral.centres).norm(dim=1)
-    assert float(steps.max()) < 3 * 2.2 * (2 * math.pi * 2 / 60), "no jump, at the end neither"
-
-
 @pytest.mark.parametrize(
     ("path", "frames", "count"),
     [("orbit", None, 6), ("orbit", 9, 9), ("spiral", None, 120), ("test", None, 2), ("train", 3, 3)],

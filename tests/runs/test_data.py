@@ -72,24 +72,6 @@ def test_built_in_scene_is_not_replaced_by_a_download(tmp_path: Path):
     assert again(run, str(tmp_path / "published.npz")).name == "published"
 
 
-def test_resumed_run_of_a_stranger_uses_no_network(small_run: Path, inside, tmp_path: Path):
-    run = tmp_path / "run"
-    shutil.copytree(small_run, run)
-    config = yaml.safe_load((run / "config.yaml").read_text())
-    config["dataset"] = {
-        "_target_": "nerf_lightning.sources.from_photos",
-        "url": "http://stranger.example/.profile",
-        "folder": str(tmp_path),
-        "path": None,
-        "resize": 16,
-    }
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
-    code, _, err = inside(f"resume={run}", "budget.steps=11")
-    assert "the network was asked" not in err
-    assert code == 0, err
-    assert not (tmp_path / ".profile").exists()
-
-
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (5e5, 5.4112e6, 300.0)], ids=["local", "georeferenced"])
 def test_other_photos_are_placed_in_the_frame_of_the_run(shift: tuple[float, float, float], tmp_path: Path):
     """Half of a capture has another middle and another scale than all of it; its cameras still stand where they stood."""
