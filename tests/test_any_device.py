@@ -118,7 +118,7 @@ def unbind(system: NeRF3D) -> None:
         part.bounds = replace(part.bounds, unbounded=True)
 
 
-MOST = {"tensorf": 255, "hashgrid": 255, "voxels": 255, "mlp": 225}
+MOST = {"tensorf": 256, "hashgrid": 255, "voxels": 258, "mlp": 227}
 """Operations a step between two updates of the sampler: forward, backward, optimiser. Each takes 5 to 10 microseconds."""
 
 
