@@ -91,7 +91,10 @@ def config_from(plain: Any, path: Path | str) -> DictConfig:
     known = {field.name for field in fields(RunOptions)}
     options = {key: value for key, value in plain.items() if key in known}
     check_options("", RunOptions, options, OF_COMMAND, source=str(path))
-    return OmegaConf.create(escape(plain))  # text from outside is never an interpolation
+    try:
+        return OmegaConf.create(escape(plain))  # text from outside is never an interpolation
+    except RecursionError as error:
+        raise InputError(path, "", "values nested too deep", "a run's configuration") from error
 
 
 def check_config(path: Path | str, key: str, node: Any) -> None:

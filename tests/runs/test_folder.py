@@ -1,5 +1,6 @@
 """A run folder is read back without trusting it: damage gets one line, and nothing in it is executed."""
 
+import functools
 import json
 import os
 import shutil
@@ -120,6 +121,7 @@ DAMAGES: list[tuple[str, Callable[[Path], object], str]] = [
     (CONFIG, change(version="9.9"), "version 9.9"),
     (CONFIG, change(dataset="lego"), "options by name"),
     (CONFIG, change(logger=[0, float("nan")]), "finite"),
+    (CONFIG, change(model__finest=functools.reduce(lambda x, _: [x], range(150), 1)), "nested too deep"),
     (CONFIG, change(model__hue=3), "unknown option"),
     (CONFIG, change(optimizer__betas=[]), "optimizer"),
     (SCENE, Path.unlink, "nothing there"),
