@@ -102,4 +102,4 @@ def _open_run(source: Path, device: str, side: int, host: str, port: int) -> "Pa
     except InputError as error:
         print(f"without photos: {error}", flush=True)
     assert scene is None or isinstance(scene, Scene)  # of a scene's run
-    return FieldPage(source.name, found.system, found.orbit, scene, host, port, side)
+    return FieldPage(source.resolve().name, found.system, found.orbit, scene, host, port, side)

@@ -83,7 +83,8 @@ def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figu
         x, inside = min(one.seconds, reach), one.seconds <= reach
         xs.append(x)
         axes.scatter([x], [one.psnr], 34, "none", marker="o" if inside else ">", edgecolor=GREY, label=label)
-        name = one.name if inside else f"{one.name} ({one.seconds / 3600:.1f} h)"
+        time = f"{one.seconds / 3600:.1f} h" if one.seconds >= 3600 else f"{one.seconds / 60:.0f} min"
+        name = one.name if inside else f"{one.name} ({time})"
         texts.append(add_name(axes, name, x, one.psnr, GREY))
         label = ""
     if training and len(points) <= MAX_NAMED:

@@ -17,7 +17,7 @@ from tests.comparison.conftest import run_maker
 from tests.helpers.run_results import MakeRun
 
 ENTRY = "  source: a paper\n  hardware: a cluster\n  scene: Toy\n  conditions: 800x800\n"
-METHODS = "  methods: {theirs: [35.5, 120], slower: [36, 90000.0]}\n"
+METHODS = "  methods: {theirs: [35.5, 120], slower: [36, 90000.0], later: [36, 3000]}\n"
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)>"
 
 
@@ -82,7 +82,8 @@ def test_draw_cost_names_few_points_and_publications_beyond_the_axis_with_their_
     runs = [make_run(name, {"recipe": name}, train_seconds=10.0 + n, psnr=30.0 + n) for n, name in enumerate("abc")]
     points = compute_points(runs)[0][1].assign(style=[("black", "o")] * 3)
     (axes,) = draw_cost(points, "train_seconds", read_references(tmp_path / "mine.yaml")).axes
-    assert sorted(text.get_text() for text in axes.texts) == ["a", "b", "c", "slower (25.0 h)", "theirs"]
+    names = ["a", "b", "c", "later (50 min)", "slower (25.0 h)", "theirs"]
+    assert sorted(text.get_text() for text in axes.texts) == names
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [
         "published, other hardware",
         "Pareto frontier",
