@@ -61,7 +61,7 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
         trial, generator = copy.deepcopy(system).to(device), step_generator(0, Stream.BATCH, 0)
         if isinstance(trial, NeRF3D):
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
-            batch = draw_rays(data.scene.train, 64, generator, plain=trial.renderer.uses_texture).to(device)
+            batch = draw_rays(data.scene.train, 64, generator, with_texture=trial.renderer.uses_texture).to(device)
             losses, _ = trial.compute_losses(batch, step_generator(0, Stream.STEP, 0, device))
             total_loss(losses).backward()
         else:

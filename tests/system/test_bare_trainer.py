@@ -57,7 +57,7 @@ def test_plain_places_are_found_for_view_loss_of_unbounded_scene(weight: float, 
     data = build_data(cfg)
     data.scene = replace(data.scene, bounds=replace(data.scene.bounds, unbounded=unbounded))
     bare(1).fit(build_system(cfg, frame_of(data), CPU), data)
-    assert (data.draw(0).plain is not None) == (weight > 0 and unbounded)
+    assert (data.draw(0).texturelessness is not None) == (weight > 0 and unbounded)
 
 
 PROPOSALS = ("refine=poses", "sampler=proposal", "~sampler.resolution", "sampler.final=0.01", "optimizer.lr=0.02")
