@@ -23,7 +23,7 @@ from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.system.growth import follow_resolution, grow_field, next_stage
 from nerf_lightning.system.system import total_loss
-from nerf_lightning.training.train import prepare
+from nerf_lightning.training.process import prepare_process
 from nerf_lightning.utils.device import CPU, synchronize
 from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.seeding import Stream, step_generator
@@ -43,7 +43,7 @@ def build(overrides: list[str], device: torch.device = CPU) -> tuple[DictConfig,
     with tempfile.TemporaryDirectory() as folder:
         cfg = composed(overrides, Path(folder))
         silence_lightning()
-        prepare(cfg)
+        prepare_process(cfg)
         data = build_data(cfg)
         data.enlarge(limits_of(cfg, device).batch)
         system = build_system(cfg, frame_of(data), device).to(device)

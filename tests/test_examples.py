@@ -46,12 +46,14 @@ def test_example_train_and_render_writes_view_and_field(example: Callable[..., N
 
 
 @pytest.mark.filterwarnings("ignore:.*LeafSpec.*:FutureWarning")  # Lightning's progress bar, with PyTorch as it is now
-def test_example_own_field_learns(
-    example: Callable[..., None], scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("part", "steps"), [("field", 10), ("loss", 40), ("sampler", 40)])
+def test_example_own_part_learns(
+    part: str, steps: int, example: Callable[..., None], scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ):
-    example("own_field.py", str(scene), "10")
+    example(f"own_{part}.py", str(scene), str(steps))
     assert float(capfd.readouterr().out.split(" dB on")[0].split()[-1]) > 12, "it learns: a black picture has less"
-    assert imageio.imread(tmp_path / "own_field.png").shape == (16, 32, 3)
+    if part == "field":
+        assert imageio.imread(tmp_path / "own_field.png").shape == (16, 32, 3)
 
 
 def test_example_own_photos_writes_orbit_and_field(

@@ -46,3 +46,21 @@ def test_imports_between_rooms_run_one_way():
         found |= {(room, other) for other in imported_rooms(file) - {room}}
     assert len(found) > 50
     assert {(room, other) for room, other in found if level[room] <= level[other]} == UP
+
+
+CORE = ("model", "sampler", "renderer", "refine", "system", "callbacks", "training")
+OWN = {"self", "ctx", "history"}
+"""An object itself, what autograd gives a function of its own, and the guard's record."""
+OUTSIDE = {"torch", "trainer", "kept"}
+"""Objects of torch, Lightning and functools."""
+
+
+def test_core_sets_no_attribute_of_another_object():
+    found = []
+    for file in (file for room in CORE for file in (ROOT / "nerf_lightning" / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+                owner = ast.unparse(node).split(".")[0]
+                if owner not in OWN | OUTSIDE and node.attr not in ("data", "grad"):  # of a tensor
+                    found.append(f"{file.name}:{node.lineno}: {ast.unparse(node)}")
+    assert found == []

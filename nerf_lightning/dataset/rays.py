@@ -25,7 +25,7 @@ FOCUS = 0.5
 SOME_PIXELS = 8192
 """Pixels drawn to measure the error of one plain colour."""
 NEIGHBOUR = 0.0125
-"""How far from a pixel its photo is looked at for `plainness`, in longer sides of the photo."""
+"""How far from a pixel its photo is looked at for `measure_texturelessness`, in longer sides of the photo."""
 CONTRAST = 0.01
 """Difference of colours at which a photo is plain by 1/e: two or three steps of 8 bits, hardly more than their noise."""
 
@@ -39,8 +39,8 @@ class RayBatch(TensorDataclass):
     """sRGB, with straight alpha where C is 4."""
     views: Int[Tensor, "R"] | None = field(default=None, kw_only=True)
     """The training photo that each belongs to; None where that is not asked for."""
-    plain: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
-    """How plain the photo is around each, see `plainness`; None where that is not asked for."""
+    texturelessness: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
+    """Of the photo around each, see `measure_texturelessness`; None where that is not asked for."""
     weights: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
     """How much each counts, see `Focus`; None where all count the same."""
 
@@ -74,9 +74,9 @@ def view_batch(views: Views, view: int, subset: PixelSubset = WHOLE) -> ViewBatc
     return ViewBatch(rays, views.image(view)[row, column], len(rows), len(columns), known, subset.strip)
 
 
-def plainness(views: Views, places: Int[Tensor, "R"], view: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
-    """How plain photos are around the pixels at these places in `Views.pixels`: 1 where the colour is the same on all four
-    sides, falling toward 0 with its largest difference.
+def measure_texturelessness(views: Views, places: Int[Tensor, "R"], view: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
+    """How textureless photos are around the pixels at these places in `Views.pixels`: 1 where the colour is the same on all
+    four sides, falling toward 0 with its largest difference.
 
     Such places look alike in photos from elsewhere too, so that these hardly tell how far they are.
     """
@@ -95,21 +95,21 @@ def plainness(views: Views, places: Int[Tensor, "R"], view: Int[Tensor, "R"]) ->
     return torch.exp(-contrast / (255 * CONTRAST))
 
 
-def draw_rays(views: Views, count: int, generator: torch.Generator, plain: bool = False) -> RayBatch:
+def draw_rays(views: Views, count: int, generator: torch.Generator, with_texture: bool = False) -> RayBatch:
     """Draws pixels uniformly from all views, masked ones excepted, with replacement.
 
     Photos stay bytes, and rays are made only for the drawn pixels: the cost does not depend on the number of photos.
     """
-    return batch_of(views, views.draw(count, generator), plain)
+    return batch_of(views, views.draw(count, generator), with_texture)
 
 
 def batch_of(
-    views: Views, places: Int[Tensor, "R"], plain: bool = False, weights: Float[Tensor, "R"] | None = None
+    views: Views, places: Int[Tensor, "R"], with_texture: bool = False, weights: Float[Tensor, "R"] | None = None
 ) -> RayBatch:
-    """Rays and pixels at these places in `Views.pixels`; `plain` and `weights` as in `RayBatch`."""
+    """Rays and pixels at these places in `Views.pixels`; `weights` and, if asked for, `texturelessness` as in `RayBatch`."""
     rays, view = rays_through(views, places)
-    shown = plainness(views, places, view) if plain else None
-    return RayBatch(rays, views.pixels[places], views=view, plain=shown, weights=weights)
+    textureless = measure_texturelessness(views, places, view) if with_texture else None
+    return RayBatch(rays, views.pixels[places], views=view, texturelessness=textureless, weights=weights)
 
 
 class RayDataModule(StepDataModule[Views]):
@@ -137,10 +137,8 @@ class RayDataModule(StepDataModule[Views]):
         self._focus: Focus | None = None
         self._focus_state: dict[str, Tensor] = {}
         """What `_focus` goes on from, when photos are drawn from for the first time."""
-        self.plain = False
-        """Whether batches say how plain photos are, see `RayBatch.plain`."""
-        self.finer = 1.0
-        """Factor on the samples aimed for, see `Field.finer`: fewer meet in a small cell, and gradients would be noise."""
+        self._with_texture = False
+        self._resolution_scale = 1.0
 
     def enlarge(self, batch: int) -> None:
         """Takes that many times the rays and samples a step, for a device that takes more at once. Before training."""
@@ -148,12 +146,21 @@ class RayDataModule(StepDataModule[Views]):
         self.rays = self.first_rays = self.first_rays * batch
         self.samples = None if self.samples is None else self.samples * batch
 
+    def measure_texture(self, is_asked: bool) -> None:
+        """Sets whether batches say how textureless photos are."""
+        self._with_texture = is_asked
+
+    def set_resolution_scale(self, scale: float) -> None:
+        """Sets the factor on the samples aimed for, see `Field.resolution_scale`: fewer meet in a small cell, and gradients
+        would be noise."""
+        self._resolution_scale = scale
+
     def note_samples(self, drawn: int) -> None:
         """Called with the samples that a step's rays took: moves the number of rays toward the aim."""
         if self.samples is None:
             return
         # Damped, since one batch's count is noisy; bounded, since empty space would ask for endless rays.
-        wanted = self.rays * round(self.samples * self.finer) / max(drawn, 1)
+        wanted = self.rays * round(self.samples * self._resolution_scale) / max(drawn, 1)
         limit = self.first_rays * self.MOST_RAYS
         self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
 
@@ -171,14 +178,14 @@ class RayDataModule(StepDataModule[Views]):
     def draw_from(self, photos: Views, step: int, part: slice) -> RayBatch:
         generator = step_generator(self.seed, Stream.BATCH, step, photos.pixels.device)
         if self.focus == 0:
-            return batch_of(photos, photos.draw(self.rays, generator)[part], self.plain)
+            return batch_of(photos, photos.draw(self.rays, generator)[part], self._with_texture)
         if self._focus is None or self._focus.views is not photos:
             self._focus_state = self._focus_state if self._focus is None else self._focus.state_dict()
             self._focus = Focus(photos, self.focus)
             if len(self._focus_state.get("sums", ())) == len(self._focus.sums):  # else of other photos, or of none
                 self._focus.load_state_dict(self._focus_state)
         places, weights = self._focus.draw(self.rays, generator)
-        return batch_of(photos, places[part], self.plain, weights[part])
+        return batch_of(photos, places[part], self._with_texture, weights[part])
 
     def some_pixels(self) -> RayBatch:
         """Training pixels to measure the error of one plain colour on."""

@@ -77,7 +77,7 @@ def view_loss(
         weight: of the samples, see `volume_weights`; no gradient goes there.
         view_residual: see `FieldOutput`.
         samples: along R rays.
-        texturelessness: p of each ray, see `RayBatch.plain`; None for 0.
+        texturelessness: p of each ray, see `RayBatch.texturelessness`; None for 0.
     """
     squares = view_residual.square().sum(1)
     price = squares

@@ -37,7 +37,8 @@ from nerf_lightning.sizing.choose import (
 )
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.training.job import find_progress
-from nerf_lightning.training.train import prepare, train, warm_up
+from nerf_lightning.training.process import prepare_process, warm_up
+from nerf_lightning.training.train import train
 from nerf_lightning.utils.files import atomic, write_json
 from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.parsing import read_json
@@ -78,7 +79,7 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> dic
     """
     device = build.device_of(cfg)
     silence_lightning()
-    prepare(cfg)
+    prepare_process(cfg)
     data = build.build_data(cfg)
     data.enlarge(limits_of(cfg, device).batch)
     build.build_system(set_options(cfg, "model", ladder.rungs[0]), build.frame_of(data), device)
@@ -166,7 +167,7 @@ def train_rung(cfg: DictConfig, data: Data, folder: Path, smaller: System | None
     Returns:
         The system, on the device that trained it, and the seconds it took.
     """
-    prepare(cfg)
+    prepare_process(cfg)
     silence_lightning()
     if isinstance(data, RayDataModule):
         data.start_again()

@@ -36,7 +36,7 @@ def next_stage(system: "NeRF3D", step: int) -> int | None:
 def follow_resolution(system: "NeRF3D", data: RayDataModule) -> None:
     """Gives the sampler's steps, and the samples a step of the data, the field's present resolution."""
     system.sampler.set_resolution_scale(system.field.resolution_scale)
-    data.finer = system.field.resolution_scale
+    data.set_resolution_scale(system.field.resolution_scale)
 
 
 @torch.no_grad()

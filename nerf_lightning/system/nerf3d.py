@@ -86,7 +86,7 @@ class NeRF3D(System):
     def on_fit_start(self) -> None:
         if self.trainer.ckpt_path is None:  # what is resumed has marked them already
             self.sampler.mark_invisible_cells(self.data.scene.train.cameras)
-        self.data.plain = self.renderer.uses_texture
+        self.data.measure_texture(self.renderer.uses_texture)
         follow_resolution(self, self.data)
 
     def set_first_step(self, step: int) -> None:
@@ -151,7 +151,7 @@ class NeRF3D(System):
         """The other losses by name: of the field, the rendering weights, and what the sampler learns from."""
         return {
             **self.field.losses(),
-            **self.renderer.losses(output, samples, self.state.progress, batch.plain),
+            **self.renderer.losses(output, samples, self.state.progress, batch.texturelessness),
             **self.sampler.losses(samples, output.weights),
         }
 

@@ -6,6 +6,7 @@ import types
 import typing
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from nerf_lightning.errors import InputError
@@ -18,40 +19,17 @@ MAX_FLOAT = (2 - 2**-23) * 2.0**127
 
 
 @dataclass(frozen=True)
-class AtLeast:
-    """A lower bound on an option, stated in its annotation."""
+class Bound:
+    """A bound on an option, stated in its annotation."""
 
+    words: str
+    holds: Callable[[Any, float], bool]
     value: float
 
 
-@dataclass(frozen=True)
-class AtMost:
-    """An upper bound, likewise."""
+AtLeast, AtMost = partial(Bound, "at least", operator.ge), partial(Bound, "at most", operator.le)
+Above, Below = partial(Bound, "above", operator.gt), partial(Bound, "below", operator.lt)
 
-    value: float
-
-
-@dataclass(frozen=True)
-class Above:
-    """A lower bound that is itself too low."""
-
-    value: float
-
-
-@dataclass(frozen=True)
-class Below:
-    """An upper bound that is itself too high."""
-
-    value: float
-
-
-BOUNDS: dict[type, tuple[str, Callable[[Any, float], bool]]] = {
-    AtLeast: ("at least", operator.ge),
-    AtMost: ("at most", operator.le),
-    Above: ("above", operator.gt),
-    Below: ("below", operator.lt),
-}
-"""In words, and as a comparison."""
 Positive = Annotated[float, Above(0)]
 Weight = Annotated[float, AtLeast(0)]
 """Of a term of the loss; 0 does without it."""
@@ -139,14 +117,14 @@ def _fits(value: Any, hint: Any) -> bool:
 
 def _is_within(value: Any, bound: Any) -> bool:
     """Whether a number keeps a bound; other annotations are none."""
-    return type(bound) not in BOUNDS or BOUNDS[type(bound)][1](value, bound.value)
+    return not isinstance(bound, Bound) or bound.holds(value, bound.value)
 
 
 def _describe(hint: Any) -> str:
     """An annotation in words."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        bounds = [f"{BOUNDS[type(bound)][0]} {bound.value:.12g}" for bound in arguments[1:] if type(bound) in BOUNDS]
+        bounds = [f"{bound.words} {bound.value:.12g}" for bound in arguments[1:] if isinstance(bound, Bound)]
         return f"{_describe(arguments[0])} {' and '.join(bounds)}"
     if origin in (typing.Union, types.UnionType):
         return " or ".join(_describe(argument) for argument in arguments)

@@ -7,7 +7,7 @@ import torch
 from nerf_lightning.cameras import Bounds, Cameras, orbit_around
 from nerf_lightning.dataset import RayDataModule, Scene, Views
 from nerf_lightning.dataset.loader import BatchLoader
-from nerf_lightning.dataset.rays import draw_rays, plainness
+from nerf_lightning.dataset.rays import draw_rays, measure_texturelessness
 from nerf_lightning.renderer import over
 
 VIEWS, HEIGHT, WIDTH = 3, 4, 6
@@ -40,7 +40,7 @@ def test_draw_rays_colours_belong_to_their_rays(scene: Scene):
         torch.testing.assert_close(batch.rays.directions[i].double(), direction / direction.norm(), atol=1e-6, rtol=0)
 
 
-def test_plainness_step_and_slope_are_told_apart():
+def test_texturelessness_step_and_slope_are_told_apart():
     """One photo with a step of colour and one with a slope, of two sizes: what counts is near by, and within the photo."""
     step, slope = torch.full((20, 160, 3), 90), torch.arange(80).expand(40, 80)[..., None].repeat(1, 1, 3)
     step[:, 100:, 1] = 120
@@ -51,7 +51,7 @@ def test_plainness_step_and_slope_are_told_apart():
         replace(cameras, sizes=torch.tensor([[160, 20], [80, 40]])),
     )
     every = torch.arange(len(views.pixels))
-    found = plainness(views, every, (every >= 20 * 160).long())
+    found = measure_texturelessness(views, every, (every >= 20 * 160).long())
     first, second = found[: 20 * 160].view(20, 160), found[20 * 160 :].view(40, 80)
     near = 2  # 1.25 % of 160 pixels
     assert (first[:, : 100 - near] == 1).all() and (first[:, 100 + near :] == 1).all()

@@ -76,7 +76,7 @@ def test_run_on_large_photos_has_finer_field(tmp_path: Path, monkeypatch: pytest
     given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "model.coarsest=8"]
     given += ["model.size=fixed", "model.width=8", "model.stages=3", "dataset.samples=500", "device=cpu", "~logger"]
     told: list[float] = []
-    monkeypatch.setattr(RayDataModule, "note_samples", lambda data, drawn: told.append(data.finer))
+    monkeypatch.setattr(RayDataModule, "note_samples", lambda data, drawn: told.append(data._resolution_scale))
     train(
         composed([*given, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "budget.steps=7"], tmp_path / "run")
     )

@@ -11,7 +11,8 @@ from nerf_lightning.config.build import build_data, build_system, frame_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.training.train import prepare, train
+from nerf_lightning.training.process import prepare_process
+from nerf_lightning.training.train import train
 from nerf_lightning.utils.device import CPU
 from nerf_lightning.utils.libraries import silence_lightning
 
@@ -39,7 +40,7 @@ def test_plain_trainer_same_steps_gives_same_weights(tmp_path: Path):
     train(cfg)
     expected = load_run(tmp_path).system.state_dict()
 
-    prepare(cfg)
+    prepare_process(cfg)
     data = build_data(cfg)
     system = build_system(cfg, frame_of(data), CPU)
     trainer = bare(STEPS)
@@ -56,7 +57,7 @@ def test_plain_places_are_found_for_view_loss_of_unbounded_scene(weight: float, 
     data = build_data(cfg)
     data.scene = replace(data.scene, bounds=replace(data.scene.bounds, unbounded=unbounded))
     bare(1).fit(build_system(cfg, frame_of(data), CPU), data)
-    assert (data.draw(0).plain is not None) == (weight > 0 and unbounded)
+    assert (data.draw(0).texturelessness is not None) == (weight > 0 and unbounded)
 
 
 PROPOSALS = ("refine=poses", "sampler=proposal", "~sampler.resolution", "sampler.final=0.01", "optimizer.lr=0.02")

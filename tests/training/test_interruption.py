@@ -99,7 +99,7 @@ def test_interrupted_run_is_saved_and_resumed_to_the_same_weights(
 
 
 def test_signal_before_training_leaves_nothing(inside, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("nerf_lightning.training.train.build_data", lambda cfg: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("nerf_lightning.training.resume.build_data", lambda cfg: signal.raise_signal(signal.SIGINT))
     code, _, err = inside(*SMALL)
     assert code == 130 and "the same command continues" in err and err.count("\n") == 1
     assert not list(Path().iterdir())
