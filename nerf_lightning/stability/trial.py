@@ -1,8 +1,10 @@
 """One trial of the suite: a condition, a method and a seed, trained as a user would."""
 
+from collections import deque
 from collections.abc import Generator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +67,12 @@ def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Generator[O
     # Should this process be killed, they end when they have been idle for a minute.
     pool = ProcessPoolExecutor(workers, timeout=60, env={"OMP_NUM_THREADS": "1"})
     try:
-        # Not pool.map: after an interruption it cancels what waits, over which loky's shutdown fails (joblib 1.6).
-        futures = [pool.submit(run_trial, trial, root) for trial in trials]
-        for future in futures:
-            yield future.result()
+        # A few at a time, and not pool.map: where trials wait in line or are cancelled, loky's shutdown fails (joblib 1.6).
+        rest = iter(trials)
+        running = deque(pool.submit(run_trial, trial, root) for trial in islice(rest, 2 * workers))
+        while running:
+            yield running.popleft().result()
+            running.extend(pool.submit(run_trial, trial, root) for trial in islice(rest, 1))
     except TerminatedWorkerError as error:
         found, expected = "a process that the system ended", f"memory for {workers} of them"
         raise InputError("stability", "workers", found, expected, "give fewer; the same command continues") from error
