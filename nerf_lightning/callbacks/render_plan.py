@@ -27,9 +27,10 @@ def allot(costs: Mapping[Job, float], weights: Mapping[Job, float], allowance: f
     rest = max(0.0, allowance - MIN_SHARE * sum(costs.values()))
     for job in sorted(costs, key=lambda job: costs[job] / weights[job]):
         weight = weights[job] / sum(weights[other] for other in costs if other not in shares)
-        shares[job] = min((1 - MIN_SHARE) * costs[job], weight * rest)
-        rest -= shares[job]
-    return {job: shares[job] + MIN_SHARE * costs[job] for job in costs}
+        least = MIN_SHARE * costs[job]
+        shares[job] = min(costs[job], least + weight * rest)  # exactly its cost, as less would leave rows out
+        rest -= shares[job] - least
+    return shares
 
 
 class RenderPlan:

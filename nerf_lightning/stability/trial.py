@@ -1,9 +1,10 @@
 """One trial of the suite: a condition, a method and a seed, trained as a user would."""
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Generator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass
-from itertools import repeat
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ def list_trials(conditions: Sequence[str], methods: Sequence[str], seeds: int, s
     ]
 
 
-def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Iterator[Outcome]:
+def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Generator[Outcome, None, None]:
     """Runs trials in processes of one thread each, which end with this one; yields their outcomes in order.
 
     Raises:
@@ -66,7 +67,12 @@ def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Iterator[Ou
     # Should this process be killed, they end when they have been idle for a minute.
     pool = ProcessPoolExecutor(workers, timeout=60, env={"OMP_NUM_THREADS": "1"})
     try:
-        yield from pool.map(run_trial, trials, repeat(root))
+        # A few at a time, and not pool.map: where trials wait in line or are cancelled, loky's shutdown fails (joblib 1.6).
+        rest = iter(trials)
+        running = deque(pool.submit(run_trial, trial, root) for trial in islice(rest, 2 * workers))
+        while running:
+            yield running.popleft().result()
+            running.extend(pool.submit(run_trial, trial, root) for trial in islice(rest, 1))
     except TerminatedWorkerError as error:
         found, expected = "a process that the system ended", f"memory for {workers} of them"
         raise InputError("stability", "workers", found, expected, "give fewer; the same command continues") from error

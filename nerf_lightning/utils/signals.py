@@ -31,10 +31,11 @@ def handle_signals() -> Iterator[None]:
         yield
         return
     install_handlers()
+    hook, sys.unraisablehook = sys.unraisablehook, _raise_again
     try:
         yield
     finally:
-        _received = None
+        _received, sys.unraisablehook = None, hook
         for signum, handler in handlers.items():
             signal.signal(signum, handler)
 
@@ -85,6 +86,16 @@ def received_signal() -> int | None:
 def raise_if_signalled() -> None:
     if _received is not None:
         raise Interrupted(_received)
+
+
+def _raise_again(lost: "sys.UnraisableHookArgs") -> None:
+    """Sends a signal once more whose `Interrupted` could not be raised, as in the callbacks of Numba's compiler."""
+    global _received
+    if isinstance(lost.exc_value, Interrupted):
+        _received = None
+        threading.Timer(0.02, os.kill, (os.getpid(), lost.exc_value.signum)).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _handle(signum: int, frame: FrameType | None) -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as imageio
+import psutil
 import pytest
 import torch
 
@@ -90,10 +91,14 @@ def test_run_trial_octaves_beyond_the_pixels_fail_between_them(tmp_path: Path):
     assert outcome.psnr is not None and outcome.psnr < 15
 
 
-def test_run_trials_runs_in_processes_in_order(tmp_path: Path):
+def test_run_trials_runs_in_processes_in_order_which_end_with_it(tmp_path: Path):
     trials = [Trial("OpenGL poses", method, 0, 20) for method in ("voxels", "hashgrid")]
-    outcomes = list(run_trials(trials, tmp_path, 1))
+    waiting = [Trial("clean", "hashgrid", seed, 100_000) for seed in range(6)]
+    found = run_trials([*trials, *waiting], tmp_path, 1)
+    outcomes = [next(found), next(found)]
     assert [(one.method, one.status) for one in outcomes] == [("voxels", "refused"), ("hashgrid", "refused")]
+    found.close()  # as an interruption does
+    assert not [one for one in psutil.Process().children() if "loky_posix" in " ".join(one.cmdline())]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 """The first signal ends a process in order, the second one at once."""
 
+import ctypes
 import os
 import signal
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -31,6 +33,13 @@ def test_signal_raises_where_the_process_is(signum: int):
         assert raised.value.signum == received_signal() == signum
         with pytest.raises(Interrupted):  # also where a clean-up has lost it
             raise_if_signalled()
+
+
+def test_signal_in_a_callback_is_raised_after_it(signum: int):
+    callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signum))  # no exception leaves it
+    with handle_signals(), pytest.raises(Interrupted):
+        callback()
+        time.sleep(10)
 
 
 def test_deferred_signal_is_raised_after_the_outer_block(signum: int, capfd: pytest.CaptureFixture[str]):
