@@ -45,7 +45,8 @@ def conditions_of(run: Run) -> Conditions:
     size, views, background = scene.get("resolution"), scene.get("views"), run.results.get("background")
     counts = [views.get(split) for split in ("train", "val")] if isinstance(views, dict) else []
     kind, chip = str(run.results.get("device")).partition(":")[0], machine.get("processor", "unknown processor")
-    threads = f"{run.results.get('threads')} threads on {machine.get('cores')} cores"
+    count = run.results.get("threads")
+    threads = f"{count} {'thread' if count == 1 else 'threads'} on {machine.get('cores')} cores"
     return Conditions(
         scene=str(scene.get("name") or "unknown scene"),
         resolution="x".join(map(str, size)) if isinstance(size, list) else "unknown resolution",
