@@ -1,6 +1,8 @@
 """The built-in scene: a ray-traced bulldozer of bricks, so that a run needs no download."""
 
+import logging
 import math
+from contextlib import suppress
 
 import numpy as np
 import torch
@@ -10,11 +12,18 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, look_at, orbit_around
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
+from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.objects import make_cameras
 from nerf_lightning.synthetic.solids import bulldozer
 from nerf_lightning.synthetic.tracer import render_view
+from nerf_lightning.utils.files import atomic, cache_folder
 from nerf_lightning.utils.memory import check_memory
+from nerf_lightning.utils.parsing import read_npz
 
+log = logging.getLogger(__name__)
+
+VERSION = 1
+"""Part of the cached images' name: raise it whenever model, shading or cameras change."""
 RADIUS = 4.0311
 """Distance of every camera from the origin, as in the NeRF paper's Lego scene."""
 FIELD_OF_VIEW_RAD = 0.6911112
@@ -43,17 +52,29 @@ def bricks(size: int = 200, train_views: int = 100, val_views: int = 10, orbit_v
     return Scene(
         name="bricks",
         source=BUILT_IN,
-        train=_render_views(_place_cameras(torch.arange(1, train_views + 1)), size),
-        val=_render_views(_place_cameras(-torch.arange(1, val_views + 1)), size),
+        train=_render_views(_place_cameras(torch.arange(1, train_views + 1)), size, "train"),
+        val=_render_views(_place_cameras(-torch.arange(1, val_views + 1)), size, "val"),
         orbit=make_cameras(orbit, size, size, FIELD_OF_VIEW_RAD),
         bounds=Bounds(centre + 1.02 * (aabb - centre)),
         background=(0.0, 0.0, 0.0),
     )
 
 
-def _render_views(c2w: Float[Tensor, "V 4 4"], size: int) -> Views:
+def _render_views(c2w: Float[Tensor, "V 4 4"], size: int, split: str) -> Views:
+    """Views of the bulldozer, from the cache where an earlier run has traced the same."""
     cameras = make_cameras(c2w, size, size, FIELD_OF_VIEW_RAD)
-    return Views.of(torch.from_numpy(np.stack([render_view(cameras, view) for view in range(len(cameras))])), cameras)
+    path = cache_folder() / f"bricks-v{VERSION}-{size}px-{len(cameras)}-{split}.npz"
+    with suppress(InputError, KeyError):  # missing, or damaged: traced again
+        images = read_npz(path, ["images"], lambda headers: None)["images"]
+        if images.shape == (len(cameras), size, size, 4) and images.dtype == np.uint8:
+            return Views.of(torch.from_numpy(images), cameras)
+    images = np.stack([render_view(cameras, view) for view in range(len(cameras))])
+    try:
+        with atomic(path) as temporary:
+            np.savez_compressed(temporary, images=images)
+    except (OSError, InputError) as error:
+        log.warning("the built-in scene is not cached, the next run traces it again: %s", error)
+    return Views.of(torch.from_numpy(images), cameras)
 
 
 def _place_cameras(index: Tensor) -> Float[Tensor, "V 4 4"]:

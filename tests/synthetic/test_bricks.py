@@ -68,6 +68,16 @@ def test_bricks_images_are_the_same_everywhere(scene):
     assert scene.sha256().startswith("7869af40dd6c")
 
 
+def test_bricks_traced_images_are_cached_and_damaged_ones_traced_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("NERF_LIGHTNING_CACHE", str(tmp_path))
+    traced = bricks(8, 2, 1, 1).sha256()
+    (file,) = tmp_path.glob("*train.npz")
+    file.write_bytes(file.read_bytes()[:100])
+    assert bricks(8, 2, 1, 1).sha256() == traced
+    monkeypatch.setattr("nerf_lightning.synthetic.bricks.render_view", lambda *_: pytest.fail("traced again"))
+    assert bricks(8, 2, 1, 1).sha256() == traced
+
+
 def test_bricks_cameras_match_the_paper(scene):
     for cameras in (scene.train.cameras, scene.val.cameras, scene.orbit):
         torch.testing.assert_close(cameras.centres.norm(dim=-1), torch.full((len(cameras),), 4.0311))
