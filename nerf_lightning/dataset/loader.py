@@ -73,11 +73,11 @@ class StepDataModule(L.LightningDataModule, Generic[Photos]):
 
     def draw_from(self, photos: Photos, step: int, part: slice) -> Any:
         """A part of the batch of a step."""
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} must define draw_from(photos, step, part)")
 
     def held_out(self, view: int, subset: PixelSubset = WHOLE) -> Any:
         """One held-out view."""
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} must define held_out(view, subset)")
 
     def test_on(self, subset: PixelSubset) -> None:
         """The next test loads only these pixels of each held-out view."""
