@@ -4,8 +4,9 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -31,7 +32,8 @@ def handle_signals() -> Iterator[None]:
         yield
         return
     install_handlers()
-    hook, sys.unraisablehook = sys.unraisablehook, _raise_again
+    hook = sys.unraisablehook
+    sys.unraisablehook = partial(_raise_again, hook)
     try:
         yield
     finally:
@@ -88,14 +90,14 @@ def raise_if_signalled() -> None:
         raise Interrupted(_received)
 
 
-def _raise_again(lost: "sys.UnraisableHookArgs") -> None:
+def _raise_again(hook: Callable[["sys.UnraisableHookArgs"], object], lost: "sys.UnraisableHookArgs") -> None:
     """Sends a signal once more whose `Interrupted` could not be raised, as in the callbacks of Numba's compiler."""
     global _received
     if isinstance(lost.exc_value, Interrupted):
         _received = None
         threading.Timer(0.02, os.kill, (os.getpid(), lost.exc_value.signum)).start()
     else:
-        sys.__unraisablehook__(lost)
+        hook(lost)
 
 
 def _handle(signum: int, frame: FrameType | None) -> None:
