@@ -36,6 +36,8 @@ class Picture:
     """sRGB."""
     at: Callable[[int, int], UInt8[Tensor, "h w 3"] | None] = unknown
     """Width, height -> the true picture at that size, or None if unknown."""
+    test: ClassVar[None] = None
+    """It has no test split."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -96,6 +98,7 @@ class PixelDataModule(StepDataModule[Tensor]):
         seed: of the draw.
     """
 
+    has_cameras = False
     held_out_views = 1
 
     def __init__(self, scene: Picture, pixels: Count | None = None, seed: int = 0):

@@ -15,6 +15,7 @@ from torch import Tensor
 from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.model import Field, PictureField
+from nerf_lightning.refine import Corrections
 from nerf_lightning.system.metrics import psnr, ssim
 from nerf_lightning.system.state import TrainingState
 from nerf_lightning.utils.device import synchronize
@@ -122,12 +123,28 @@ class System(L.LightningModule):
         self.chunk = chunk
         self.backend = backend
         self.state = state or TrainingState()
+        self.corrections: Corrections | None = None
+        """Of the training photos' cameras and light."""
         self.stats = StepStats(torch.tensor(math.nan), 0, 0)
 
     def warm_start_from(self, smaller: "System") -> None:
         """Continues from what a system with a smaller field of the same kind has learned."""
         field: Any = self.field
         field.warm_start_from(smaller.field)
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """What a compact file keeps, by name: modules with `export_state` and `import_state`."""
+        return {"field": self.field}
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether cameras or light of the training photos were corrected."""
+        return self.corrections is not None and bool(self.corrections.enabled_at)
+
+    def rehearse(self, data: Any) -> None:
+        """Computes a small step's gradients on the data of a run, so that kernels are compiled."""
+        raise TypeError(f"{type(self).__name__} must define rehearse(data)")
 
     def param_groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups of parameters, each with a name; without `lr`, one takes the optimiser's own."""
@@ -171,6 +188,10 @@ class System(L.LightningModule):
     @property
     def background(self) -> list[float] | None:
         """The background of evaluated views; None for a picture."""
+        return None
+
+    def between(self, view: Any) -> float | None:
+        """PSNR of a picture's field between its pixels; None where there is none to measure."""
         return None
 
     def diagnose(self, view: Any) -> str:

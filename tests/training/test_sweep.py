@@ -20,9 +20,9 @@ def table(root: Path) -> dict[str, dict[str, str]]:
 
 
 def test_sweep_again_does_nothing_and_keeps_table_and_figure(inside, tmp_path: Path):
-    command = ["-m", *SMALL, "callbacks.charts=null", "model.width=8,16", "seed=1"]
+    command = ["-m", *SMALL, "callbacks.pictures=null", "model.width=8,16", "seed=1"]
     code, out, err = inside(*command)
-    name = "sweep_budget.steps=3_callbacks.charts=null_dataset.max_side=16_model.width=8,16_seed=1"
+    name = "sweep_budget.steps=3_callbacks.pictures=null_dataset.max_side=16_model.width=8,16_seed=1"
     root = tmp_path / "outputs" / "smoke_2d" / name
     assert code == 0, err
     names = {f"model.width={width}" for width in (8, 16)}
@@ -158,9 +158,3 @@ def test_two_processes_of_a_run_leave_one_folder(inside, tmp_path: Path):
     one, two = results
     assert abs(one["psnr"] - two["psnr"]) < 1.0 and one["psnr"] > 15
     assert (two["steps"], two["status"]) == (200, "finished")
-
-
-def test_sweep_of_jobs_with_several_processes_is_refused(inside):
-    pair = ["trainer=ddp", "trainer.accelerator=cpu"]
-    code, out, err = inside("-m", *SMALL, "seed=0,1", *pair)
-    assert code == 1 and err.count("one process a job in a sweep") >= 2
