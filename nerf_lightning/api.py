@@ -173,7 +173,8 @@ def train(
         KeyboardInterrupt: after Ctrl-C; the last state is saved, and the command line's `resume=` goes on from it.
     """
     if isinstance(scene, str | Path):
-        scene = load_scene(scene, auto_resize(seconds, steps, the_device(device), torch.get_num_threads()))
+        size = auto_resize(seconds, steps, the_device(device), torch.get_num_threads())
+        scene = open_scene(os.path.abspath(user_path(scene)), options=PhotoLoadOptions(size))
     default = Path("outputs", scene.name, datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
     place = default if folder is None else user_path(folder)
     given = [

@@ -198,7 +198,7 @@ class RayDataModule(StepDataModule[Views]):
         return check_scene(self.scene, corrected)
 
     @property
-    def held_out_views(self) -> int:  # type: ignore[override]
+    def held_out_views(self) -> int:
         return len(self.scene.val)
 
     def pixels_held_out(self, view: int) -> int:

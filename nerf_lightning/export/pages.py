@@ -44,7 +44,7 @@ def build_page(
         return field_page(content, system, found.orbit, found.scene["name"], facts), "without photos"
     data = data_again(found.cfg, found.scene, photos)
     if found.orbit is None:
-        view = data.held_out(0).to(system.device)
+        view: Any = data.held_out(0).to(system.device)
         rgb = system.colours(view.uv).view(view.height, view.width, 3)
         quality = f"PSNR {held_out_psnr(system, data):.2f} dB"
         facts = describe_run(source, found, [("quality", quality), ("size", f"{view.width} x {view.height} pixels")])
