@@ -22,6 +22,7 @@ from nerf_lightning.callbacks.pictures import (
 )
 from nerf_lightning.dataset import PixelDataModule
 from nerf_lightning.dataset.picture import builtin_picture
+from nerf_lightning.drawing.panels import narrowed
 from nerf_lightning.model import PictureField
 from nerf_lightning.sources import from_picture
 from nerf_lightning.system import NeRF2D, constant
@@ -60,6 +61,13 @@ def test_picture_report_after_test_is_written(clock, system, trainer_with, tmp_p
     for name in names:
         picture = imageio.imread(tmp_path / name)
         assert min(picture.shape[:2]) > 300 and picture.std() > 1
+
+
+@pytest.mark.parametrize(
+    ("size", "most", "expected"), [((40, 60), 60, (40, 60)), ((40, 60), 30, (20, 30)), ((2, 60), 6, (1, 6))]
+)
+def test_narrowed_keeps_proportion(size: tuple[int, int], most: int, expected: tuple[int, int]):
+    assert narrowed(np.zeros((*size, 3), np.uint8), most).shape == (*expected, 3)
 
 
 def frames_of(path: Path) -> list[tuple[int, int, tuple[int, int]]]:

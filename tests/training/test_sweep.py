@@ -158,3 +158,9 @@ def test_two_processes_of_a_run_leave_one_folder(inside, tmp_path: Path):
     one, two = results
     assert abs(one["psnr"] - two["psnr"]) < 1.0 and one["psnr"] > 15
     assert (two["steps"], two["status"]) == (200, "finished")
+
+
+def test_sweep_of_jobs_with_several_processes_is_refused(inside):
+    pair = ["trainer=ddp", "trainer.accelerator=cpu"]
+    code, out, err = inside("-m", *SMALL, "seed=0,1", *pair)
+    assert code == 1 and err.count("one process a job in a sweep") >= 2
