@@ -117,6 +117,10 @@ class PixelDataModule(StepDataModule[Tensor]):
         uv = torch.stack([(index % width + 0.5) / width, (index // width + 0.5) / height], dim=-1)
         return PixelBatch(uv, photos.view(-1, 3)[index].float() / 255)
 
+    def small_batch(self) -> PixelBatch:
+        """A few places, to compile kernels with."""
+        return PixelBatch(*torch.rand(64, 5, generator=step_generator(0, Stream.BATCH, 0)).split([2, 3], dim=1))
+
     def some_pixels(self) -> PixelBatch:
         """As in `RayDataModule`; here, all pixels."""
         return self.held_out(0)

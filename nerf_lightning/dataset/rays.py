@@ -194,6 +194,10 @@ class RayDataModule(StepDataModule[Views]):
         """Training pixels to measure the error of one plain colour on."""
         return draw_rays(self.scene.train, SOME_PIXELS, step_generator(self.seed, Stream.PLAIN, 0))
 
+    def small_batch(self) -> RayBatch:
+        """A few rays, to compile kernels with."""
+        return draw_rays(self.scene.train, 64, step_generator(0, Stream.BATCH, 0), with_texture=True)
+
     def find_doubts(self, corrected: bool) -> list[Doubt]:
         return check_scene(self.scene, corrected)
 

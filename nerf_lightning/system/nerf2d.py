@@ -4,14 +4,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.dataset import PictureBatch, PixelBatch, PixelDataModule
+from nerf_lightning.dataset import PictureBatch, PixelBatch
 from nerf_lightning.model import PictureField
 from nerf_lightning.sampler import CHUNK
 from nerf_lightning.system.compiled import part
 from nerf_lightning.system.metrics import psnr
 from nerf_lightning.system.state import TrainingState
 from nerf_lightning.system.system import MakeOptimizer, Schedule, StepStats, System
-from nerf_lightning.utils.seeding import Stream, step_generator
 
 PIXELS = 2
 """Pixels rendered at once for each sample of `chunk`."""
@@ -58,9 +57,8 @@ class NeRF2D(System):
         self.stats = StepStats(loss.detach(), len(batch.uv), len(batch.uv), losses={"photometric": loss.detach()})
         return loss
 
-    def rehearse(self, data: PixelDataModule) -> None:
-        uv, rgb = torch.rand(64, 5, generator=step_generator(0, Stream.BATCH, 0)).to(self.device).split([2, 3], dim=1)
-        self.loss(PixelBatch(uv, rgb)).backward()
+    def compute_losses(self, batch: PixelBatch, generator: torch.Generator) -> tuple[dict[str, Tensor], StepStats]:
+        return {"photometric": self.loss(batch)}, self.stats
 
     def truth(self, batch: PixelBatch) -> Tensor:
         return batch.rgb

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch, draw_rays
+from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import RenderOutput, VolumeRenderer, over
@@ -67,16 +67,6 @@ class NeRF3D(System):
         scheduled = {"field": 1.0, **self.sampler.lr_factors(progress)}
         factors = {name: self.schedule(progress, step) * factor for name, factor in scheduled.items()}
         return factors if self.corrections is None else {**factors, **self.corrections.lr_factors(progress)}
-
-    @property
-    def parts(self) -> dict[str, Any]:
-        return {**super().parts, "sampler": self.sampler}
-
-    def rehearse(self, data: RayDataModule) -> None:
-        generator, texture = step_generator(0, Stream.BATCH, 0), self.renderer.uses_texture
-        batch = draw_rays(data.scene.train, 64, generator, with_texture=texture).to(self.device)
-        losses, _ = self.compute_losses(batch, step_generator(0, Stream.STEP, 0, self.device))
-        total_loss(losses).backward()
 
     def warm_start_from(self, smaller: "NeRF3D") -> None:
         super().warm_start_from(smaller)

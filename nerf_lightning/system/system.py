@@ -20,6 +20,7 @@ from nerf_lightning.system.metrics import psnr, ssim
 from nerf_lightning.system.state import TrainingState
 from nerf_lightning.utils.device import synchronize
 from nerf_lightning.utils.memory import give_back_freed_memory
+from nerf_lightning.utils.seeding import Stream, step_generator
 
 MakeOptimizer = Callable[[list[dict[str, Any]]], torch.optim.Optimizer]
 Schedule = Callable[[float, int], float]
@@ -135,16 +136,21 @@ class System(L.LightningModule):
     @property
     def parts(self) -> dict[str, Any]:
         """What a compact file keeps, by name: modules with `export_state` and `import_state`."""
-        return {"field": self.field}
+        return {name: module for name, module in self.named_children() if hasattr(module, "export_state")}
 
     @property
     def is_corrected(self) -> bool:
         """Whether cameras or light of the training photos were corrected."""
         return self.corrections is not None and bool(self.corrections.enabled_at)
 
-    def rehearse(self, data: Any) -> None:
-        """Computes a small step's gradients on the data of a run, so that kernels are compiled."""
-        raise TypeError(f"{type(self).__name__} must define rehearse(data)")
+    def compute_losses(self, batch: Any, generator: torch.Generator) -> tuple[dict[str, Tensor], StepStats]:
+        """The losses of a step by name, and what it did. All its randomness comes from `generator`."""
+        raise TypeError(f"{type(self).__name__} must define compute_losses(batch, generator)")
+
+    def rehearse(self, batch: Any) -> None:
+        """Computes the gradients of a step, so that kernels are compiled."""
+        losses, _ = self.compute_losses(batch.to(self.device), step_generator(0, Stream.STEP, 0, self.device))
+        total_loss(losses).backward()
 
     def param_groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups of parameters, each with a name; without `lr`, one takes the optimiser's own."""

@@ -55,4 +55,4 @@ def warm_up(system: System, data: DataModule, device: torch.device) -> None:
     note = " (the first time they are compiled: half a minute)" if is_compiled else ""
     console = Console()
     with console.status(f"getting the kernels ready{note}") if animates(console) else nullcontext():
-        copy.deepcopy(system).to(device).rehearse(data)
+        copy.deepcopy(system).to(device).rehearse(data.small_batch())
