@@ -44,6 +44,17 @@ class TensorBoard(TensorBoardLogger):
         for name, value in metrics.items():
             self.experiment.add_scalar(name, value, step, walltime=date)
 
+    @rank_zero_only
+    def log_summary(self, options: Mapping[str, Any], results: Mapping[str, Any]) -> None:
+        """Fills the HParams tab and closes the file. PSNR and seconds are curves, whose last values the tab shows."""
+        from torch.utils.tensorboard.summary import hparams
+
+        values = {key: options.get(key) or "" for key in ("method", "recipe")}
+        values |= {"seed": options["seed"], "bytes": results["artifact_bytes"]}
+        for summary in hparams(values, dict.fromkeys(("val/psnr", TRAIN_SECONDS), 0.0)):
+            self.experiment.file_writer.add_summary(summary)
+        self.experiment.close()
+
     def save(self) -> None:
         """Writes no hparams.yaml: a run's config.yaml has all."""
 
@@ -55,9 +66,9 @@ class TensorBoard(TensorBoardLogger):
 
 
 def log_summary(logger: Logger, options: Mapping[str, Any], results: Mapping[str, Any]) -> None:
-    """Writes a run's options and final figures, and closes the logger; TensorBoard has the curves alone."""
+    """Writes a run's options and final figures, and closes the logger."""
     if isinstance(logger, TensorBoard):
-        logger.experiment.close()
+        logger.log_summary(options, results)
         return
     logger.log_hyperparams({key: options[key] for key in OPTIONS if options.get(key) is not None})
     logger.log_metrics({f"final/{key}": results[key] for key in FIGURES if results[key] is not None}, results["steps"])

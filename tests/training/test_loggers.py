@@ -16,6 +16,7 @@ SMALL = ("+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3", "callb
 
 def test_tensorboard_run_is_one_file_with_curves(inside, tmp_path: Path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
     small = [word for word in SMALL if word != "callbacks=null"]
     quick = ("callbacks.throughput.every=1", "callbacks.pictures=null", "seed=3")
@@ -32,6 +33,10 @@ def test_tensorboard_run_is_one_file_with_curves(inside, tmp_path: Path):
     passed = results["train_seconds"] - events.Scalars("speed/train_seconds")[0].value
     assert dated == pytest.approx(passed, abs=0.01), "dates are seconds of training"
     assert not [name for name in events.Tags()["scalars"] if name.startswith(("final", "hp", "test"))]
+    content = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    values = HParamsPluginData.FromString(content).session_start_info.hparams
+    assert set(values) == {"method", "recipe", "seed", "bytes"}
+    assert values["method"].string_value == "picture_mlp" and values["bytes"].number_value == results["artifact_bytes"]
 
 
 def test_csv(inside, tmp_path: Path):
