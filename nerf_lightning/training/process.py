@@ -10,7 +10,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, draw_rays
+from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule
+from nerf_lightning.dataset.rays import make_batch
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.system import NeRF3D, System
@@ -61,7 +62,8 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
         trial, generator = copy.deepcopy(system).to(device), step_generator(0, Stream.BATCH, 0)
         if isinstance(trial, NeRF3D):
             assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
-            batch = draw_rays(data.scene.train, 64, generator, with_texture=trial.renderer.uses_texture).to(device)
+            photos, with_texture = data.scene.train, trial.renderer.uses_texture
+            batch = make_batch(photos, photos.draw(64, generator), with_texture).to(device)
             losses, _ = trial.compute_losses(batch, step_generator(0, Stream.STEP, 0, device))
             total_loss(losses).backward()
         else:

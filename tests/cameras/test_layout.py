@@ -16,7 +16,6 @@ EVERY = [
     ("one", ring(1), Layout.PAN),
     ("pure pan", pan(), Layout.PAN),
     ("half a pure pan", pan(degrees=180), Layout.PAN),
-    *((f"pan {seed}", pan(0.02, seed=seed), Layout.PAN) for seed in range(3)),
     ("walk", walk(), Layout.WALK),
     ("arm's length", toward(CENTRE + 0.6 * pan()[:, :3, 2], torch.linspace(0, 6, 24), torch.zeros(24)), Layout.WALK),
     ("corridor", corridor(), Layout.WALK),
