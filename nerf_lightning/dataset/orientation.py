@@ -31,18 +31,19 @@ def choose_orientations(
     chosen: list[bool] = []
     others = 0
     for photo, size in zip(photos, stated, strict=True):
-        stored, upright = (image_header(photo, turn)[:2] for turn in (False, True))
+        shapes = [image_header(photo, turn)[:2] for turn in (False, True)]
         header = read_header(photo)
         has_turn = header is not None and header.orientation != 1
-        fits_stored, fits_upright = (size is None or has_shape(shape, size) for shape in (stored, upright))
+        fits_stored, fits_upright = (size is None or has_shape(shape, size) for shape in shapes)
         chosen.append(has_turn and (orientation == "exif" or (orientation == "auto" and fits_upright > fits_stored)))
         others += has_turn and orientation == "auto" and fits_upright and fits_stored
-    if any(chosen) or others:
-        text = (
-            "%s: %d photos are turned as their EXIF orientation says, which fits their cameras; of %d others the pixels are"
-            " taken as they are stored, which fits as well (dataset.orientation=exif turns them)"
-        )
-        log.warning(text, where, sum(chosen), others)
+    turned = "%s: %d photos are turned as their EXIF orientation says, so that they fit their cameras"
+    stored = (
+        "%s: %d photos have an EXIF orientation, and are taken as they are stored (dataset.orientation=exif turns them)"
+    )
+    for count, text in ((sum(chosen), turned), (others, stored)):
+        if count:
+            log.warning(text, where, count)
     return chosen
 
 

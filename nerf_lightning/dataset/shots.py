@@ -30,8 +30,6 @@ Masked = Literal["auto", "unknown", "empty"]
 Orientation = Literal["auto", "stored", "exif"]
 MIN_KNOWN = 250
 """Share of a pixel, in 1/255, that must be known after averaging for the pixel to be known."""
-MAX_REDUCTION = 16
-"""Of a photo against its camera's size."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +125,7 @@ def read_shots(source: Path, shots: Sequence[Shot], options: PhotoLoadOptions) -
 def check_shape(source: Path, shot: Shot, width: int, height: int) -> None:
     """Refuses a photo that cannot be of its camera."""
     stated = shot.optics.width, shot.optics.height
-    if min(width, height) < 2 or MAX_REDUCTION * width < stated[0] or not has_shape((width, height), stated):
+    if not has_shape((width, height), stated):
         expected = f"{stated[0]}x{stated[1]}, the size of its camera, or the same reduced"
         raise InputError(shot.photo, "", f"{width}x{height} pixels", expected, f"are these the photos of {source}?")
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nerf_lightning.cameras import Layout, classify_layout, gaze_point
-from tests.helpers.camera_paths import CENTRE, RADIUS, corridor, dome, forward, pan, ring, toward, walk
+from nerf_lightning.cameras import Layout, classify_layout
+from tests.helpers.camera_paths import CENTRE, corridor, dome, forward, pan, ring, toward, walk
 
 EVERY = [
     *((f"ring {yaw}", ring(yaw=yaw), Layout.INWARD) for yaw in (0, 30)),
@@ -31,13 +31,6 @@ def test_classify_layout_any_frame_and_unit(c2w: torch.Tensor, layout: Layout):
     moved[:, :3, 3] = 70 * moved[:, :3, 3] + 30
     assert classify_layout(moved) == layout
     assert classify_layout(c2w.float()) == layout
-
-
-@pytest.mark.parametrize("yaw", [0, 20])
-def test_gaze_point_ring_is_its_middle(yaw: int):
-    assert (gaze_point(ring(yaw=yaw)) - CENTRE).norm() < 0.05 * RADIUS
-    dense_half = torch.cat([torch.arange(32), torch.arange(32, 64, 4)])
-    assert (gaze_point(ring(64, yaw)[dense_half]) - CENTRE).norm() < 0.1 * RADIUS
 
 
 def test_classify_layout_points_tell_pan_from_walk():

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from nerf_lightning.cameras import find_up, look_at, orbit_around, turn_upright
+from nerf_lightning.cameras import find_up, look_at, orbit_around
 
 UPS = [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8), (0.36, 0.48, -0.8)]
 
@@ -55,11 +55,3 @@ def test_find_up_any_side_of_photos(quarters: list[int], share: float, degrees: 
     roll = torch.eye(4).repeat(len(c2w), 1, 1)
     roll[:, 0, 0], roll[:, 0, 1], roll[:, 1, 0], roll[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
     assert math.degrees(math.acos(float(find_up(c2w @ roll) @ up))) < degrees
-
-
-def test_turn_upright_takes_up_to_z():
-    for up in (unit(*UPS[3]).float(), torch.tensor([0.0, 0.0, -1.0])):
-        turn = turn_upright(up)
-        torch.testing.assert_close(turn @ up, torch.tensor([0.0, 0.0, 1.0]), atol=1e-6, rtol=0)
-        torch.testing.assert_close(turn @ turn.T, torch.eye(3), atol=1e-6, rtol=0)
-        assert float(torch.linalg.det(turn)) == pytest.approx(1)

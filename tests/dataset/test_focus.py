@@ -72,17 +72,16 @@ def test_focus_draws_where_the_error_is():
 def test_focus_state_resumes_exactly():
     views = photos()
     errors = torch.rand(len(views.pixels), generator=seeded())
-    whole = taught(views, errors, steps=EVERY + 5)
-    other = Focus(views, 0.5)
+    whole, other = taught(views, errors, steps=EVERY + 5), Focus(views, 0.5)
     other.load_state_dict(whole.state_dict())
     for step in range(EVERY):
-        drawn = [focus.draw(300, seeded(step)) for focus in (whole, other)]
-        assert torch.equal(drawn[0][0], drawn[1][0]) and torch.equal(drawn[0][1], drawn[1][1])
-        whole.note(errors[drawn[0][0]])
-        order = torch.randperm(300)
+        places, weights = whole.draw(300, seeded(step))
+        assert all(map(torch.equal, other.draw(300, seeded(step)), (places, weights)))
+        whole.note(errors[places])
+        order = torch.randperm(300)  # sums do not depend on it
         other.drawn = other.drawn[order]
-        other.note(errors[drawn[1][0]][order])
-    assert all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), other.state_dict().values(), strict=True))
+        other.note(errors[places][order])
+    assert all(map(torch.equal, whole.state_dict().values(), other.state_dict().values()))
 
 
 def test_ray_data_follows_noted_errors():
