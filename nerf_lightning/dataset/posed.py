@@ -146,12 +146,7 @@ def assemble_scene(
         kind = replace(kind, bounded=not hints.bounds.unbounded, reason="the file states a box")
     if hints.background is not None:
         kind = replace(kind, background=hints.background)
-    points = None if hints.points is None else torch.from_numpy(hints.points)
-    region = find_region(viewing_poses(train.cameras), points, lambda: match_points(train, train.cameras.c2w.numpy()))
-    if not checks.NEAREST <= region.unit <= checks.FARTHEST:
-        expected = f"a distance of {checks.NEAREST:g} to {checks.FARTHEST:g}"
-        found = f"cameras {region.unit:.3g} from what they look at"
-        raise InputError(source, "poses", found, expected, "take another unit")
+    region = locate_region(source, train, hints)
     text = "%s: taken as %s, since %s (dataset.bounded overrides); %s cameras"
     log.info(text, name, "bounded" if kind.bounded else "unbounded", kind.reason, region.layout)
     if not region.known and not kind.bounded:
@@ -184,6 +179,17 @@ def assemble_scene(
         kind=f"{kind.reason}; {region.layout} cameras",
         points=None if region.points is None else transform(from_source, region.points).float(),
     )
+
+
+def locate_region(source: Path, views: Views, hints: Hints) -> Region:
+    """The region that training photos show, see `find_region`."""
+    points = None if hints.points is None else torch.from_numpy(hints.points)
+    region = find_region(viewing_poses(views.cameras), points, lambda: match_points(views, views.cameras.c2w.numpy()))
+    if not checks.NEAREST <= region.unit <= checks.FARTHEST:
+        expected = f"a distance of {checks.NEAREST:g} to {checks.FARTHEST:g}"
+        found = f"cameras {region.unit:.3g} from what they look at"
+        raise InputError(source, "poses", found, expected, "take another unit")
+    return region
 
 
 def is_precise(cameras: Cameras, region: Region) -> bool:
