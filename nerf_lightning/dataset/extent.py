@@ -50,9 +50,9 @@ def estimate_bounds(
     """
     aabb = visible_cube(views.cameras)
     views = views.spread(MAX_VIEWS)
-    masks = silhouettes(views, background)
+    masks = silhouettes(views, background) or []
     # The second pass sees finer voxels, so the box loses the slack of the first.
-    for _ in range(0 if masks is None else 2):
+    for _ in range(2 if masks else 0):
         hull = visual_hull(masks, view_voxels(aabb, GRID, views.cameras), least=0.5 * len(masks))
         if hull.any():
             kept, voxel = make_grid(aabb, GRID)[hull], (aabb[1] - aabb[0]) / GRID

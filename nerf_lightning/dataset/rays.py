@@ -190,7 +190,8 @@ class RayDataModule(StepDataModule[Views]):
 
     def small_batch(self) -> RayBatch:
         """A few rays, to compile kernels with."""
-        return draw_rays(self.scene.train, 64, step_generator(0, Stream.BATCH, 0), with_texture=True)
+        generator = step_generator(0, Stream.BATCH, 0)
+        return make_batch(self.scene.train, self.scene.train.draw(64, generator), with_texture=True)
 
     def find_doubts(self, corrected: bool) -> list[Doubt]:
         return check_scene(self.scene, corrected)
