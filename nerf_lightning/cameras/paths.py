@@ -56,7 +56,12 @@ def orbit_like(cameras: Cameras, layout: Layout, centre: Float[Tensor, "3"], fra
         distance = weights @ (centres - centre).norm(dim=1)
         poses = look_at(centre + distance[:, None] * direction, centre.double(), up)
     lens = cameras[typical_view(cameras)].as_pinholes()  # photos of all directions have no view to repeat
-    return Cameras.of_size(lens.K.repeat(frames, 1, 1), poses.to(cameras.c2w), *lens.size(0))
+    K, (width, height) = lens.K[0], lens.size(0)
+    right, down = (lens.c2w[0, :3, axis].double() @ up for axis in (0, 1))
+    if abs(right) > abs(down):  # the camera was held on its side, and the photo is stored so
+        K = torch.stack([K[1, [1, 0, 2]], K[0, [1, 0, 2]], K[2]])
+        width, height = height, width
+    return Cameras.of_size(K.repeat(frames, 1, 1), poses.to(cameras.c2w), width, height)
 
 
 def angular_loop(

@@ -75,6 +75,13 @@ def test_orbit_like_ring_is_a_full_turn(yaw: int):
     torch.testing.assert_close(pivot_of(orbit), CENTRE.float(), atol=0.05, rtol=0)
 
 
+def test_orbit_like_photos_on_their_side_get_an_upright_view_of_their_shape():
+    quarter = torch.eye(4, dtype=torch.float64)[[1, 0, 2, 3]] * torch.tensor([1.0, -1, 1, 1])
+    orbit = orbit_at(ring() @ quarter, 8)
+    assert (orbit.width, orbit.height) == (24, 32)
+    assert (orbit.c2w[:, :3, 1] @ UP.float()).max() < -0.5, "upright"
+
+
 def test_orbit_like_arc_and_half_pan_swing():
     arc, pans = orbit_at(ring(24, degrees=150), 60), orbit_at(pan(degrees=150), 60)
     offset = arc.centres - CENTRE.float()
