@@ -67,5 +67,5 @@ def confined_to(system: System, cells: Cells | None) -> System:
     part = copy.deepcopy(system).cpu()
     assert isinstance(part, NeRF3D)  # as it has cells
     part.field.prune(cells.cpu())
-    part.sampler.import_state({"occupied": cells.cpu().flatten()})
+    part.sampler.import_state({"grid.occupied": cells.cpu().flatten()})
     return part
