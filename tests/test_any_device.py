@@ -94,7 +94,7 @@ VARIANTS = {
 }
 
 
-@pytest.mark.parametrize(("variant", "unbounded"), zip(VARIANTS, itertools.cycle([False, True]), strict=False))
+@pytest.mark.parametrize(("variant", "unbounded"), list(zip(VARIANTS, itertools.cycle([False, True]), strict=False)))
 def test_steps_on_device_match_steps_on_cpu(
     variant: str, unbounded: bool, without_doubles: torch.device, tmp_path: Path
 ):
