@@ -66,5 +66,5 @@ def confined_to(system: System, cells: Cells | None) -> System:
         return system
     part: Any = copy.deepcopy(system).cpu()
     part.field.prune(cells.cpu())
-    part.sampler.import_state({"occupied": cells.cpu().flatten()})
+    part.sampler.import_state({"grid.occupied": cells.cpu().flatten()})
     return part

@@ -63,7 +63,7 @@ def made(recipe: str, precision: str = "byte", unbounded: bool = False) -> bytes
     with torch.no_grad():
         for parameter in system.field.parameters():
             parameter.add_(torch.randn_like(parameter) * (0.3 if recipe == "tensorf" else 0.5))
-    system.sampler.import_state({"occupied": torch.rand(16**3) < 0.3})
+    system.sampler.import_state({"grid.occupied": torch.rand(16**3) < 0.3})
     plain = plain_config(cfg)
     plain["dataset"]["path"] = "/home/somebody/photos"
     return without_folders(encode(system, precision, plain, scene))
