@@ -23,7 +23,7 @@ from nerf_lightning.runs.folder import RunFolder, config_from
 from nerf_lightning.runs.scene_file import frame_from
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.parsing import VALUE_ERRORS, Headers, existing_file, parse_json, read_content, read_npz
+from nerf_lightning.utils.parsing import VALUE_ERRORS, existing_file, parse_json, read_content, read_npz
 
 FORMAT, VERSION = "nerf_lightning compact", 1
 WORTH_BYTES = 2048
@@ -136,14 +136,12 @@ def _unpacked(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]
         InputError: as `decode`.
     """
     expected = "a compact file of this package"
-
-    def check(headers: Headers) -> None:
-        require_keys(path, headers, ["header"])
-        if (size := headers["header"].nbytes) > MAX_HEADER_BYTES:
-            raise InputError(path, "header", f"{size} bytes", f"{expected}: at most {MAX_HEADER_BYTES}")
-
-    arrays = read_npz(content, None, check, path, expected)
-    header = parse_json(arrays.pop("header").tobytes(), f"{path}: header", expected)
+    arrays = read_npz(content, None, path, expected)
+    require_keys(path, arrays, ["header"])
+    packed = arrays.pop("header").tobytes()
+    if len(packed) > MAX_HEADER_BYTES:
+        raise InputError(path, "header", f"{len(packed)} bytes", f"{expected}: at most {MAX_HEADER_BYTES}")
+    header = parse_json(packed, f"{path}: header", expected)
     format_, version = (header.get(key) for key in ("format", "version")) if isinstance(header, dict) else (None, None)
     if (format_, version) != (FORMAT, VERSION):
         found = f"{format_}, version {version}"
