@@ -61,7 +61,7 @@ def _render_views(c2w: Float[Tensor, "V 4 4"], size: int, split: str) -> Views:
     cameras = make_cameras(c2w, size, size, FIELD_OF_VIEW_RAD)
     path = cache_folder() / f"bricks-v{VERSION}-{size}px-{len(cameras)}-{split}.npz"
     with suppress(InputError, KeyError):  # missing, or damaged: traced again
-        images = read_npz(path, ["images"], lambda headers: None)["images"]
+        images = read_npz(path, ["images"])["images"]
         if images.shape == (len(cameras), size, size, 4) and images.dtype == np.uint8:
             return Views.of(torch.from_numpy(images), cameras)
     images = np.stack([render_view(cameras, view) for view in range(len(cameras))])

@@ -4,7 +4,6 @@ import logging
 import math
 import re
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic
-from nerf_lightning.utils.parsing import Headers, read_npz
+from nerf_lightning.utils.parsing import read_npz
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +48,8 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     Raises:
         InputError: anything missing, malformed or contradictory.
     """
-    data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS), partial(_check_headers, path))
+    data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS))
+    _check_shapes(path, data)
     count, height, width, channels = data["images_train"].shape
     size = fit_size(width, height, choose_resize(path, [(width, height)] * count, channels, options.resize))
     K = _intrinsics(path, data, width, height)
@@ -86,20 +86,19 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     return assemble_scene(path, name, [train, *held_out], options, hints)
 
 
-def _check_headers(path: Path, headers: Headers) -> None:
-    """Compares shapes, before anything is unpacked."""
-    checks.require_keys(path, headers, NEEDED)
-    one = headers["images_train"].shape[1:]
-    for key in (key for key in PAIRS if key in headers):
-        checks.require_keys(path, headers, [PAIRS[key]])
-        (count, *shape), dtype = headers[key].shape or (0,), headers[key].dtype
+def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    checks.require_keys(path, arrays, NEEDED)
+    one = arrays["images_train"].shape[1:]
+    for key in (key for key in PAIRS if key in arrays):
+        checks.require_keys(path, arrays, [PAIRS[key]])
+        (count, *shape), dtype = arrays[key].shape or (0,), arrays[key].dtype
         if len(shape) != 3 or shape[2] not in (3, 4) or 0 in shape or (dtype != np.uint8 and dtype.kind != "f"):
             expected = "images of shape (V, H, W, 3 or 4), uint8 or floats in [0, 1]"
-            raise InputError(path, key, f"shape {headers[key].shape}, {dtype}", expected)
+            raise InputError(path, key, f"shape {arrays[key].shape}, {dtype}", expected)
         if tuple(shape) != one:
-            raise InputError(path, key, f"shape {headers[key].shape}", f"images of shape {one}, as in images_train")
+            raise InputError(path, key, f"shape {arrays[key].shape}", f"images of shape {one}, as in images_train")
         checks.check_split_size(path, key, count)
-        if (poses := headers[PAIRS[key]].shape[:1]) != (count,):
+        if (poses := arrays[PAIRS[key]].shape[:1]) != (count,):
             raise InputError(path, key, f"{count} images for {math.prod(poses)} poses", "one pose for each image")
 
 
