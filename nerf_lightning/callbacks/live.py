@@ -63,7 +63,7 @@ class Live(L.Callback):
         from nerf_lightning.view.field_page import FieldPage
 
         self.page = FieldPage(scene.name, pl_module, scene.orbit, scene, self.host, self.port, MAX_SIDE, live=True)
-        print(f"live: {announce(scene.name, self.host, self.page.port)}", flush=True)
+        print(f"live: {announce(scene.name, self.host, self.port, self.page.port)}", flush=True)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         start = time.perf_counter()

@@ -59,7 +59,7 @@ def view(
     else:
         page = _open_run(find_run(path), device, side, host, port)
     try:
-        print(f"{announce(page.name, host, page.port)}; Ctrl-C ends it", flush=True)
+        print(f"{announce(page.name, host, port, page.port)}; Ctrl-C ends it", flush=True)
         page.run()
     except (Interrupted, KeyboardInterrupt):
         pass

@@ -1,4 +1,4 @@
-"""What a page about a scene draws, as plain arrays: frusta with photos, points, lines. Knows no viewer."""
+"""What a page about a scene draws, as plain arrays: frusta with photos, rays, samples, lines. Knows no viewer."""
 
 import math
 from collections.abc import Iterator
@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
-from torch import Tensor
+from jaxtyping import Float, Int, UInt8
+from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Cameras, pivot_of, upward
+from nerf_lightning.cameras import Bounds, Cameras, Rays, pivot_of, upward
 from nerf_lightning.dataset.resize import area_resize, fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
@@ -36,6 +36,17 @@ class Frustum:
 
 
 @dataclass(frozen=True)
+class RayFigure:
+    """N rays, and M samples on those that meet the bounds; world frame."""
+
+    approach: Float[np.ndarray, "N 2 3"]
+    """From each camera to where the ray enters the bounds; a short piece of rays that miss them."""
+    inside: Float[np.ndarray, "K 2 3"]
+    """From near to far, for the K rays that meet the bounds."""
+    samples: Float[np.ndarray, "M 3"]
+
+
+@dataclass(frozen=True)
 class Viewpoint:
     """Where a viewer's camera stands."""
 
@@ -54,6 +65,37 @@ def frusta(views: Views, photo_side: int) -> Iterator[Frustum]:
         fov, aspect = 2 * math.atan(height / (2 * K[1, 1])), float(width / K[0, 0] * K[1, 1] / height)
         photo = area_resize(views.image(i).numpy(), *fit_size(width, height, photo_side))
         yield Frustum(views.name(i), c2w, fov, aspect, photo)
+
+
+def random_rays(cameras: Cameras, view: Int[Tensor, "R"], generator: Generator) -> Rays:
+    """The ray of a random pixel of each of some views, which may repeat."""
+    place = torch.rand(len(view), 2, generator=generator) * cameras.sizes[view]
+    col, row = place.long().minimum(cameras.sizes[view] - 1).unbind(1)
+    return cameras.rays(view, row, col)
+
+
+def ray_figure(rays: Rays, bounds: Bounds, samples: int, stump: float) -> RayFigure:
+    """Rays and samples in the middle of equal intervals along them.
+
+    Args:
+        rays: in the bounds' frame.
+        bounds: where the content is.
+        samples: intervals on each ray that meets the bounds.
+        stump: how much of a ray that misses the bounds is drawn, world units.
+    """
+    near, far = bounds.near_far(rays)
+    hit = far > near
+
+    def along(t: Float[Tensor, "R S"]) -> Float[Tensor, "R S 3"]:
+        return rays.origins[:, None] + t[..., None] * rays.directions[:, None]
+
+    shares = (torch.arange(samples) + 0.5) / samples
+    entry = torch.where(hit, near, torch.full_like(near, stump))
+    return RayFigure(
+        along(torch.stack([torch.zeros_like(near), entry], dim=1)).numpy(),
+        along(torch.stack([near, far], dim=1))[hit].numpy(),
+        along(near[:, None] + shares * (far - near)[:, None])[hit].flatten(0, 1).numpy(),
+    )
 
 
 def colour_points(

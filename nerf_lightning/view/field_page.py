@@ -161,7 +161,7 @@ class FieldPage(Page):
         near, far = (end.cpu() for end in self.system.field.bounds.near_far(ray))
         far = torch.minimum(torch.maximum(far, near), near + 4 * self.scale)
         ends = torch.stack([ray.origins.cpu() + t[:, None] * ray.directions.cpu() for t in (near, far)], dim=1)
-        with self.server.atomic():
+        with self.redrawing, self.server.atomic():
             self.lines("/ray/inside", ends.numpy(), rgb(GREEN))
             self.points("/ray/samples", places.cpu().numpy(), rgb(VERMILLION), 0.006)
         colour = ", ".join(f"{float(c):.2f}" for c in rendered.rgb[0])

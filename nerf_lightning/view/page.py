@@ -22,7 +22,7 @@ PHOTO_SIDE = 160
 LINE = 1.5
 """Width of lines, screen pixels."""
 FRUSTUM_DEPTH = 0.12
-"""Depth of a frustum, as a share of the cameras' distance to what they look at."""
+"""Depth of a frustum at first, as a share of the cameras' distance to what they look at."""
 
 
 class Page:
@@ -40,6 +40,7 @@ class Page:
         self.name = name
         self.home = home
         self.scale = scale
+        self.redrawing = threading.Lock()  # callbacks come from many threads
         self.groups: dict[str, viser.FrameHandle] = {}
         self.names: list[viser.FrameHandle] = []
         self.pyramids: list[tuple[Frustum, viser.CameraFrustumHandle]] = []
@@ -115,6 +116,8 @@ class Page:
         self.switch("names", *self.names)
         self.photos = gui.add_checkbox("photos", True)
         self.photos.on_update(lambda _: self.show_photos())
+        self.depth = gui.add_slider("camera size", 0.01, 0.5, 0.01, FRUSTUM_DEPTH)
+        self.depth.on_update(lambda _: self.size_frusta())
 
     def switch(self, word: str, *handles: viser.SceneNodeHandle | None) -> None:
         """A checkbox that shows and hides scene nodes; none where there is nothing to show."""
@@ -137,6 +140,11 @@ class Page:
         with self.server.atomic():
             for frustum, handle in self.pyramids:
                 handle.image = frustum.photo if self.photos.value else None
+
+    def size_frusta(self) -> None:
+        with self.server.atomic():
+            for frustum, handle in self.pyramids:
+                handle.scale = viser_scale(frustum, self.depth.value * self.scale)
 
     def lines(self, name: str, segments: np.ndarray, colour: tuple[int, int, int]) -> None:
         """Line segments [N, 2, 3] under a name, in place of what it had."""

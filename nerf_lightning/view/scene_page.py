@@ -1,8 +1,18 @@
-"""A scene as a page in the browser, served by Viser: cameras with their photos, points, and what to show."""
+"""A scene as a page in the browser, served by Viser: cameras with their photos, rays and samples, and what to show."""
+
+import torch
 
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.drawing.ink import GREY, MAUVE, VERMILLION, rgb
-from nerf_lightning.view.drawing import box_edges, colour_points, home_of, overview, path_segments
+from nerf_lightning.drawing.ink import GREEN, GREY, MAUVE, SKY, VERMILLION, rgb
+from nerf_lightning.view.drawing import (
+    box_edges,
+    colour_points,
+    home_of,
+    overview,
+    path_segments,
+    random_rays,
+    ray_figure,
+)
 from nerf_lightning.view.page import Page
 
 
@@ -18,11 +28,14 @@ class ScenePage(Page):
         _, distance = home_of(scene.orbit)
         super().__init__(scene.name, overview(scene), distance, host, port)
         self.scene = scene
+        self.seed = 0
+        """Of the random pixels."""
         with self.server.atomic():
             self.set_stage()
             self.add_cameras(scene)
             self._add_surroundings()
             self._add_controls()
+            self.draw_rays()
 
     def _add_surroundings(self) -> None:
         scene = self.server.scene
@@ -32,6 +45,7 @@ class ScenePage(Page):
         self.lines("/box", box_edges(self.scene.bounds.aabb), rgb(GREY))
         self.points("/focus", self.home.look_at[None], rgb(VERMILLION), 0.02)
         scene.add_frame("/axes", axes_length=0.2 * self.scale, axes_radius=0.003 * self.scale)
+        self.ray_group = scene.add_frame("/rays", show_axes=False)
 
     def _add_controls(self) -> None:
         gui = self.server.gui
@@ -45,3 +59,25 @@ class ScenePage(Page):
             for word in ("points", "orbit", "box", "axes"):
                 self.switch(word, self.server.scene.get_handle_by_name(f"/{word}"))
             self.add_camera_switches()
+        with gui.add_folder("rays", expand_by_default=False):
+            self.rays = gui.add_slider("rays", 0, 64, 1, 0, hint="from each training camera")
+            self.samples = gui.add_slider("samples", 1, 256, 1, 64, hint="on each ray")
+            for control in (self.rays, self.samples):
+                control.on_update(lambda _: self.draw_rays())
+            button = gui.add_button("other rays", hint="through new random pixels")
+            button.on_click(lambda _: self.draw_rays(again=True))
+
+    def draw_rays(self, again: bool = False) -> None:
+        """Draws the rays that the controls ask for; the same pixels as before unless `again`."""
+        with self.redrawing, self.server.atomic():
+            self.seed += again
+            self.ray_group.visible = self.rays.value > 0
+            if not self.ray_group.visible:
+                return
+            cameras = self.scene.train.cameras
+            views = torch.arange(len(cameras)).repeat_interleave(self.rays.value)
+            rays = random_rays(cameras, views, torch.Generator().manual_seed(self.seed))
+            figure = ray_figure(rays, self.scene.bounds, self.samples.value, self.scale)
+            self.lines("/rays/approach", figure.approach, rgb(SKY))
+            self.lines("/rays/inside", figure.inside, rgb(GREEN))
+            self.points("/rays/samples", figure.samples, rgb(VERMILLION), 0.006)

@@ -28,9 +28,16 @@ def resolve_host(host: str) -> str:
         raise InputError("view", "host", found, "an address of this machine", todo) from error
 
 
-def announce(name: str, host: str, port: int) -> str:
-    """The line that says where a page is and who can see it."""
+def announce(name: str, host: str, wanted: int, port: int) -> str:
+    """The line that says where the page is and who can see it.
+
+    Args:
+        name: the page's.
+        host: where it is served.
+        wanted, port: the port that was asked for, 0 for any, and the one that it has.
+    """
     seen = "127.0.0.1" if host == "0.0.0.0" else host
+    taken = f" (port {wanted} is taken)" if port != wanted != 0 else ""
     shared = not resolve_host(host).startswith("127.")
     network = f"; shared with the network (--host {host}): all who reach this machine can see it" if shared else ""
-    return f"{name}: http://{seen}:{port}{network}"
+    return f"{name}: http://{seen}:{port}{taken}{network}"

@@ -31,7 +31,7 @@ def page(scene: Scene) -> Iterator[ScenePage]:
     page.stop()
 
 
-def test_scene_page_is_served_with_cameras_where_they_are(page: ScenePage, scene: Scene):
+def test_scene_page_is_served_with_cameras_where_they_are_and_no_rays(page: ScenePage, scene: Scene):
     connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
     connection.request("GET", "/")
     response = connection.getresponse()
@@ -48,10 +48,27 @@ def test_scene_page_is_served_with_cameras_where_they_are(page: ScenePage, scene
             np.testing.assert_allclose(third, c2w[:3, 2], atol=1e-5)  # z looks ahead, as OpenCV has it
     for name in ("/orbit", "/box", "/focus", "/axes"):
         assert nodes(name).visible
+    assert not nodes("/rays").visible and nodes("/rays/approach") is None
 
 
 def test_scene_page_controls_change_what_is_shown(page: ScenePage):
     nodes = page.server.scene.get_handle_by_name
+    page.rays.value, page.samples.value = 1, 7
+    page.draw_rays()
+    first = nodes("/rays/approach").points.copy()
+    assert first.shape == (4, 2, 3)
+    page.draw_rays()
+    assert np.array_equal(nodes("/rays/approach").points, first)
+    page.draw_rays(again=True)
+    assert not np.array_equal(nodes("/rays/approach").points, first)
+    assert len(nodes("/rays/samples").points) == 7 * len(nodes("/rays/inside").points)
+    page.rays.value = 0
+    page.draw_rays()
+    assert not nodes("/rays").visible
+    size = nodes("/training/0").scale
+    page.depth.value = 2 * page.depth.value
+    page.size_frusta()
+    assert nodes("/training/0").scale == pytest.approx(2 * size)
     page.photos.value = False
     page.show_photos()
     assert nodes("/training/0").image is None
@@ -79,8 +96,9 @@ def test_announce_says_who_can_see_the_page_and_refuses_another_machines_address
     for host in ("192.0.2.1", ""):
         with pytest.raises(InputError, match="127.0.0.1 for this machine alone"):
             resolve_host(host)
-    assert announce("lego", "127.0.0.1", 8080) == "lego: http://127.0.0.1:8080"
-    assert "http://127.0.0.1:9000; shared with the network" in announce("lego", "0.0.0.0", 9000)
+    assert announce("lego", "127.0.0.1", 8080, 8080) == "lego: http://127.0.0.1:8080"
+    assert announce("lego", "localhost", 8080, 8081).endswith("http://localhost:8081 (port 8080 is taken)")
+    assert "http://127.0.0.1:9000; shared with the network" in announce("lego", "0.0.0.0", 0, 9000)
 
 
 def test_has_run_tells_runs_from_scenes(scene: Scene, small_run: Path, tmp_path: Path):
