@@ -66,7 +66,8 @@ def versions(choice: str) -> Iterator[None]:
 def march(unbounded: bool, room: int | None, *tensors: Tensor) -> Outputs:
     origins, directions, aabb, near, far, shift, occupied = tensors
     rays, bounds = Rays(origins, directions), Bounds(aabb, unbounded)
-    return kernels.march(rays, bounds, near, far, shift, occupied, STEPS, 3.46 / STEPS, room)
+    given = rays, bounds, near, far, shift, occupied, STEPS, 3.46 / STEPS
+    return kernels.front_first(*given, lambda packed: torch.zeros_like(packed[0]), TRANSPARENT, room)[1]
 
 
 def keep_visible(room: int | None, thickness: Tensor, *packed: Tensor) -> Outputs:
@@ -95,11 +96,6 @@ def mlp(x: Tensor, *rest: Tensor) -> Tensor:
     """The layers' matrices and biases in turn, then the extra inputs."""
     *flat, extra = rest
     return kernels.mlp(x, list(zip(flat[::2], flat[1::2], strict=True)), extra)
-
-
-def plane_line_sum_and_products(*tensors: Tensor) -> Outputs:
-    planes, lines, others, other_lines, unit = tensors
-    return kernels.plane_line_sum_and_products((planes, lines), (others, other_lines), unit)
 
 
 def roughness(values: Tensor, vertex: Tensor, index: Tensor) -> Tensor:
@@ -163,7 +159,7 @@ def _cases() -> dict[str, Case]:
     flat = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
     features = torch.rand(15, len(unit)).T
     clear = clear_of_kinks(features, harmonics, layers)
-    factors, colours = VectorMatrix(128, 16), VectorMatrix(128, 16)
+    factors = VectorMatrix(128, 16)
     voxels = VoxelField(Bounds(aabb), coarsest=64, finest=64, stages=1)
     sparse(voxels)
     rows, weights = kernels.locate(voxels.index, unit)
@@ -189,11 +185,6 @@ def _cases() -> dict[str, Case]:
         "spherical_harmonics": Case(kernels.spherical_harmonics, (seen_from,)),
         "plane_line_products": Case(kernels.plane_line_products, (factors.planes, factors.lines, unit), learns=2),
         "plane_line_sum": Case(kernels.plane_line_sum, (factors.planes, factors.lines, unit), learns=2),
-        "plane_line_sum_and_products": Case(
-            plane_line_sum_and_products,
-            (factors.planes, factors.lines, colours.planes, colours.lines, unit),
-            learns=4,
-        ),
         "locate": Case(kernels.locate, (voxels.index, unit), kind="located"),
         "mark_rows": Case(mark_rows, (voxels.seen, rows)),
         "read_voxels": Case(kernels.read_voxels, (*voxels.tables, rows, weights, harmonics[:, 1:4]), learns=3),

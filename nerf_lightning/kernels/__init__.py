@@ -10,7 +10,7 @@ from nerf_lightning.kernels.hashgrid import hash_interpolate
 from nerf_lightning.kernels.march import cell_index, march, mark_cells, pack_intervals, points
 from nerf_lightning.kernels.merge import merge_faint
 from nerf_lightning.kernels.mlp import mlp, mlp_heads
-from nerf_lightning.kernels.planes import plane_line_products, plane_line_sum, plane_line_sum_and_products
+from nerf_lightning.kernels.planes import plane_line_products, plane_line_sum
 from nerf_lightning.kernels.proposals import along, inverse_cdf, resample
 from nerf_lightning.kernels.switch import has_fast, use_kernels
 from nerf_lightning.kernels.voxels import interpolate_rows, locate, mark_rows, read_voxels, roughness, voxel_value
@@ -35,7 +35,6 @@ __all__ = [
     "pack_intervals",
     "plane_line_products",
     "plane_line_sum",
-    "plane_line_sum_and_products",
     "points",
     "read_voxels",
     "resample",

@@ -3,64 +3,49 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import has_fast
 
-# Products of coordinates that the harmonics are made of: of two coordinates, then of three.
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
-TRIPLES = tuple((pair, axis) for pair in (0, 1, 2) for axis in (0, 1, 2)) + ((3, 2),)
-_XX, _YY, _ZZ, _XY, _YZ, _XZ = range(3, 9)
-
-
-def _cubic(pair: int, axis: int) -> int:
-    return 9 + TRIPLES.index((pair - 3, axis))
-
-
-# Each function as factors of those products; the first one is a constant.
-TERMS: tuple[dict[int, float], ...] = (
-    {},
-    {1: -0.48860251190291987},
-    {2: 0.48860251190291987},
-    {0: -0.48860251190291987},
-    {_XY: 1.0925484305920792},
-    {_YZ: -1.0925484305920792},
-    {_ZZ: 3 * 0.31539156525252005},
-    {_XZ: -1.0925484305920792},
-    {_XX: 0.5462742152960396, _YY: -0.5462742152960396},
-    {_cubic(_XX, 1): -3 * 0.5900435899266435, _cubic(_YY, 1): 0.5900435899266435},
-    {_cubic(_XY, 2): 2.890611442640554},
-    {_cubic(_ZZ, 1): -5 * 0.4570457994644657, 1: 0.4570457994644657},
-    {_cubic(_ZZ, 2): 5 * 0.3731763325901154, 2: -3 * 0.3731763325901154},
-    {_cubic(_ZZ, 0): -5 * 0.4570457994644657, 0: 0.4570457994644657},
-    {_cubic(_XX, 2): 1.445305721320277, _cubic(_YY, 2): -1.445305721320277},
-    {_cubic(_XX, 0): -0.5900435899266435, _cubic(_YY, 0): 3 * 0.5900435899266435},
+TERMS: tuple[dict[str, float], ...] = (
+    {"111": 0.28209479177387814},
+    {"11y": -0.48860251190291987},
+    {"11z": 0.48860251190291987},
+    {"11x": -0.48860251190291987},
+    {"1xy": 1.0925484305920792},
+    {"1yz": -1.0925484305920792},
+    {"1zz": 3 * 0.31539156525252005, "111": -0.31539156525252005},
+    {"1xz": -1.0925484305920792},
+    {"1xx": 0.5462742152960396, "1yy": -0.5462742152960396},
+    {"xxy": -3 * 0.5900435899266435, "yyy": 0.5900435899266435},
+    {"xyz": 2.890611442640554},
+    {"yzz": -5 * 0.4570457994644657, "11y": 0.4570457994644657},
+    {"zzz": 5 * 0.3731763325901154, "11z": -3 * 0.3731763325901154},
+    {"xzz": -5 * 0.4570457994644657, "11x": 0.4570457994644657},
+    {"xxz": 1.445305721320277, "yyz": -1.445305721320277},
+    {"xxx": -0.5900435899266435, "xyy": 3 * 0.5900435899266435},
 )
-CONSTANTS = {0: 0.28209479177387814, 6: -0.31539156525252005}
+"""Each function as factors of products of three out of 1, x, y and z."""
 
 
 @constant
-def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Factors of all powers, constants, and which coordinates and pairs are multiplied."""
-    factors = [[terms.get(power, 0.0) for terms in TERMS] for power in range(9 + len(TRIPLES))]
-    constants = [CONSTANTS.get(function, 0.0) for function in range(len(TERMS))]
-    firsts, seconds, pairs, axes = (list(column) for both in (PAIRS, TRIPLES) for column in zip(*both, strict=True))
-    columns = [torch.tensor(column, device=device) for column in (firsts + seconds + axes, pairs)]
-    return (
-        torch.tensor(factors, dtype=dtype, device=device),
-        torch.tensor(constants, dtype=dtype, device=device),
-        columns,
-    )
+def _factors(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "64 16"]:
+    """What each function takes of all those products."""
+    table = torch.zeros(4, 4, 4, len(TERMS), dtype=dtype)
+    for number, terms in enumerate(TERMS):
+        for product, factor in terms.items():
+            i, j, k = ("1xyz".index(letter) for letter in product)
+            table[i, j, k, number] = factor
+    return table.flatten(0, 2).to(device)
 
 
 def spherical_harmonics_reference(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:
     """`spherical_harmonics` in plain PyTorch, for every device and precision, as one matrix product."""
-    factors, constants, (places, pair) = _tables(d.dtype, d.device)
-    first, second, axis = d.index_select(1, places).split([len(PAIRS), len(PAIRS), len(TRIPLES)], dim=1)
-    pairs = first * second
-    triples = pairs.index_select(1, pair) * axis
-    return torch.addmm(constants, torch.cat([d, pairs, triples], dim=1), factors)
+    one = pad(d, (1, 0), value=1.0)
+    three = one[:, :, None, None] * one[:, None, :, None] * one[:, None, None, :]
+    return three.flatten(1) @ _factors(d.dtype, d.device)
 
 
 def spherical_harmonics(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:

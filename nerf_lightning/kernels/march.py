@@ -1,8 +1,5 @@
 """Where rays cross the occupied cells of a grid over the bounds."""
 
-import functools
-
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
@@ -11,11 +8,6 @@ from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.constants import constant
 from nerf_lightning.kernels.switch import has_fast
-
-MOST = 1 << 20
-"""Intervals that the reference tests at a time, unless told otherwise."""
-BLOCK = 4
-"""Cells along a side of a block; the fast version crosses an empty block in one leap."""
 
 Packed = tuple[Float[Tensor, "N"], Float[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "R_plus_1"]]
 """Midpoint and length of each interval, its ray, and where each ray's intervals begin."""
@@ -73,11 +65,31 @@ def pack_intervals(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]
     return _pack((start + end) / 2, end - start, keep)
 
 
-def march_reference(
-    rays: Rays, bounds: Bounds, near: Tensor, far: Tensor, shift: Tensor, occupied: Tensor,
-    samples: int, step: float, room: int | None = None, most: int = MOST,
-) -> Packed:  # fmt: skip
-    """`march` in plain PyTorch, for every device."""
+def march(
+    rays: Rays,
+    bounds: Bounds,
+    near: Float[Tensor, "R"],
+    far: Float[Tensor, "R"],
+    shift: Float[Tensor, "R"],
+    occupied: Bool[Tensor, "cells"],
+    samples: int,
+    step: float,
+    room: int | None = None,
+    most: int = 1 << 20,
+) -> Packed:
+    """Equal steps from near to far; keeps those whose midpoint lies in an occupied cell. In plain PyTorch, for every device.
+
+    Args:
+        rays, bounds: in world units.
+        near, far: distances along each ray; a ray with near >= far gets nothing.
+        shift: moves each ray's steps along it, as a share of a step, in [0, 1).
+        occupied: cells of a cubic grid over the bounds' unit cube, last axis fastest.
+        samples: steps of an unbounded ray, spaced as `Bounds.distances` says; at most this many (and one) inside bounds.
+        step: length of a step inside bounds.
+        room: how many entries to make whatever is found, so that the host need not wait for a count. If fewer are found, the
+            last interval is repeated with length 0; if more, rays whose `offsets` end beyond `room` lack some.
+        most: intervals tested at a time, which bounds the memory needed.
+    """
     resolution = round(len(occupied) ** (1 / 3))
     # One more than `samples`: the shift may cut the first one short, and the last must reach the far end.
     steps = torch.arange(-0.5, samples + 1, device=near.device) + shift[:, None]
@@ -94,79 +106,6 @@ def march_reference(
         cells = cell_index(bounds.to_unit(places), resolution, torch.int32)  # half the time of int64
         keep[part].logical_and_(occupied.index_select(0, cells.flatten()).view(cells.shape))
     return _pack(t, end - start, keep, room)
-
-
-def march(
-    rays: Rays,
-    bounds: Bounds,
-    near: Float[Tensor, "R"],
-    far: Float[Tensor, "R"],
-    shift: Float[Tensor, "R"],
-    occupied: Bool[Tensor, "cells"],
-    samples: int,
-    step: float,
-    room: int | None = None,
-    most: int = MOST,
-) -> Packed:
-    """Equal steps from near to far; keeps those whose midpoint lies in an occupied cell.
-
-    Args:
-        rays, bounds: in world units.
-        near, far: distances along each ray; a ray with near >= far gets nothing.
-        shift: moves each ray's steps along it, as a share of a step, in [0, 1).
-        occupied: cells of a cubic grid over the bounds' unit cube, last axis fastest.
-        samples: steps of an unbounded ray, spaced as `Bounds.distances` says; at most this many (and one) inside bounds.
-        step: length of a step inside bounds.
-        room: how many entries to make whatever is found, so that the host need not wait for a count. If fewer are found, the
-            last interval is repeated with length 0; if more, rays whose `offsets` end beyond `room` lack some.
-        most: intervals that the reference tests at a time, which bounds its memory.
-    """
-    if room is not None or not has_fast(constants=(rays.origins, rays.directions, near, far, shift)):
-        return march_reference(rays, bounds, near, far, shift, occupied, samples, step, room, most)
-    return Walk(rays, bounds, near, far, shift, occupied, samples, step).on(torch.arange(len(rays)), samples + 1)
-
-
-class Walk:
-    """The fast `march`, which may go some steps at a time. Arguments as there."""
-
-    def __init__(
-        self,
-        rays: Rays,
-        bounds: Bounds,
-        near: Float[Tensor, "R"],
-        far: Float[Tensor, "R"],
-        shift: Float[Tensor, "R"],
-        occupied: Bool[Tensor, "cells"],
-        samples: int,
-        step: float,
-    ):
-        resolution = round(len(occupied) ** (1 / 3))
-        cells, held = resolution, occupied
-        if resolution % BLOCK == 0:
-            cells = resolution // BLOCK
-            # A block's four cells in a row as one number.
-            rows = occupied.view(torch.int32).view(cells, BLOCK, cells, BLOCK, cells)
-            held = functools.reduce(torch.bitwise_or, [row for part in rows.unbind(1) for row in part.unbind(2)])
-        blocks = cpu.march.FAR * (held == 0).to(torch.uint8).flatten()
-        if not bounds.unbounded:
-            cpu.march.clear(blocks.view(cells, cells, cells))
-        inside = bounds.inside(rays) if bounds.unbounded else torch.empty(0, 2)
-        self.ends, self.shape = (near, far, inside, shift), (bounds.half_size, bounds.unbounded)
-        self.steps = samples, np.float32(step)
-        grid = occupied, resolution, blocks, cells
-        self.given = rays.origins, rays.directions, *self.ends, *grid, bounds.centre, *self.shape, *self.steps
-        self.after = torch.zeros(len(rays), dtype=torch.int32)
-        """The interval at which each ray goes on."""
-
-    def on(self, which: Int[Tensor, "A"], most: int) -> Packed:
-        """The next intervals of some rays, at most so many of each; `offsets` counts these rays alone."""
-        found, counts = torch.empty(len(which), most, dtype=torch.int32), torch.empty_like(which)
-        cpu.march.walk(which, *self.given, most, self.after, found, counts)
-        offsets = offsets_from_counts(counts)
-        total = int(offsets[-1])
-        t, dt, ray = torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
-        cpu.march.pack(which, *self.ends, *self.shape, *self.steps, found, offsets, t, dt, ray)
-        return t, dt, ray, offsets
 
 
 def points_reference(origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor) -> Float[Tensor, "N 3"]:

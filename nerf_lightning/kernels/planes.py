@@ -1,7 +1,5 @@
 """TensoRF: a volume as a sum of planes times lines (vector-matrix decomposition; Chen et al. 2022, eq. 3)."""
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -15,74 +13,24 @@ PLANE_AXES = ((1, 2), (0, 2), (0, 1))
 """Axes of each mode's plane; its line runs along the remaining axis: 0, 1, 2."""
 
 
-class Footprint(NamedTuple):
-    """What positions read: rows of all planes and lines, one mode after the other, and their weights."""
-
-    plane_rows: Int[Tensor, "twelveN"]
-    plane_shares: Float[Tensor, "4 N 3 1"]
-    line_rows: Int[Tensor, "sixN"]
-    line_shares: Float[Tensor, "2 N 3 1"]
-
-
-@constant
-def _axes_and_steps(side: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """The first axes of all planes, then the second ones; and the row offsets of modes, corners and ends."""
-    axes = torch.tensor(PLANE_AXES, device=device).T.flatten()
-    mode, end = torch.arange(3, device=device), torch.arange(2, device=device)
-    corner = (end[:, None] * side + end).flatten()
-    return axes, mode * side * side + corner[:, None, None], mode * side + end[:, None, None]
-
-
-def footprint(unit: Float[Tensor, "N 3"], side: int) -> Footprint:
-    """Where positions in [0, 1]^3 (clamped outside) read in planes and lines with `side` vertices along each axis."""
-    axes, plane_steps, line_steps = _axes_and_steps(side, unit.device)
-    scaled = unit.clamp(0, 1) * (side - 1)
-    low = scaled.long().clamp_(0, side - 2)
-    fraction = scaled - low
-    share = torch.stack([1 - fraction, fraction])
-    (across, down), (row, column) = (x.index_select(-1, axes).split(3, dim=-1) for x in (share, low))
-    return Footprint(
-        (torch.add(column, row, alpha=side) + plane_steps).flatten(),
-        (across[:, None] * down).view(4, len(unit), 3, 1),
-        (low + line_steps).flatten(),
-        share[..., None],
-    )
-
-
 @constant
 def _crossed(device: torch.device) -> Int[Tensor, "3 2"]:
     """`PLANE_AXES` as `grid_sample` wants them, the last one first."""
     return torch.tensor(PLANE_AXES, device=device).flip(1)
 
 
-def sampled_products(
+def products_reference(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N 3 C"]:
-    """`plane_line_products`, mode by mode, by PyTorch's own sampling of pictures: a fifth of the time of gathers on an NVIDIA
-    H200, where a gather gives each row of channels a block of threads. Apple's devices do not have its gradient."""
+    """`plane_line_products`, mode by mode, in plain PyTorch for every device: by its sampling of pictures, as a gather takes
+    five times as long on an NVIDIA H200."""
     places = unit.clamp(0, 1).mul(2).sub(1).T
     across = places[_crossed(unit.device)].mT[:, None]
     along = torch.stack([torch.zeros_like(places), places], dim=-1)[:, None]
-    corners = grid_sample(planes.permute(0, 3, 1, 2), across, padding_mode="border", align_corners=True)
-    ends = grid_sample(lines.mT[..., None], along, padding_mode="border", align_corners=True)
-    unknown = 0 * places.sum(0)  # it clamps what is not a number, which is to show
+    corners = grid_sample(planes.permute(0, 3, 1, 2), across, align_corners=True)
+    ends = grid_sample(lines.mT[..., None], along, align_corners=True)
+    unknown = 0 * places.sum(0)  # it passes over what is not a number, which is to show
     return (corners * ends + unknown)[:, :, 0].permute(2, 0, 1)
-
-
-def _products(planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], at: Footprint) -> Float[Tensor, "N 3 C"]:
-    """One gather for all planes and one for all lines: on a GPU the number of operations counts."""
-    channels = lines.shape[2]
-    corners = planes.flatten(0, 2).index_select(0, at.plane_rows).view(*at.plane_shares.shape[:3], channels)
-    ends = lines.flatten(0, 1).index_select(0, at.line_rows).view(*at.line_shares.shape[:3], channels)
-    return (corners * at.plane_shares).sum(0) * (ends * at.line_shares).sum(0)
-
-
-def _reference(*volumes: tuple[Tensor, Tensor], unit: Float[Tensor, "N 3"]) -> list[Tensor]:
-    """Products of each of some planes and lines of one size, mode by mode, N 3 C, in plain PyTorch for every device."""
-    if unit.device.type == "cuda":
-        return [sampled_products(*volume, unit) for volume in volumes]
-    at = footprint(unit, volumes[0][1].shape[1])
-    return [_products(*volume, at) for volume in volumes]
 
 
 def _block(channels: int) -> tuple[int, ...]:
@@ -130,7 +78,7 @@ def plane_line_products(
     """
     if has_fast(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, False)
-    return _reference((planes, lines), unit=unit)[0].flatten(1)
+    return products_reference(planes, lines, unit).flatten(1)
 
 
 def plane_line_sum(
@@ -139,16 +87,4 @@ def plane_line_sum(
     """The sum of what `plane_line_products` gives at each position."""
     if has_fast(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, True)[:, 0]
-    return _reference((planes, lines), unit=unit)[0].sum((1, 2))
-
-
-def plane_line_sum_and_products(
-    summed: tuple[Float[Tensor, "3 S S A"], Float[Tensor, "3 S A"]],
-    apart: tuple[Float[Tensor, "3 S S B"], Float[Tensor, "3 S B"]],
-    unit: Float[Tensor, "N 3"],
-) -> tuple[Float[Tensor, "N"], Float[Tensor, "N threeB"]]:
-    """`plane_line_sum` of some planes and lines, and `plane_line_products` of others of the same size."""
-    if has_fast(*summed, unit) and has_fast(*apart, unit):
-        return plane_line_sum(*summed, unit), plane_line_products(*apart, unit)
-    total, products = _reference(summed, apart, unit=unit)
-    return total.sum((1, 2)), products.flatten(1)
+    return products_reference(planes, lines, unit).sum((1, 2))

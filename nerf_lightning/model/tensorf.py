@@ -9,7 +9,7 @@ from torch.nn.functional import interpolate
 
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import mlp, plane_line_sum, plane_line_sum_and_products
+from nerf_lightning.kernels import mlp, plane_line_products, plane_line_sum
 from nerf_lightning.kernels.planes import PLANE_AXES
 from nerf_lightning.model.field import Field, Size
 from nerf_lightning.model.growth import ResolutionSchedule, replace_data
@@ -164,10 +164,8 @@ class TensoRFField(Field):
         return max(1.0, self.density_volume.cells / FINEST) if self.follows_photos else 1.0
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
-        density, colour = self.density_volume, self.colour_volume
-        factors = (density.planes, density.lines), (colour.planes, colour.lines)
-        total, products = plane_line_sum_and_products(*factors, self.bounds.to_unit(positions))
-        return self.activation(total), products
+        unit, colour = self.bounds.to_unit(positions), self.colour_volume
+        return self.activation(self.density_volume.total(unit)), plane_line_products(colour.planes, colour.lines, unit)
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """As `forward` gives it, without computing the colour."""

@@ -9,7 +9,8 @@ from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.kernels import front_first, keep_visible
-from nerf_lightning.kernels.march import BLOCK, Packed
+from nerf_lightning.kernels.front_first import BLOCK
+from nerf_lightning.kernels.march import Packed
 from nerf_lightning.sampler.occupancy_grid import OccupancyGrid
 from nerf_lightning.sampler.samples import CHUNK, DensityFn, Sampler, Samples
 from nerf_lightning.utils.options import Above, AtLeast, Below, Count, Side

@@ -86,16 +86,6 @@ def test_gradients_behind_opaque_sample_are_finite(kernels: str):
 FAINT = 0.1
 
 
-@pytest.mark.parametrize("where", [0, 4])
-def test_composite_nan_density_shows_in_its_ray(where: int, kernels: str):
-    samples = ragged_samples([3, 5, 2])
-    density = 0.1 + torch.rand(10)
-    density[3 + where] = math.nan
-    seen = composite(density, torch.rand(10, 3), samples.t, samples.dt, samples.ray, samples.offsets)
-    for values in seen:
-        assert values[1].isnan().all() and values[0].isfinite().all()
-
-
 def packed(samples: Samples):
     return samples.t, samples.dt, samples.ray, samples.offsets
 

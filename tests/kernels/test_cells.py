@@ -9,12 +9,18 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import front_first, keep_visible, march, mark_cells, points, use_kernels
+from nerf_lightning.kernels import front_first, keep_visible, mark_cells, points, use_kernels
 from nerf_lightning.kernels.march import Packed
 from nerf_lightning.sampler import Samples
 from tests.helpers.assert_close import run_with_threads
 
 CUBE = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+EPS, STEP = 0.01, 2 * math.sqrt(3) / 100
+
+
+def march(*given) -> Samples:
+    """All intervals, as nothing is in the light's way."""
+    return Samples(*front_first(*given, lambda packed: torch.zeros_like(packed[0]), EPS)[1])
 
 
 def cell_of(point: list[float], bounds: Bounds, n: int) -> int:
@@ -31,7 +37,7 @@ def test_march_matches_loop_over_rays_and_steps(training: bool, resolution: int,
     step = float((box.aabb[1] - box.aabb[0]).norm()) / 40
     near, far = box.near_far(rays)
     shift = torch.rand(len(rays)) if training else torch.zeros(len(rays))
-    actual = Samples(*march(rays, box, near, far, shift, occupied, 40, step))
+    actual = march(rays, box, near, far, shift, occupied, 40, step)
     total = 0
     for r in range(len(rays)):
         expected = []
@@ -68,9 +74,7 @@ def test_march_along_walls_matches_reference(away: float):
         for version in ("reference", "auto"):
             use_kernels(version)
             step = 2 * 3**0.5 / 4000
-            found.append(
-                Samples(*march(rays, CUBE, *CUBE.near_far(rays), torch.zeros(500), grid.flatten(), 4000, step))
-            )
+            found.append(march(rays, CUBE, *CUBE.near_far(rays), torch.zeros(500), grid.flatten(), 4000, step))
         assert torch.equal(found[0].t, found[1].t) and torch.equal(found[0].offsets, found[1].offsets)
         total += len(found[0])
     assert total > 1e5
@@ -90,11 +94,6 @@ def test_mark_cells_marks_cells_of_samples(unbounded: bool, box: Bounds, rays: R
     assert torch.equal(marks, expected) and {3, 7} == set(marks.tolist())
     mark_cells(marks, 9, bounds, positions[:0])
     assert torch.equal(marks, expected), "no samples, no marks"
-
-
-EPS = 0.01
-
-STEP = 2 * math.sqrt(3) / 100
 
 
 def shells(positions: Tensor) -> Tensor:

@@ -3,9 +3,7 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.kernels import plane_line_products, plane_line_sum, use_kernels
-from nerf_lightning.kernels.planes import sampled_products
 
-NAN = float("nan")
 SIZES = pytest.mark.parametrize(("side", "channels"), [(7, 8), (5, 3)])
 
 
@@ -39,16 +37,3 @@ def test_products_any_size_match_loop_over_vertices(side: int, channels: int):
         single = planes.float(), lines.float(), unit
         torch.testing.assert_close(plane_line_products(*single).double(), expected, atol=2e-5, rtol=1e-4)
         torch.testing.assert_close(plane_line_sum(*single).double(), expected.sum(1), atol=1e-4, rtol=1e-4)
-
-
-@SIZES
-def test_sampled_products_match_products(side: int, channels: int):
-    planes, lines = (x.requires_grad_() for x in factors(side, channels, torch.float64))
-    unit = (1.4 * torch.rand(50, 3, dtype=torch.float64) - 0.2).requires_grad_()
-    got, expected = sampled_products(planes, lines, unit).flatten(1), plane_line_products(planes, lines, unit)
-    torch.testing.assert_close(got, expected)
-    above = torch.randn_like(expected)
-    gradients = (torch.autograd.grad(out, (planes, lines, unit), above) for out in (got, expected))
-    torch.testing.assert_close(*gradients)
-    bad = torch.tensor([[0.5, NAN, 0.5], [0.5, 0.5, 0.5]], dtype=torch.float64)
-    assert sampled_products(planes, lines, bad).isnan().flatten(1).all(1).tolist() == [True, False]

@@ -110,20 +110,15 @@ def _pick(builder, first, second, places):
     return builder.shuffle_vector(first, second, mask)
 
 
-FEATURES = binding.get_host_cpu_features()
-FUSES = FEATURES.get("fma", True)
-"""Whether the processor has fused multiply-add; only some x86 ones lack it."""
-WIDEST = 16 if FEATURES.get("avx512f", False) else 8
+WIDEST = 16 if binding.get_host_cpu_features().get("avx512f", False) else 8
 """Numbers in the processor's widest registers; on those whose registers hold four, two together are one value."""
 
 
 @intrinsic
 def fused(typing, a, b, c):
-    """a * b + c of three numbers or three values of one width, rounded once where the processor can."""
+    """a * b + c of three numbers or three values of one width, rounded once."""
 
     def code(context, builder, signature, values):
-        if not FUSES:
-            return builder.fadd(builder.fmul(values[0], values[1]), values[2])
         kind = values[0].type
         name = f"llvm.fma.v{a.width}f32" if isinstance(a, Lanes) else "llvm.fma.f32"
         return builder.call(
