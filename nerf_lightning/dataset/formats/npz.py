@@ -16,10 +16,9 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.posed import Hints, assemble_scene, split_shots
-from nerf_lightning.dataset.resize import fit_size, resize_views
+from nerf_lightning.dataset.resize import area_resize, choose_resize, fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions
-from nerf_lightning.dataset.size import choose_resize
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic
@@ -52,17 +51,18 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     """
     data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS), partial(_check_headers, path))
     count, height, width, channels = data["images_train"].shape
-    longest = choose_resize(path, [(width, height)] * count, channels, options.resize)
+    size = fit_size(width, height, choose_resize(path, [(width, height)] * count, channels, options.resize))
     K = _intrinsics(path, data, width, height)
 
     def read_poses(key: str) -> Cameras:
         c2w = checks.check_poses(path, key + "[{}]", data[key])
         checks.check_split_size(path, key, len(c2w))
-        return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height)
+        return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height).resized(size)
 
     def read_views(key: str) -> Views:
-        views = Views.of(torch.from_numpy(_bytes(path, key, data[key])), read_poses(PAIRS[key]))
-        return resize_views(views, longest)
+        images = _bytes(path, key, data[key])
+        images = images if size == (width, height) else np.stack([area_resize(image, *size) for image in images])
+        return Views.of(torch.from_numpy(images), read_poses(PAIRS[key]))
 
     train, *held_out = (read_views(key) for key in PAIRS if key in data)
     if not held_out:
@@ -75,7 +75,7 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     has_path = "c2ws_test" in data and "images_test" not in data
     hints = Hints(
         keep_frame=True,
-        path=read_poses("c2ws_test").resized(fit_size(width, height, longest)) if has_path else None,
+        path=read_poses("c2ws_test") if has_path else None,
         background=_background(path, data["background"]) if "background" in data else None,
         bounds=_bounds(path, data, options),
         to_source=checks.check_similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,
