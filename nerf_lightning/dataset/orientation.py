@@ -4,8 +4,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from nerf_lightning.dataset.formats.decode import image_header
-from nerf_lightning.dataset.formats.header import read_header
+from nerf_lightning.dataset.formats.decode import image_header, read_header
 
 log = logging.getLogger(__name__)
 
@@ -31,8 +30,7 @@ def choose_orientations(
     turned, ambiguous = [], []
     for photo, size in zip(photos, stated, strict=True):
         stored, upright = (image_header(photo, turn)[:2] for turn in (False, True))
-        header = read_header(photo)
-        if header is None or header.orientation == 1 or orientation == "stored":
+        if read_header(photo).orientation == 1 or orientation == "stored":
             continue
         fits_stored, fits_upright = (size is None or has_shape(shape, size) for shape in (stored, upright))
         if orientation == "exif" or (fits_upright and not fits_stored):

@@ -1,12 +1,11 @@
 """A folder of photos: which files, in which order, and where their cameras stood."""
 
 import logging
-import re
 import tempfile
 from pathlib import Path
 
 from nerf_lightning.dataset.formats.colmap import PLACED_FOLDER
-from nerf_lightning.dataset.formats.names import list_images
+from nerf_lightning.dataset.formats.names import list_images, natural_key
 from nerf_lightning.dataset.sfm.cached import cached_folder
 from nerf_lightning.dataset.sfm.colmap import MIN_PHOTOS, reconstruct
 from nerf_lightning.errors import InputError
@@ -21,12 +20,6 @@ MAX_NAMES = 5
 """That a line lists."""
 
 
-def natural(path: Path) -> list[tuple[int, int, str]]:
-    """A key that sorts photo 9 before photo 10."""
-    parts = re.findall(r"(\d+)|(\D+)", path.name.lower())
-    return [(0, int(number), "") if number else (1, 0, text) for number, text in parts]
-
-
 def find_photos(folder: Path, key: str) -> list[Path]:
     """The photos in a folder in natural order, without those in folders below it.
 
@@ -39,7 +32,7 @@ def find_photos(folder: Path, key: str) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError("config", key, f"{folder}, which is no folder", "a folder of photos")
-    photos = sorted(list_images(folder), key=natural)
+    photos = sorted(list_images(folder), key=lambda photo: natural_key(photo.name))
     if not photos:
         others = sorted({file.suffix.lower() for file in folder.iterdir() if file.suffix})
         found = f"only {', '.join(others)} files" if others else "no photo"
