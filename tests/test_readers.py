@@ -45,7 +45,6 @@ READERS: dict[str, tuple[str, str, Reader]] = {
     # name: file to damage, what to read, reader
     "json": ("figures.json", "figures.json", lambda path: read_json(path, "figures")),
     "yaml": ("options.yaml", "options.yaml", lambda path: read_yaml(path, "options")),
-    "npy": ("llff/poses_bounds.npy", "llff/poses_bounds.npy", lambda path: read_npy(path, lambda header: None)),
     "checkpoint": ("run/checkpoints/last.ckpt", "run/checkpoints/last.ckpt", lambda p: read_checkpoint(p, RESUME_KEYS)),
     "run config": ("run/config.yaml", "run", load_config),
     "run scene": ("run/scene.json", "run", load_run),

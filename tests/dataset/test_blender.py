@@ -58,8 +58,6 @@ def test_load_blender_pixel_intrinsics_precede_the_angle(folder: Path):
     cameras = load_blender(folder).train.cameras
     torch.testing.assert_close(cameras.K[0], torch.tensor([[11.0, 0, 3.5], [0, 12, 2.5], [0, 0, 1]]))
     assert cameras.lenses.coefficients[0, 0] == pytest.approx(-0.01)
-    edit_all(folder, camera_angle_x=None)
-    torch.testing.assert_close(load_blender(folder).train.cameras.K, cameras.K)
 
 
 def test_load_blender_split_without_photos_is_the_orbit(folder: Path):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.cameras import Bounds, Cameras
-from nerf_lightning.dataset import RayDataModule, Scene, Views, draw_rays, open_scene
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.dataset import Views, draw_rays, open_scene
 from nerf_lightning.dataset.shots import PhotoLoadOptions
 from nerf_lightning.errors import InputError
 from tests.helpers.colmap_files import cameras_of, photos, write_colmap
@@ -52,17 +52,6 @@ def test_draw_rays_several_sizes_match_their_colours():
     torch.testing.assert_close(batch.rays.directions, directions[number])
     counts = torch.bincount(number, minlength=29)
     assert len(counts) == 29 and float(((counts - 2000 / 29) ** 2 * 29 / 2000).sum()) < 28 + 5 * 56**0.5, "chi squared"
-
-
-def test_ray_data_held_out_masked_view_knows_its_pixels():
-    views = mixed()
-    known = torch.ones(29, dtype=torch.bool)
-    known[3:9], known[11:13], known[22:] = False, False, False
-    views = Views(views.pixels, views.cameras, known)
-    assert torch.equal(views[torch.tensor([1])].mask_of(0), views.mask_of(1))
-    scene = Scene("mixed", "test", views, views, views.cameras, Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])))
-    batch = RayDataModule(scene).held_out(1)
-    assert (batch.width, batch.height) == (2, 5) and torch.equal(batch.known, known[12:22])
 
 
 def capture(folder: Path, views: Views, edit: Callable[[int, np.ndarray], np.ndarray] = lambda i, x: x) -> Path:
@@ -118,10 +107,9 @@ def write_subfolders(folder: Path, views: Views, masked: tuple[str, ...]) -> Pat
 
 def test_open_scene_masks_in_subfolders_match_their_photos(views: Views, tmp_path: Path):
     scene = open_scene(str(write_subfolders(tmp_path / "both", views, ("front", "back"))))
-    for part in (scene.train, scene.val):
-        for view, name in enumerate(part.names):
-            hidden = 9 if name.startswith("back") else 5
-            assert (~part.mask_of(view)).nonzero()[:, 1].unique().tolist() == [hidden], name
+    for view, name in enumerate(scene.train.names):
+        hidden = 9 if name.startswith("back") else 5
+        assert (~scene.train.mask_of(view)).nonzero()[:, 1].unique().tolist() == [hidden], name
     half = open_scene(str(write_subfolders(tmp_path / "half", views, ("front",))))
     hidden = {name.split("/")[0]: int((~half.train.mask_of(view)).sum()) for view, name in enumerate(half.train.names)}
     assert hidden == {"back": 0, "front": 40}, "the other camera's masks are not taken"

