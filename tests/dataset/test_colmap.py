@@ -48,21 +48,17 @@ def test_open_scene_colmap_llff_transforms_agree(views: Views, tmp_path: Path):
     same(binary, open_scene(str(tmp_path / "llff")))
 
 
-def test_open_scene_model_folder_means_its_scene(views: Views, tmp_path: Path):
-    folder = colmap(tmp_path / "scene", views, "colmap/sparse/0")
-    scene = open_scene(str(folder))
-    assert scene.name == "scene" and len(scene.train) == 15
-    same(scene, open_scene(str(folder / "colmap/sparse/0")))
-    same(scene, open_scene(str(folder / "colmap/sparse")))
-
-
-def test_open_scene_several_models_takes_the_largest(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    folder = colmap(tmp_path, views, "sparse/1")
+def test_open_scene_model_folder_means_its_scene(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """Of several models the largest is taken."""
+    folder = colmap(tmp_path / "scene", views, "colmap/sparse/1")
     few = views[torch.arange(4)]
-    write_colmap(folder / "sparse/0", few.cameras.c2w.numpy(), photos(folder / "images", few), cameras_of(few))
+    write_colmap(folder / "colmap/sparse/0", few.cameras.c2w.numpy(), photos(folder / "images", few), cameras_of(few))
     with caplog.at_level(logging.WARNING):
-        assert len(open_scene(str(folder)).train) == 15
+        scene = open_scene(str(folder))
     assert "sparse/1: the largest model; others: 0" in caplog.text
+    assert scene.name == "scene" and len(scene.train) == 15
+    for below in ("colmap/sparse/1", "colmap/sparse"):
+        same(scene, open_scene(str(folder / below)))
 
 
 VALUES = {"f": 50, "fx": 50, "fy": 51, "cx": 24, "cy": 20, "k1": 0.1, "k2": 0.02, "p1": 0.01, "p2": 0.02, "k3": 0.03}

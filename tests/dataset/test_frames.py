@@ -69,13 +69,12 @@ def test_select_frames_of_fast_stretch_takes_sharp_ones():
     assert select_frames(np.zeros(9), np.eye(9)[4], 3)[1] == 4
 
 
-@pytest.mark.parametrize("turns", [1, 2])
-def test_write_frames_of_rotated_video_are_upright(turns: int, tmp_path: Path):
+def test_write_frames_of_rotated_video_are_upright(tmp_path: Path):
     picture = np.zeros((64, 96, 3), np.uint8)
     picture[:32, 48:], picture[32:, :48] = (255, 0, 0), (0, 0, 255)
-    write_video(tmp_path / "a.mp4", [picture] * 3, turns)
+    write_video(tmp_path / "a.mp4", [picture] * 3, 1)
     upright = imageio.imread(next(extract_frames(tmp_path / "a.mp4").glob("*.jpg")))
-    assert np.abs(upright.astype(int) - np.rot90(picture, turns)).mean() < 5
+    assert np.abs(upright.astype(int) - np.rot90(picture, 1)).mean() < 5
 
 
 def test_extract_frames_twice_decodes_once(tmp_path: Path, caplog: pytest.LogCaptureFixture):

@@ -121,10 +121,8 @@ def test_load_transforms_missing_photos_are_left_out_with_a_warning(capture: Pat
         (capture / f"images/{i:04d}.png").unlink()
     with caplog.at_level(logging.WARNING):
         scene = load_transforms(capture)
-    assert (len(scene.train), len(scene.val)) == (7, 2)
-    # Poses stay with their photos: the dots still agree.
-    assert dot_error(scene) < 0.02
-    assert "3 of 12 photos are not there" in caplog.text
+    assert (len(scene.train), len(scene.val)) == (7, 2) and "3 of 12 photos are not there" in caplog.text
+    assert dot_error(scene) < 0.02, "poses stay with their photos"
 
 
 def test_load_transforms_applied_transform_and_scale_are_undone(capture: Path, caplog: pytest.LogCaptureFixture):

@@ -169,17 +169,14 @@ def compare(hypothesis: Hypothesis, share: float, given: float, least: float) ->
 
 def wrong_poses(matches: Matches, c2w: Poses, count: int) -> Doubt | None:
     """Poses that explain little more than those of other photos would."""
-    given, chance = (np.zeros(2), np.zeros(2))
-    for i, slack in enumerate((1.0, UNRELATED_TOLERANCE)):
-        given[i] = share_explained(matches, c2w, tolerance=slack)
-        chance[i] = shuffled_shares(matches, c2w, count, slack).mean()
+    slacks = (1.0, UNRELATED_TOLERANCE)
+    given = np.array([share_explained(matches, c2w, tolerance=slack) for slack in slacks])
+    chance = np.array([shuffled_shares(matches, c2w, count, slack).mean() for slack in slacks])
     skill, loose_skill = (given - chance) / (1 - chance)
     if skill >= INEXACT:
         return None
-    found = (
-        f"poses that explain {given[0]:.0%} of the matches between photos, while shuffled ones explain {chance[0]:.0%}:"
-        " they belong to other photos, or are inexact"
-    )
+    explained = f"poses that explain {given[0]:.0%} of the matches between photos, while shuffled ones explain"
+    found = f"{explained} {chance[0]:.0%}: they belong to other photos, or are inexact"
     unrelated = bool(loose_skill < UNRELATED)
     return Doubt(found, "check which pose belongs to which photo", unrelated, True, unrelated)
 
