@@ -109,9 +109,9 @@ class VolumeRenderer(torch.nn.Module):
             distance = opacity * median_depth(density, opacity, samples)
         colour = torch.addcmul(summed, (1 - opacity)[:, None], backgrounds)
         has_losses = self.distortion_loss_weight or self.near_loss_weight or self.view_loss_weight
-        weights = None
-        if self.training and learns and (has_losses or samples.proposals is not None):
-            weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
+        if not (self.training and learns and (has_losses or samples.proposals is not None)):
+            return RenderOutput(colour, opacity, distance)  # nothing of each sample: a view has many
+        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
         return RenderOutput(colour, opacity, distance, weights, view_residual)
 
     def losses(
