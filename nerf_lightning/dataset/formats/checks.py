@@ -55,7 +55,8 @@ def parse_array(where: object, key: str, value: Any, *shape: int) -> Float[np.nd
     """Finite numbers of a shape, as float64."""
     array = parse_floats(where, key, value)
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(where, key, f"{array.tolist()} of shape {array.shape}", f"finite numbers of shape {shape}")
+        found = f"shape {array.shape}" if array.shape != shape else "nan or infinity"
+        raise InputError(where, key, found, f"finite numbers of shape {shape}")
     return array
 
 

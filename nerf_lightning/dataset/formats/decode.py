@@ -166,8 +166,9 @@ def read_pixels(path: Path, upright: bool = False, size: tuple[int, int] | None 
     with open_image(path) as image:
         image.verify()  # checksums of a PNG, which decoding does not look at
     with open_image(path) as image:
-        is_reduced = wanted is not None and isinstance(image, JpegImageFile)
-        factor = draft_scale(header.width, header.height, wanted) if is_reduced else 1
+        factor = 1
+        if wanted is not None and isinstance(image, JpegImageFile):
+            factor = draft_scale(header.width, header.height, wanted)
         check_memory(path, "", f"{header.width}x{header.height} pixels", 4 * header.width * header.height // factor**2)
         image.draft(image.mode, (header.width // factor, header.height // factor))
         if image.mode in ("I", "F"):

@@ -153,6 +153,6 @@ def save_npz(scene: Scene, path: Path) -> None:
         "far": scene.bounds.far,
         "background": scene.background if any(scene.background) else None,
     }
-    content = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
+    content: dict[str, Any] = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
     with atomic(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **content)

@@ -5,7 +5,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -60,7 +60,10 @@ def reconstruct(photos: Sequence[Path], workspace: Path) -> "pycolmap.Reconstruc
     options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_PHOTOS, random_seed=0)
     (workspace / "models").mkdir()
     with counted(len(photos), "placing photos") as step:
-        callbacks = {"initial_image_pair_callback": lambda: step(2), "next_image_callback": lambda: step(1)}
+        callbacks: dict[str, Any] = {
+            "initial_image_pair_callback": lambda: step(2),
+            "next_image_callback": lambda: step(1),
+        }
         models = pycolmap.incremental_mapping(database, copies, workspace / "models", options, **callbacks)
     model = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     if model is not None:
