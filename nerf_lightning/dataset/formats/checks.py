@@ -38,7 +38,7 @@ def require_keys(where: object, have: Iterable[str], needed: Sequence[str]) -> N
 def parse_number(where: object, key: str, value: Any) -> float:
     """A finite real number; text that holds one (some exporters write it so) and arrays of one element count."""
     array = parse_floats(where, key, value)
-    if array.size != 1 or not np.isfinite(array).all():
+    if isinstance(value, bool) or array.size != 1 or not np.isfinite(array).all():
         raise InputError(where, key, f"{value!r} of shape {array.shape}", "one finite number")
     return float(array.item())
 
