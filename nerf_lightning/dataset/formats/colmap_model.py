@@ -144,6 +144,10 @@ class Bytes:
         """As many as the next number says."""
         return range(self.take("Q")[0])
 
+    def skip_records(self, size: int) -> None:
+        count = len(self.records())
+        self.at += count * size
+
     def text(self) -> str:
         """A name that ends with a zero byte."""
         start, end = self.at, self.content.index(b"\0", self.at)
@@ -166,14 +170,14 @@ def _images_bin(path: Path) -> Iterator[Row]:
     for _ in file.records():
         _, *pose, camera = file.take("i7di")
         yield file.text(), camera, pose
-        file.at += 24 * len(file.records())  # x, y and the point of each feature
+        file.skip_records(24)  # x, y and the point of each feature
 
 
 def _points_bin(path: Path) -> Iterator[Row]:
     file = Bytes(path)
     for _ in file.records():
         yield file.take("Q3d3Bd")[1:4]
-        file.at += 8 * len(file.records())  # the images that see it
+        file.skip_records(8)  # the images that see it
 
 
 def _lines(path: Path) -> Iterator[str]:

@@ -60,6 +60,12 @@ def fold_name(name: str) -> tuple[str, ...]:
     return parts
 
 
+def exact_file(root: Path, name: str) -> Path | None:
+    """The file at a path relative to a folder, whose extension may be missing, as Blender exports leave it."""
+    suffixes = ("", *IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES))
+    return next((file for suffix in suffixes if os.path.isfile(file := root / (name + suffix))), None)
+
+
 def find_images(root: Path, names: Sequence[str], where: object) -> list[Path | None]:
     """The image files that a scene file names; None where there is none.
 
@@ -75,7 +81,7 @@ def find_images(root: Path, names: Sequence[str], where: object) -> list[Path | 
     Raises:
         InputError: several files may be meant, or one by two names.
     """
-    found = {name: root / name if os.path.isfile(root / name) else None for name in names}
+    found = {name: exact_file(root, name) for name in names}
     inexact = [name for name, file in found.items() if file is None]
     exact, free = set(found.values()), dict[str, list[Path]]()
     for file in walk_images(root) if inexact else ():
