@@ -172,7 +172,7 @@ def train(
         FileExistsError: if the folder holds a run (options=["overwrite=true"] replaces it), or one is going on in it.
         KeyboardInterrupt: after Ctrl-C; the last state is saved, and the command line's `resume=` goes on from it.
     """
-    if not isinstance(scene, Scene):
+    if isinstance(scene, str | Path):
         size = auto_resize(seconds, steps, the_device(device), torch.get_num_threads())
         scene = open_scene(os.path.abspath(user_path(scene)), options=PhotoLoadOptions(size))
     default = Path("outputs", scene.name, datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))

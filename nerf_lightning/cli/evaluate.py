@@ -38,7 +38,6 @@ def evaluate(
 
     import pandas as pd
 
-    from nerf_lightning.dataset import RayDataModule
     from nerf_lightning.drawing.contact_sheet import contact_sheet
     from nerf_lightning.drawing.panels import result_panel, write_png
     from nerf_lightning.evaluate.metrics import DIGITS, format_table, to_json
@@ -54,7 +53,7 @@ def evaluate(
     found = open_run(source, where)
     data = data_again(found.cfg, found.scene, photos)
     if split == "test":
-        if not isinstance(data, RayDataModule) or data.scene.test is None:
+        if data.scene.test is None:
             raise InputError("evaluate", "split", "test", "val: these photos have no test split")
         data.scene = replace(data.scene, val=data.scene.test)
     folder = beside(source) / "evaluation" if output is None else output_path(output)

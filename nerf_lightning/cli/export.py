@@ -171,7 +171,6 @@ def export_transforms(run: RunPath = None, /, *, output: Output = None, photos: 
     Args:
         output: A new folder; default: posed/ in the run.
     """
-    from nerf_lightning.dataset import RayDataModule
     from nerf_lightning.export.photos import write_photos
     from nerf_lightning.runs.data import data_again
     from nerf_lightning.runs.folder import load_config
@@ -184,7 +183,7 @@ def export_transforms(run: RunPath = None, /, *, output: Output = None, photos: 
         raise InputError(target, "", "something", "a folder that is not there yet", "give another -o, or remove it")
     content = load_scene(source)  # a compact file does not know corrected cameras
     data = data_again(load_config(source), content, photos)
-    if not isinstance(data, RayDataModule):
+    if not data.has_cameras:
         raise InputError(source, "", "a picture's run", "a scene's run")
     with atomic_folder(target) as temporary:
         write_photos(data.scene, temporary)

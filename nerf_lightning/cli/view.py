@@ -89,7 +89,6 @@ def _open_scene(path: Path, resize: int | str | None, holdout: int, host: str, p
 
 
 def _open_run(source: Path, device: str, side: int, host: str, port: int) -> "Page":
-    from nerf_lightning.dataset import Scene
     from nerf_lightning.runs.data import data_again
     from nerf_lightning.runs.open import open_scene_run
     from nerf_lightning.utils.device import the_device
@@ -101,5 +100,4 @@ def _open_run(source: Path, device: str, side: int, host: str, port: int) -> "Pa
         scene = data_again(found.cfg, found.scene).scene
     except InputError as error:
         print(f"without photos: {error}", flush=True)
-    assert scene is None or isinstance(scene, Scene)  # of a scene's run
     return FieldPage(source.resolve().name, found.system, found.orbit, scene, host, port, side)

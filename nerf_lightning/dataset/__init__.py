@@ -11,8 +11,12 @@ from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.shots import PhotoLoadOptions
 from nerf_lightning.dataset.views import Views
 
+DataModule = RayDataModule | PixelDataModule
+"""Of a scene, or of a picture."""
+
 __all__ = [
     "BUILT_IN",
+    "DataModule",
     "Picture",
     "PictureBatch",
     "PixelBatch",
@@ -33,5 +37,4 @@ __all__ = [
     "pixel_grid",
     "open_scene",
     "save_npz",
-    "PhotoLoadOptions",
 ]

@@ -10,6 +10,8 @@ from torch import Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset.focus import Focus
 from nerf_lightning.dataset.loader import StepDataModule
+from nerf_lightning.dataset.matching.judge import Doubt
+from nerf_lightning.dataset.plausible import check_scene
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.dataset.views import Views
@@ -123,6 +125,7 @@ class RayDataModule(StepDataModule[Views]):
         focus: share of the rays that are drawn by the error of what is around them, see `Focus`; 0 draws all alike.
     """
 
+    has_cameras = True
     MOST_RAYS = 32  # times the rays of the first step
 
     def __init__(
@@ -190,6 +193,13 @@ class RayDataModule(StepDataModule[Views]):
     def some_pixels(self) -> RayBatch:
         """Training pixels to measure the error of one plain colour on."""
         return draw_rays(self.scene.train, SOME_PIXELS, step_generator(self.seed, Stream.PLAIN, 0))
+
+    def small_batch(self) -> RayBatch:
+        """A few rays, to compile kernels with."""
+        return draw_rays(self.scene.train, 64, step_generator(0, Stream.BATCH, 0), with_texture=True)
+
+    def find_doubts(self, corrected: bool) -> list[Doubt]:
+        return check_scene(self.scene, corrected)
 
     @property
     def held_out_views(self) -> int:

@@ -11,7 +11,6 @@ from numpy import ndarray
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras, spiral_like
-from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.drawing.panels import to_bytes
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.shapes import encode_mesh, encode_ply, format_offset
@@ -51,7 +50,6 @@ def training_views(run: SceneRun, photos: Path | None = None) -> Cameras:
         orbit = run.orbit[torch.tensor(subsample(len(run.orbit), count))]
         K, c2w, sizes = (torch.cat([getattr(x, name) for x in (orbit, spiral)]) for name in ("K", "c2w", "sizes"))
         return Cameras(K, c2w, sizes)
-    assert isinstance(data, RayDataModule)  # of a scene's run
     return some_cameras(data)
 
 

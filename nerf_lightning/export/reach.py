@@ -2,6 +2,7 @@
 
 import copy
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -24,15 +25,14 @@ Cells = Bool[Tensor, "G G G"]
 
 def occupied_cells(system: System) -> Cells | None:
     """Cells in which the sampler looks for something; None for a sampler without a grid."""
-    if not isinstance(system, NeRF3D) or not isinstance(system.sampler, OccupancySampler):
-        return None
-    return system.sampler.grid.occupied.view(*[system.sampler.grid.resolution] * 3)
+    sampler = system.parts.get("sampler")
+    return sampler.grid.occupied.view(*[sampler.grid.resolution] * 3) if isinstance(sampler, OccupancySampler) else None
 
 
-def seen_cells(system: System, cameras: Cameras) -> Cells | None:
+def seen_cells(system: NeRF3D, cameras: Cameras) -> Cells | None:
     """The occupied cells that are visible to the cameras, and their neighbours."""
     occupied = occupied_cells(system)
-    if occupied is None or not isinstance(system, NeRF3D):
+    if occupied is None:
         return None
     return widened(visible_cells(system, cameras, len(occupied))) & occupied
 
@@ -64,8 +64,7 @@ def confined_to(system: System, cells: Cells | None) -> System:
     """A copy of a system with only what some cells need, on the CPU, to be encoded; the system itself for None."""
     if cells is None:
         return system
-    part = copy.deepcopy(system).cpu()
-    assert isinstance(part, NeRF3D)  # as it has cells
+    part: Any = copy.deepcopy(system).cpu()
     part.field.prune(cells.cpu())
     part.sampler.import_state({"occupied": cells.cpu().flatten()})
     return part

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.dataset import DataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.reach import Cells, confined_to, occupied_cells, seen_cells
 from nerf_lightning.runs.compact import decode, encode
@@ -41,7 +41,7 @@ class Compact:
         return self.before - self.psnr
 
 
-def held_out_psnr(system: System, data: RayDataModule | PixelDataModule, views: Sequence[int] | None = None) -> float:
+def held_out_psnr(system: System, data: DataModule, views: Sequence[int] | None = None) -> float:
     """Mean dB over held-out views that have a figure, nan where none has; over all of them for None."""
     chosen = range(data.held_out_views) if views is None else views
     results = system.evaluate_held_out(data, tracked(chosen, len(chosen), "held-out views"))
@@ -49,15 +49,15 @@ def held_out_psnr(system: System, data: RayDataModule | PixelDataModule, views: 
     return fmean(finite) if finite else math.nan
 
 
-def some_cameras(data: RayDataModule, most: int = MOST_VIEWS) -> Cameras:
+def some_cameras(data: DataModule, most: int = MOST_VIEWS) -> Cameras:
     """Those of training views spread over all."""
     cameras = data.scene.train.cameras
     return cameras[torch.tensor(subsample(len(cameras), most))]
 
 
 def smallest(
-    system: System,
-    data: RayDataModule | PixelDataModule,
+    system: Any,
+    data: DataModule,
     config: dict[str, Any],
     most_loss: float,
     precision: str | None = None,
@@ -77,7 +77,7 @@ def smallest(
         InputError: where every precision asked for loses more.
     """
     before = held_out_psnr(system, data)
-    if seen is None and isinstance(data, RayDataModule):
+    if seen is None and data.has_cameras:
         seen = seen_cells(system, some_cameras(data))
     occupied = occupied_cells(system)
     alike = seen is None or occupied is None or torch.equal(seen, occupied)

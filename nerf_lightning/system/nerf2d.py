@@ -57,6 +57,9 @@ class NeRF2D(System):
         self.stats = StepStats(loss.detach(), len(batch.uv), len(batch.uv), losses={"photometric": loss.detach()})
         return loss
 
+    def compute_losses(self, batch: PixelBatch, generator: torch.Generator) -> tuple[dict[str, Tensor], StepStats]:
+        return {"photometric": self.loss(batch)}, self.stats
+
     def truth(self, batch: PixelBatch) -> Tensor:
         return batch.rgb
 

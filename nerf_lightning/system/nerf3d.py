@@ -68,9 +68,8 @@ class NeRF3D(System):
         factors = {name: self.schedule(progress, step) * factor for name, factor in scheduled.items()}
         return factors if self.corrections is None else {**factors, **self.corrections.lr_factors(progress)}
 
-    def warm_start_from(self, smaller: System) -> None:
+    def warm_start_from(self, smaller: "NeRF3D") -> None:
         super().warm_start_from(smaller)
-        assert isinstance(smaller, NeRF3D)  # checked by the field
         self.sampler.warm_start_from(smaller.sampler)
         self.sampler.set_resolution_scale(self.field.resolution_scale)
 

@@ -59,7 +59,7 @@ def test_other_photos_of_the_same_thing(run: Path, tmp_path: Path):
 
 def test_pictures_too(tmp_path: Path):
     given = ["+experiment=smoke_2d", "dataset.max_side=32", "budget.steps=2", "~logger"]
-    train(composed([*given, *(f"callbacks.{one}=null" for one in ("training_gif", "charts", "baselines"))], tmp_path))
+    train(composed([*given, "callbacks.pictures=null"], tmp_path))
     (view,) = evaluated(tmp_path)["views"]
     results = json.loads((tmp_path / "results.json").read_text())
     assert view["psnr"] == pytest.approx(results["psnr"], abs=0.02)

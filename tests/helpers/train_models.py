@@ -23,8 +23,7 @@ SCENE = [
     *("dataset.samples=2048", "sampler.samples=32", "sampler.resolution=16", "callbacks.orbit=null"),
 ]
 PICTURE = [
-    *("+experiment=picture", "dataset.max_side=24", "dataset.pixels=256", "callbacks.baselines=null"),
-    *("callbacks.training_gif=null", "callbacks.charts=null"),
+    *("+experiment=picture", "dataset.max_side=24", "dataset.pixels=256", "callbacks.pictures=null"),
 ]
 MODELS = {
     "hashgrid": [*SCENE, "refine=auto", "model.levels=3", "model.finest=32", "model.log2_entries=10", "model.width=16"],

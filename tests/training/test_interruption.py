@@ -21,7 +21,7 @@ from nerf_lightning.training.train import train
 from tests.helpers.growth import grow
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=12", "model.width=8"]
-SMALL += ["callbacks.heldout.at=[0.5]", *(f"callbacks.{name}=null" for name in ("charts", "training_gif", "baselines"))]
+SMALL += ["callbacks.heldout.at=[0.5]", "callbacks.pictures=null"]
 STOP = 6
 State = tuple[int, dict[str, torch.Tensor]]
 
