@@ -10,9 +10,8 @@ from nerf_lightning.dataset.formats.names import list_images
 from nerf_lightning.dataset.formats.npz import load_npz
 from nerf_lightning.dataset.formats.transforms import load_blender, load_transforms
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.sfm.frames import extract_frames
+from nerf_lightning.dataset.sfm.frames import VIDEOS, extract_frames
 from nerf_lightning.dataset.sfm.photos import place_photos
-from nerf_lightning.dataset.sfm.video import VIDEOS
 from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import user_path
@@ -76,7 +75,7 @@ def _open(place: Path, name: str | None, options: PhotoLoadOptions) -> Scene:
         photos = next((folder for folder in folders if folder.is_dir() and list_images(folder)), None)
     if photos is not None:
         name = name or (place.stem if place.is_file() else place.resolve().name)
-        return load_colmap(place_photos(photos), name, options, photos, upright=True)
+        return load_colmap(place_photos(photos), name, replace(options, orientation="exif"), photos)
     kind = "folder" if place.is_dir() else f"{place.suffix or 'plain'} file"
     found = f"a {kind} without a scene" if place.exists() else "nothing there"
     raise InputError(place, "", found, SUPPORTED)

@@ -4,8 +4,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from nerf_lightning.dataset.formats.decode import image_header
-from nerf_lightning.dataset.formats.header import read_header
+from nerf_lightning.dataset.formats.decode import image_header, read_header
 
 log = logging.getLogger(__name__)
 
@@ -32,8 +31,7 @@ def choose_orientations(
     others = 0
     for photo, size in zip(photos, stated, strict=True):
         shapes = [image_header(photo, turn)[:2] for turn in (False, True)]
-        header = read_header(photo)
-        has_turn = header is not None and header.orientation != 1
+        has_turn = read_header(photo).orientation != 1
         fits_stored, fits_upright = (size is None or has_shape(shape, size) for shape in shapes)
         chosen.append(has_turn and (orientation == "exif" or (orientation == "auto" and fits_upright > fits_stored)))
         others += has_turn and orientation == "auto" and fits_upright and fits_stored

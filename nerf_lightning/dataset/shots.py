@@ -13,8 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from nerf_lightning.cameras import Cameras, Lenses
-from nerf_lightning.dataset.formats.decode import THREADS, image_header, read_pixels
-from nerf_lightning.dataset.formats.header import stated_exposure
+from nerf_lightning.dataset.formats.decode import THREADS, image_header, read_pixels, stated_exposure
 from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.masks import read_mask
 from nerf_lightning.dataset.orientation import has_shape

@@ -48,21 +48,21 @@ def build_page(
         facts = describe_run(source, found, [("quality", quality), ("size", f"{view.width} x {view.height} pixels")])
         return picture_page(to_bytes(rgb.cpu()), data.scene.name, facts), quality
     drawn = drawable(system, some_cameras(data), plain_config(found.cfg), cells)
-    seen = occupied_cells(drawn.system) if drawn.change else None
+    seen = occupied_cells(drawn.system) if drawn.changes else None
     compact = smallest(drawn.system, data, drawn.config, loss_db, seen)
-    before = held_out_psnr(system, data) if drawn.change else compact.before
-    content = without_folders(compact.content)
+    before = held_out_psnr(system, data) if drawn.changes else compact.before
+    content, changes = without_folders(compact.content), "; ".join(drawn.changes)
     measured = [
         ("held-out PSNR", f"{compact.psnr:.2f} dB"),
         ("size", f"{len(content) / 1000:,.1f} kB, {compact.precision} precision"),
     ]
-    if drawn.change:
-        measured.append(("drawn with", f"{drawn.change}: {before - compact.psnr:.2f} dB lost"))
+    if changes:
+        measured.append(("drawn with", f"{changes}: {before - compact.psnr:.2f} dB lost"))
     train, chosen = data.scene.train, subsample(len(data.scene.train), MAX_PHOTOS)
     cameras, names = train.cameras[torch.tensor(chosen)].to("cpu"), [train.name(i) for i in chosen]
     facts = describe_run(source, found, measured)
     page = field_page(content, drawn.system, found.orbit, data.scene.name, facts, cameras, names)
-    return page, f"held-out PSNR {before:.2f} -> {compact.psnr:.2f} dB" + (f" ({drawn.change})" if drawn.change else "")
+    return page, f"held-out PSNR {before:.2f} -> {compact.psnr:.2f} dB" + (f" ({changes})" if changes else "")
 
 
 def describe_run(source: Path, found: RunFolder, measured: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

@@ -107,7 +107,7 @@ NPZ = [
     (entries(images_train=None), "images_train: found no such key"),
     (entries(images_val=lambda x: x * 1.0), "floats from"),
     (entries(images_val=lambda x: x[:, :4]), "as in images_train"),
-    (entries(images_val=lambda x: x[:0]), "0 views"),
+    (entries(images_val=lambda x: x[:0], c2ws_val=lambda x: x[:0]), "0 views"),
     (entries(c2ws_train=lambda x: x[:2]), "9 images for 2 poses"),
     (pose(lambda p: p * np.nan), "c2ws_train[1]: found nan"),
     (pose(lambda p: p * [2, 2, 3, 1]), "c2ws_train[1]: found no rotation"),
@@ -118,14 +118,11 @@ NPZ = [
     (entries(K=[[60.0, 0, 1e9], [0, 60, 3], [0, 0, 1]]), "none of these numbers above"),
     (entries(K=[[600.0, 0, 240], [0, 600, 200], [0, 0, 1]]), "the middle of photos 10 times as large"),
     (entries(near=3.0, far=2.0), "far: found 2"),
-    (entries(near=np.zeros(17)), "near: found shape (17,)"),
     (entries(aabb=[[1.0, 1, 1], [0, 2, 2]]), "aabb: found"),
-    (entries(aabb=[[0.0, 0, 0], [1, 1, 1]], unbounded=[1, 0]), "unbounded: found"),
     (entries(to_source=EYE + np.eye(4, k=1) * [0, 1, 0, 0]), "a similarity"),
     (entries(background=[0, 2, 0.5]), "background: found"),
     (entries(focal=PICKLED), "Object arrays"),
     (entries(c2ws_train=lambda x: x * np.array([*[[1, 1, 1, 1e-14]] * 3, [1] * 4])), "take another unit"),
-    (Path.unlink, "nothing there"),
     (lambda file: file.write_bytes(file.read_bytes()[:-200]), "BadZipFile"),
 ]
 JSON = [
@@ -138,40 +135,30 @@ JSON = [
     (no_photos, "(nor are 11 more)"),
     (frame(fl_x=None, fl_y=None), "no focal length"),
     (frame(fl_x=None, fl_y=None, camera_angle_x=62.0), "radians"),
-    (frame(cx=1e39), "none of these numbers above"),
     (frame(k1=-50.0), "folds the photo over"),
     (frame(k4=0.1), "k4: found 0.1"),
     (frame(rolling_shutter=[0, 0, 0.03, 0]), "rolling_shutter: found"),
     (frame(w=60, h=40), "found 48x40 pixels, expected 60x40"),
-    (edit(lambda c: c.update(applied_transform=[[1, 0], [0, 1]])), "applied_transform: found shape"),
     (edit(lambda c: c.update(val_filenames=["images/x.png"])), "which is no frame"),
     (edit(lambda c: c.update(train_filenames=ALL, val_filenames=ALL[:1])), "which is in train_filenames too"),
-    (edit(lambda c: c.update(val_filenames=ALL)), "train split: found 0 views"),
 ]
 BLENDER = [
     (edit(lambda c: c.pop("camera_angle_x")), "no focal length"),
-    (no_photos, "which is not there"),
-    (text("images/0005.png", "no"), "0005.png: found 2 bytes"),
+    (text("images/0005.png", "no"), "0005.png: found no readable"),
 ]
 COLMAP = [
     (cut(f"{MODEL}/cameras.bin", 30), "cameras.bin: found a damaged file"),
     (put(f"{MODEL}/images.bin", 0, "Q", 2**60), "images.bin: found a damaged file"),
     (put(f"{MODEL}/cameras.bin", 12, "i", 99), "model number 99"),
     (put(f"{MODEL}/cameras.bin", 32, "d", math.nan), "camera 1: found nan"),
-    (put(f"{MODEL}/cameras.bin", 48, "d", 1e39), "none of these numbers above"),
     (put(f"{MODEL}/images.bin", 44, "d", math.nan), "0000.png: found the pose"),
     (put(f"{MODEL}/images.bin", 68, "i", 77), "0000.png: found camera 77"),
     (lambda scene: (scene / MODEL / "images.bin").write_bytes(bytes(8)), "0 photos"),
     (lambda scene: (scene / MODEL / "images.bin").unlink(), "a folder without a scene"),
     (no_photos, "at least half of the photos"),
     (picture("images/0003.png", 48, 40, 3), "0003.png: found 40x48 pixels, expected 48x40"),
-    (text("images/0003.png", "a photo"), "0003.png: found 7 bytes"),
     (cut("images/0003.png", 200), "0003.png: found"),
-    (text("masks/0003.png", "a mask"), "masks/0003.png: found 6 bytes"),
-    (
-        lambda scene: (shutil.rmtree(scene / "images"), (scene / "images").symlink_to("images")),
-        "at least half of the photos",
-    ),
+    (text("masks/0003.png", "a mask"), "masks/0003.png: found no readable"),
 ]
 TEXT = [
     (replaced(f"{MODEL}/cameras.txt", "48 40", "48 forty"), "forty"),
@@ -179,14 +166,11 @@ TEXT = [
     (text(f"{MODEL}/images.txt", "1 1 0 0 0\n\n"), "images.txt: found"),
     (replaced(f"{MODEL}/images.txt", "0001.png", "0000.png"), "two photos of one name"),
     (text(f"{MODEL}/points3D.txt", "1 2\n"), "points3D.txt: found"),
-    (text(f"{MODEL}/images.txt", "# none\n"), "0 photos"),
 ]
 LLFF = [
     (rows(lambda a: a[:-2]), "10 poses, but 12 in images"),
-    (rows(lambda a: a[:, :15]), "shape (12, 15)"),
     (cell(2, 3, np.nan), "row 2: found nan"),
     (cell(0, 14, 1e-300), "focal lengths of at least"),
-    (text("poses_bounds.npy", "poses"), "unreadable"),
     (lambda scene: np.save(scene / "poses_bounds.npy", PICKLED, allow_pickle=True), "unreadable"),
 ]
 TABLES = {"npz": NPZ, "transforms": JSON, "blender": BLENDER, "colmap": COLMAP, "text": TEXT, "llff": LLFF}

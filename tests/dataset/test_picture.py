@@ -78,7 +78,7 @@ def test_load_picture_png_kinds_become_rgb8(kind: str, bits: int, tmp_path: Path
 
 def test_load_picture_float_pixels_raise(tmp_path: Path):
     path = write(tmp_path / "a.tiff", np.zeros((4, 4, 3), np.float32))
-    with pytest.raises(InputError, match="float32 pixels, expected 8 or 16 bits"):
+    with pytest.raises(InputError, match="expected .* of 8 or 16 bits a channel"):
         load_picture(path)
 
 
@@ -93,7 +93,7 @@ def test_load_picture_changed_png_raises(tmp_path: Path):
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8))
     whole = path.read_bytes()
-    for at in range(8, len(whole)):
+    for at in range(8, len(whole) - 12):  # all but the end, which says nothing of the pixels
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
-        with pytest.raises(InputError, match="cut short or changed"):
+        with pytest.raises(InputError, match="no readable image"):
             load_picture(path)

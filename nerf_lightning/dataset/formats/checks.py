@@ -37,14 +37,10 @@ def require_keys(where: object, have: Iterable[str], needed: Sequence[str]) -> N
 
 def parse_number(where: object, key: str, value: Any) -> float:
     """A finite real number; text that holds one (some exporters write it so) and arrays of one element count."""
-    try:
-        number = float(value.item() if isinstance(value, np.ndarray) else value)
-    except (TypeError, ValueError, OverflowError):
-        number = np.nan
-    if isinstance(value, bool) or not np.isfinite(number):
-        found = f"shape {value.shape}, {value.dtype}" if isinstance(value, np.ndarray) else repr(value)[:60]
-        raise InputError(where, key, found, "one finite number")
-    return number
+    array = parse_floats(where, key, value)
+    if isinstance(value, bool) or array.size != 1 or not np.isfinite(array).all():
+        raise InputError(where, key, f"{value!r} of shape {array.shape}", "one finite number")
+    return float(array.item())
 
 
 def parse_floats(where: object, key: str, value: Any) -> Float[np.ndarray, "..."]:

@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from nerf_lightning.dataset.formats.colmap_model import FILES, find_files, read_model
-from nerf_lightning.dataset.formats.names import exact_file, find_images, keep_present, list_images, walk_images
+from nerf_lightning.dataset.formats.names import find_images, keep_present, list_images, walk_images
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.orientation import choose_orientations
 from nerf_lightning.dataset.posed import Hints, build_scene
@@ -19,8 +19,6 @@ log = logging.getLogger(__name__)
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse", "")
 PHOTO_FOLDERS = ("images", "input", "")
 REDUCED_FOLDERS = tuple(f"{name}_{factor}" for name in ("images", "input") for factor in (2, 4, 8))
-PLACED_FOLDER = "placed"
-"""Beside plain photos: the model that this package has made of them."""
 MAX_MODEL_DEPTH = 4
 """Folders below a scene's in which a model is looked for."""
 SHOWN = 5
@@ -35,7 +33,7 @@ def find_models(place: Path) -> list[Path]:
         folder = Path(name)
         if len(folder.relative_to(place).parts) >= MAX_MODEL_DEPTH:
             folders.clear()
-        folders[:] = sorted(below for below in folders if below != PLACED_FOLDER and not below.startswith("."))
+        folders[:] = sorted(below for below in folders if not below.startswith("."))
         if find_files(folder):
             is_numbered = folder.name.isdigit() and folder != place
             found.setdefault(folder.parent if is_numbered else folder, []).append(folder)
@@ -48,11 +46,7 @@ def find_models(place: Path) -> list[Path]:
 
 
 def load_colmap(
-    place: Path,
-    name: str | None = None,
-    options: PhotoLoadOptions = AS_IT_IS,
-    photos: Path | None = None,
-    upright: bool = False,
+    place: Path, name: str | None = None, options: PhotoLoadOptions = AS_IT_IS, photos: Path | None = None
 ) -> Scene:
     """Reads a COLMAP model (world-to-camera poses, inverted here) and its photos, sorted by name.
 
@@ -64,7 +58,6 @@ def load_colmap(
         name: defaults to the scene's folder's name.
         options: see there.
         photos: their folder; None looks for it.
-        upright: whether the model is of photos turned as their EXIF data say.
 
     Raises:
         InputError: no whole model, no photos, or photos that do not fit it.
@@ -79,20 +72,16 @@ def load_colmap(
     images, points = read_model(folder)
     images.sort(key=lambda image: image.name)
     names = [image.name for image in images]
-    root = find_photo_folder(folder, place, names) if photos is None else photos
-    files = find_images(root, names, folder)
-    placed = keep_present(folder, images, files)
-    found_files = [file for _, file in placed]
-    report_unplaced(root, found_files)
+    root = photos or find_photo_folder(folder, place, names)
+    placed = keep_present(folder, images, find_images(root, names, folder))
+    files = [file for _, file in placed]
+    report_unplaced(root, files)
     scene_folder = root.parent if root.name in (*PHOTO_FOLDERS, *REDUCED_FOLDERS) else root
-    masks = find_masks(found_files, scene_folder)
-    stated = [(image.optics.width, image.optics.height) for image, _ in placed]
-    turned = (
-        [upright] * len(placed) if upright else choose_orientations(folder, found_files, stated, options.orientation)
-    )
+    sizes = [(image.optics.width, image.optics.height) for image, _ in placed]
+    turned = choose_orientations(folder, files, sizes, options.orientation)
     shots = [
         Shot(image.name, file, image.c2w, image.optics, mask, turn)
-        for (image, file), mask, turn in zip(placed, masks, turned, strict=True)
+        for (image, file), mask, turn in zip(placed, find_masks(files, scene_folder), turned, strict=True)
     ]
     named = place if scene_folder.resolve().is_relative_to(place.resolve()) else scene_folder
     return build_scene(place, name or named.resolve().name, shots, options, hints=Hints(points=points))
@@ -104,7 +93,7 @@ def find_photo_folder(model: Path, place: Path, names: list[str]) -> Path:
     above = [model, *list(model.resolve().parents)[:4]]
     tried = [parent / name for names in (order, REDUCED_FOLDERS) for parent in above for name in names]
     for folder in tried:
-        if any(exact_file(folder, name) for name in names[:SHOWN]):
+        if any(os.path.isfile(folder / name) for name in names[:SHOWN]):
             return folder
     named = [folder for folder in tried if folder.name in (*order, *REDUCED_FOLDERS)]
     return next((folder for folder in named if next(walk_images(folder), None)), place)
@@ -112,8 +101,7 @@ def find_photo_folder(model: Path, place: Path, names: list[str]) -> Path:
 
 def report_unplaced(root: Path, placed: list[Path]) -> None:
     """Names photos beside the placed ones that the model does not place."""
-    folders = {file.parent for file in placed}
-    left = sorted({file for folder in folders for file in list_images(folder)} - set(placed))
+    left = sorted({file for folder in {file.parent for file in placed} for file in list_images(folder)} - set(placed))
     if left:
-        names = join_truncated([os.path.relpath(file, root) for file in left], SHOWN)
+        names = join_truncated([file.name for file in left], SHOWN)
         log.warning("%s: %d photos have no place in the model, %s: left out", root, len(left), names)

@@ -4,7 +4,7 @@ Read here, because pycolmap ends the process over a damaged file, and is not nee
 """
 
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,29 +68,30 @@ def read_model(folder: Path) -> tuple[list[Image], Float[np.ndarray, "P 3"]]:
     """
     files = find_files(folder)
     parsers = BINARY if files[0].suffix == ".bin" else TEXT
-    found = [_read_all(file, parse) if file.is_file() else [] for file, parse in zip(files, parsers, strict=True)]
-    optics = {number: make_optics(files[0], f"camera {number}", *camera) for number, *camera in found[0]}
-    if not found[1]:
+    cameras, photos, points = (
+        _read_rows(file, parse) if file.is_file() else [] for file, parse in zip(files, parsers, strict=True)
+    )
+    optics = {number: make_optics(files[0], f"camera {number}", *camera) for number, *camera in cameras}
+    if not photos:
         raise InputError(files[1], "", "0 photos", "at least one placed photo")
-    names, cameras, poses = zip(*found[1], strict=True)
-    for name, camera in zip(names, cameras, strict=True):
+    images = []
+    for name, camera, pose in photos:
         if camera not in optics:
             expected = "a camera of the model's cameras file"
             raise InputError(files[1], name, f"camera {camera}, which is not there", expected)
-    if len({*names}) < len(names):
+        images.append(Image(name, optics[camera], invert_pose(files[1], name, np.array(pose))))
+    if len({image.name for image in images}) < len(images):
         raise InputError(files[1], "", "two photos of one name", "a name of its own for each")
-    c2w = invert_poses(files[1], names, np.array(poses, np.float64))
-    images = [Image(name, optics[camera], pose) for name, camera, pose in zip(names, cameras, c2w, strict=True)]
-    points = np.array(found[2], np.float64).reshape(-1, 3)
-    return images, points[(np.abs(points) <= checks.FARTHEST).all(1)]
+    places = np.array(points, np.float64).reshape(-1, 3)
+    return images, places[(np.abs(places) <= checks.FARTHEST).all(1)]
 
 
-def _read_all(path: Path, parse: Callable[[Path], Iterable[Row]]) -> list[Row]:
+def _read_rows(path: Path, parse: Callable[[Path], Iterator[Row]]) -> list[Row]:
     try:
         return list(parse(path))
+    except InputError:
+        raise
     except (struct.error, ValueError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(path, "", f"a damaged file ({error})", "a whole COLMAP file", "copy it again") from error
 
 
@@ -115,29 +116,25 @@ def parameter_names(where: object, key: str, model: str) -> list[str]:
 
 
 @np.errstate(all="ignore")
-def invert_poses(path: Path, names: Iterable[str], poses: Float[np.ndarray, "V 7"]) -> Float[np.ndarray, "V 4 4"]:
-    """Camera to world, from world-to-camera poses: quaternions (w, x, y, z) and translations."""
-    is_unit = np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1) < MAX_NORM_ERROR
-    for name, pose, is_right in zip(
-        names, poses, is_unit & (np.abs(poses[:, 4:]) <= checks.FARTHEST).all(1), strict=True
-    ):
-        if not is_right:
-            expected = f"a unit quaternion and a translation of at most {checks.FARTHEST:g}"
-            raise InputError(path, name, f"the pose {pose.tolist()}", expected)
-    c2w = np.tile(np.eye(4), (len(poses), 1, 1))
-    c2w[:, :3, :3] = Rotation.from_quat(poses[:, [1, 2, 3, 0]]).as_matrix().transpose(0, 2, 1)
-    c2w[:, :3, 3] = -(c2w[:, :3, :3] @ poses[:, 4:, None])[..., 0]
+def invert_pose(path: Path, name: str, pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "4 4"]:
+    """Camera to world, from a world-to-camera pose: quaternion (w, x, y, z) and translation."""
+    is_unit = abs(np.linalg.norm(pose[:4]) - 1) < MAX_NORM_ERROR
+    if not is_unit or not (np.abs(pose[4:]) <= checks.FARTHEST).all():
+        expected = f"a unit quaternion and a translation of at most {checks.FARTHEST:g}"
+        raise InputError(path, name, f"the pose {pose.tolist()}", expected)
+    c2w = np.eye(4)
+    c2w[:3, :3] = Rotation.from_quat(pose[[1, 2, 3, 0]]).as_matrix().T
+    c2w[:3, 3] = -c2w[:3, :3] @ pose[4:]
     return c2w
 
 
 class Bytes:
-    """Reads numbers from a file's content, one after the other; struct.error where it ends before."""
+    """Reads records of a binary file; struct.error or ValueError where it ends before."""
 
     def __init__(self, path: Path):
-        self.content = read_content(path)
-        self.at = 0
+        self.content, self.at = read_content(path), 0
 
-    def take(self, form: str) -> tuple[Any, ...]:
+    def take(self, form: str) -> Row:
         """The next numbers, in struct's notation, little-endian."""
         found = struct.unpack_from("<" + form, self.content, self.at)
         self.at += struct.calcsize("<" + form)
@@ -172,7 +169,7 @@ def _images_bin(path: Path) -> Iterator[Row]:
     file = Bytes(path)
     for _ in file.records():
         _, *pose, camera = file.take("i7di")
-        yield file.text(), camera, tuple(pose)
+        yield file.text(), camera, pose
         file.skip_records(24)  # x, y and the point of each feature
 
 
@@ -197,10 +194,8 @@ def _images_txt(path: Path) -> Iterator[Row]:
     lines = _lines(path)
     for line in filter(str.strip, lines):
         next(lines, None)  # every second line holds the features, and may be empty
-        _, *pose, camera, name = line.split(None, 9)  # names may contain spaces
-        if len(pose) != 7:
-            raise ValueError(line[:60])
-        yield name.rstrip(), int(camera), tuple(map(float, pose))
+        _, w, x, y, z, tx, ty, tz, camera, name = line.split(None, 9)  # names may contain spaces
+        yield name.rstrip(), int(camera), list(map(float, (w, x, y, z, tx, ty, tz)))
 
 
 def _points_txt(path: Path) -> Iterator[Row]:

@@ -1,44 +1,157 @@
-"""Image files to arrays: any depth and channel count becomes 8-bit RGB or RGBA.
+"""Image files: size, alpha and EXIF tags, and pixels of any depth and channel count as 8-bit RGB or RGBA."""
 
-Pillow decodes JPEG, as it reports files that are cut short and decodes at reduced scale. OpenCV decodes the rest: Pillow
-cuts 16-bit colour to its high byte and cannot open TIFFs of floats to say so.
-"""
-
-import zlib
-from io import BytesIO
+import math
+import struct
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
-from jaxtyping import Shaped, UInt8
+from jaxtyping import UInt8
+from PIL import Image
 from PIL.JpegImagePlugin import JpegImageFile
 
-from nerf_lightning.dataset.formats.header import DAMAGED, JPEG, QUARTER_TURNS, read_header
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.libraries import require
 from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.parsing import existing_file
 
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # `read_pixels` says what is wrong with a file
-
 THREADS = 4
+MAX_HEADERS = 4096
+"""Files whose headers are kept in memory."""
 DRAFT_SCALES = (8, 4, 2)
 """Factors by which libjpeg reduces while it decodes."""
 OVERSAMPLING = 2
 """Least ratio of a reduced JPEG's sides to those it is averaged to, where they differ: its low-pass filter is sharper than
 an average, and shows only where little is averaged afterwards (43 dB against the average of the whole photo, else above 50)."""
-CONVERSIONS = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
-"""From OpenCV's channels, by their count."""
-PNG = b"\x89PNG"
+JPEG = b"\xff\xd8"
 HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 """Brands after `ftyp` in photos of phones (ISO 23008-12); the last two stand for any codec."""
+ORIENTATION, DETAILS, EXPOSURE, APERTURE, SPEED = 0x0112, 0x8769, 0x829A, 0x829D, 0x8827
+"""Numbers of EXIF tags: how the camera was held, those about how a photo was taken, seconds, f-number and ISO speed."""
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What brings a photo of an EXIF orientation upright."""
+QUARTER_TURNS = (5, 6, 7, 8)
+"""Orientations of photos that lie on their side."""
+DAMAGED = (OSError, ValueError, SyntaxError, KeyError, TypeError, OverflowError, ZeroDivisionError, struct.error)
+"""What Pillow raises for broken tags or pixels, or for a picture of a kind that it does not know."""
+EXPECTED = "a whole PNG, JPEG, TIFF, WebP or HEIC image of 8 or 16 bits a channel"
+
+
+@dataclass(frozen=True)
+class Header:
+    """What one image file says before its pixels."""
+
+    width: int
+    """As stored, in pixels."""
+    height: int
+    alpha: bool
+    orientation: int
+    """As EXIF says; 1 for upright as stored, and with alpha."""
+    tags: Mapping[int, Any]
+    """EXIF tags by their numbers, but for those of raw bytes, as makers' notes; none where there are none, or broken ones."""
+
+
+@contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
+    """An image file, not decoded yet.
+
+    Raises:
+        InputError: it is none that Pillow reads, is damaged, or is HEIC without the package that reads it; in the block too.
+    """
+    with existing_file(path).open("rb") as file:
+        start = file.read(12)
+    if start[8:] in HEIC:
+        require(
+            "heic", "pillow_heif", purpose="the optional extra that reads HEIC photos", otherwise=", or convert them"
+        )
+        import pillow_heif
+
+        pillow_heif.register_heif_opener()
+    try:
+        # Image.open refuses photos of 200 megapixels as bombs.
+        with JpegImageFile(path) if start.startswith(JPEG) else Image.open(path) as image:
+            yield image
+    except InputError:
+        raise
+    except (*DAMAGED, Image.DecompressionBombError) as error:
+        raise InputError(path, "", f"no readable image ({error})", EXPECTED, "copy it again or convert it") from error
+
+
+def read_header(path: Path) -> Header:
+    """The header of an image file.
+
+    Raises:
+        InputError: see `open_image`.
+    """
+    stat = existing_file(path).stat()
+    return _read_header(path, stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache(maxsize=MAX_HEADERS)
+def _read_header(path: Path, size: int, mtime_ns: int) -> Header:
+    """The other arguments tell versions of a file apart."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of sizes: nothing is decoded here; and on tags that nothing asks for
+        with open_image(path) as image:
+            alpha, tags = image.has_transparency_data, _read_tags(image)
+            orientation = 1 if alpha else tags.get(ORIENTATION, 1)
+            return Header(*image.size, alpha, orientation if orientation in TURNS else 1, tags)
+
+
+def _read_tags(image: Image.Image) -> dict[int, Any]:
+    try:
+        exif = image.getexif()
+        tags = {**exif, **exif.get_ifd(DETAILS)}
+        return {tag: value for tag, value in tags.items() if not isinstance(value, bytes)}
+    except DAMAGED:
+        return {}
+
+
+def image_header(path: Path, upright: bool = False) -> tuple[int, int, bool]:
+    """Width, height, and whether there is alpha.
+
+    Args:
+        path, upright: see `read_pixels`.
+
+    Raises:
+        InputError: see `open_image`.
+    """
+    header = read_header(path)
+    if upright and header.orientation in QUARTER_TURNS:
+        return header.height, header.width, header.alpha
+    return header.width, header.height, header.alpha
+
+
+def stated_exposure(path: Path) -> float | None:
+    """Light that a photo gathered, by its tags: seconds times ISO speed over the squared f-number; None if they do not say."""
+    tags = read_header(path).tags
+    try:
+        speed = tags[SPEED]
+        first = speed[0] if isinstance(speed, tuple) else speed  # of two kinds of sensitivity
+        found = float(tags[EXPOSURE]) * float(first) / float(tags[APERTURE]) ** 2
+    except (*DAMAGED, IndexError):
+        return None
+    return found if 0 < found < math.inf else None
 
 
 def read_pixels(path: Path, upright: bool = False, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "H W C"]:
     """Decodes one image: RGB, or RGBA with straight alpha; 16 bits become 8, grey becomes RGB.
 
     Args:
-        path: PNG, JPEG, TIFF or whatever else OpenCV reads, or HEIC.
+        path: PNG, JPEG, TIFF or whatever else Pillow reads, or HEIC.
         upright: apply the EXIF rotation (not to images with alpha). Off for posed photos, whose poses and intrinsics
             are about the pixels as stored. HEIC photos are upright always: the rotation is part of their format.
         size: width and height that the caller averages it to. A JPEG is then decoded at 1/2, 1/4 or 1/8 of its size where
@@ -47,66 +160,24 @@ def read_pixels(path: Path, upright: bool = False, size: tuple[int, int] | None 
     Raises:
         InputError: missing, truncated, not an image, or of floating-point pixels; HEIC without the package that reads it.
     """
-    existing_file(path)
     header = read_header(path)
-    orientation = header.orientation if upright and header is not None and not header.alpha else 1
-    try:
-        data = path.read_bytes()
-        if data.startswith(JPEG):
-            wanted = size[::-1] if size is not None and orientation in QUARTER_TURNS else size
-            return turn_upright(_decode_jpeg(path, data, wanted), orientation)
-        if data.startswith(PNG):
-            _check_png(path, data)
-        # UNCHANGED keeps alpha and 16 bits, and leaves the EXIF rotation alone.
-        raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    except (cv2.error, OSError) as error:
-        raise InputError(path, "", f"an unreadable image ({error})", "a PNG, JPEG or TIFF") from error
-    if raw is None and data[8:12] in HEIC:
-        return _heic(path, data)
-    if raw is None:
-        raise InputError(path, "", f"{len(data)} bytes that are no image", "a PNG, JPEG or TIFF", "copy it again")
-    return turn_upright(_rgb8(path, raw), orientation)
-
-
-def turn_upright(image: UInt8[np.ndarray, "H W C"], orientation: int) -> UInt8[np.ndarray, "h w C"]:
-    """A photo as its EXIF orientation says."""
-    image = image.transpose(1, 0, 2) if orientation in QUARTER_TURNS else image
-    image = image[:, ::-1] if orientation in (2, 3, 6, 7) else image
-    image = image[::-1] if orientation in (3, 4, 7, 8) else image
-    return np.ascontiguousarray(image)
-
-
-def image_header(path: Path, upright: bool = False) -> tuple[int, int, bool]:
-    """Width, height, and whether there is alpha, from the file's header alone where Pillow knows it.
-
-    Args:
-        path, upright: see `read_pixels`.
-
-    Raises:
-        InputError: see `read_pixels`.
-    """
-    existing_file(path)
-    header = read_header(path)
-    if header is None:
-        shape = read_pixels(path, upright).shape  # says what is wrong
-        return shape[1], shape[0], shape[2] == 4
-    if upright and not header.alpha and header.orientation in QUARTER_TURNS:
-        return header.height, header.width, header.alpha
-    return header.width, header.height, header.alpha
-
-
-def _decode_jpeg(path: Path, data: bytes, wanted: tuple[int, int] | None) -> UInt8[np.ndarray, "H W 3"]:
-    try:
-        with JpegImageFile(BytesIO(data)) as image:
-            width, height = image.size
-            factor = 1 if wanted is None else draft_scale(width, height, wanted)
-            check_memory(path, "", f"{width}x{height} pixels", 3 * width * height // factor**2)
-            image.draft(image.mode, (width // factor, height // factor))
-            image.load()
-            return np.array(image if image.mode == "RGB" else image.convert("RGB"))
-    except DAMAGED as error:
-        found = f"an image that was cut short or changed ({error})"
-        raise InputError(path, "", found, "a whole JPEG", "copy it again") from error
+    orientation = header.orientation if upright else 1
+    wanted = size[::-1] if size is not None and orientation in QUARTER_TURNS else size
+    with open_image(path) as image:
+        image.verify()  # checksums of a PNG, which decoding does not look at
+    with open_image(path) as image:
+        factor = 1
+        if wanted is not None and isinstance(image, JpegImageFile):
+            factor = draft_scale(header.width, header.height, wanted)
+        check_memory(path, "", f"{header.width}x{header.height} pixels", 4 * header.width * header.height // factor**2)
+        image.draft(image.mode, (header.width // factor, header.height // factor))
+        if image.mode in ("I", "F"):
+            raise InputError(path, "", "pixels of 32 bits", EXPECTED, "convert it")
+        if image.mode.startswith("I;16"):
+            image = Image.fromarray(((np.asarray(image, np.uint32) + 128) // 257).astype(np.uint8))
+        if image.mode != (mode := "RGBA" if header.alpha else "RGB"):
+            image = image.convert(mode)
+        return np.array(image if orientation == 1 else image.transpose(TURNS[orientation]))
 
 
 def draft_scale(width: int, height: int, wanted: tuple[int, int]) -> int:
@@ -117,38 +188,3 @@ def draft_scale(width: int, height: int, wanted: tuple[int, int]) -> int:
         if exact and (reduced == wanted or all(a >= OVERSAMPLING * b for a, b in zip(reduced, wanted, strict=True))):
             return factor
     return 1
-
-
-def _rgb8(path: Path, raw: Shaped[np.ndarray, "..."]) -> UInt8[np.ndarray, "H W C"]:
-    if raw.dtype == np.uint16:
-        raw = ((raw.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    if raw.dtype != np.uint8:
-        raise InputError(path, "", f"{raw.dtype} pixels", "8 or 16 bits a channel")
-    raw = raw.reshape(*raw.shape[:2], -1)
-    if (channels := raw.shape[2]) not in CONVERSIONS:
-        raise InputError(path, "", f"{channels} channels", "1, 3 or 4")
-    return cv2.cvtColor(raw, CONVERSIONS[channels])
-
-
-def _heic(path: Path, data: bytes) -> UInt8[np.ndarray, "H W C"]:
-    require("heic", "pillow_heif", purpose="the optional extra that reads HEIC photos", otherwise=", or convert them")
-    import pillow_heif
-
-    try:
-        image = pillow_heif.read_heif(data, convert_hdr_to_8bit=True).to_pillow()
-    except (OSError, ValueError, RuntimeError, SyntaxError, EOFError) as error:
-        raise InputError(path, "", f"an unreadable image ({error})", "a whole HEIC photo", "copy it again") from error
-    return np.asarray(image.convert("RGBA" if "A" in image.mode else "RGB"))
-
-
-def _check_png(path: Path, data: bytes) -> None:
-    """Compares the checksums of all chunks, up to the last: some OpenCV versions fill the rest with grey and only warn."""
-    at, name = 8, b""
-    while name != b"IEND":
-        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
-        name = data[at + 4 : at + 8]
-        if len(name) < 4 or zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            raise InputError(path, "", "an image that was cut short or changed", "a whole PNG", "copy it again")
-        at = end + 4
-    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
-    check_memory(path, "", f"{width}x{height} pixels", 3 * width * height)

@@ -50,10 +50,10 @@ class Frame:
         """Of the photo."""
         return str(self.values["file_path"])
 
-    def number(self, key: str) -> float | None:
+    def number(self, key: str, default: float) -> float:
         """A number, if it is there."""
         value = self.values.get(key)
-        return None if value is None else checks.parse_number(self.where, key, value)
+        return default if value is None else checks.parse_number(self.where, key, value)
 
 
 def opengl_to_opencv(c2w: Float[np.ndarray, "V 4 4"]) -> Float[np.ndarray, "V 4 4"]:
@@ -74,20 +74,18 @@ def read_frames(file: Path) -> list[Frame]:
     entries = content["frames"]
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(file, "frames", repr(entries)[:60], "objects with file_path and transform_matrix")
-    poses = []
-    for i, entry in enumerate(entries):
-        checks.require_keys(f"{file}: frames[{i}]", entry, ["file_path", "transform_matrix"])
+    places, poses = [f"{file}: frames[{i}]" for i in range(len(entries))], []
+    for where, entry in zip(places, entries, strict=True):
+        checks.require_keys(where, entry, ["file_path", "transform_matrix"])
         if not isinstance(entry["file_path"], str):
-            raise InputError(f"{file}: frames[{i}]", "file_path", repr(entry["file_path"])[:60], "a string")
-        poses.append(parse_matrix(f"{file}: frames[{i}]", "transform_matrix", entry["transform_matrix"]))
-    rigid = checks.check_poses(file, "frames[{}].transform_matrix", np.stack(poses))
-    c2w = in_other_frame(
-        torch.from_numpy(opengl_to_opencv(rigid)), torch.from_numpy(undo_applied(file, content))
-    ).numpy()
+            raise InputError(where, "file_path", repr(entry["file_path"])[:60], "a string")
+        poses.append(parse_matrix(where, "transform_matrix", entry["transform_matrix"]))
+    rigid = torch.from_numpy(opengl_to_opencv(checks.check_poses(file, "frames[{}].transform_matrix", np.stack(poses))))
+    c2w = in_other_frame(rigid, torch.from_numpy(undo_applied(file, content))).numpy()
     if unused := sorted({*content, *(key for entry in entries for key in entry)} - USED):
         log.info("%s: keys that are not used: %s", file, ", ".join(unused))
     own = [{key: value for key, value in entry.items() if value is not None} for entry in entries]
-    return [Frame(f"{file}: frames[{i}]", {**content, **own[i]}, c2w[i]) for i in range(len(entries))]
+    return [Frame(where, {**content, **values}, pose) for where, values, pose in zip(places, own, c2w, strict=True)]
 
 
 def parse_matrix(where: object, key: str, value: Any) -> Float[np.ndarray, "4 4"]:
@@ -110,54 +108,45 @@ def undo_applied(file: Path, content: Mapping[str, Any]) -> Float[np.ndarray, "4
 
 def read_size(frame: Frame) -> tuple[int, int] | None:
     """Width and height in pixels that a file states for a camera, None where it states none."""
-    width, height = frame.number("w"), frame.number("h")
-    if width is None or height is None:
-        return None
-    if min(width, height) < 1:
-        raise InputError(frame.where, "w, h", f"{width:g}x{height:g}", "the pixels of a photo")
-    return round(width), round(height)
+    width, height = round(frame.number("w", 0)), round(frame.number("h", 0))
+    if min(width, height) < 0:
+        raise InputError(frame.where, "w, h", f"{width}x{height}", "the pixels of a photo")
+    return (width, height) if width and height else None
 
 
 def read_optics(frame: Frame, width: int, height: int) -> Intrinsics:
     """Intrinsics of one frame for photos of a size, in pixels of that size."""
-    values = frame.values
-    model = values.get("camera_model") or "OPENCV"
+    model = frame.values.get("camera_model") or "OPENCV"
+    if model not in (*PERSPECTIVE, *FISHEYE, EQUIRECTANGULAR):
+        expected = f"one of {', '.join((*PERSPECTIVE, *FISHEYE, EQUIRECTANGULAR))}"
+        raise InputError(frame.where, "camera_model", repr(model)[:60], expected)
     if model == EQUIRECTANGULAR:
         if abs(width - 2 * height) > 2:
             found, expected = f"{model} of {width}x{height} pixels", "photos twice as wide as high, of all directions"
             raise InputError(frame.where, "camera_model", found, expected)
         return equirectangular(width, height)
-    if model not in (*PERSPECTIVE, *FISHEYE):
-        expected = f"one of {', '.join((*PERSPECTIVE, *FISHEYE, EQUIRECTANGULAR))}"
-        raise InputError(frame.where, "camera_model", repr(model)[:60], expected)
-    fisheye = model in FISHEYE or bool(values.get("is_fisheye"))
+    fisheye = model in FISHEYE or bool(frame.values.get("is_fisheye"))
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2")
     for key in REFUSED if fisheye else (*REFUSED, "k4"):
-        value = values.get(key)
+        value = frame.values.get(key)
         if any(value) if isinstance(value, list) else value not in (None, False, 0, "0"):
             expected = f"at most {', '.join(names)}"
             raise InputError(frame.where, key, repr(value)[:60], expected, "calibrate or export with these alone")
-    found_x, found_y = read_focal(frame, "x", width, fisheye), read_focal(frame, "y", height, fisheye)
-    fx, fy = found_x or found_y, found_y or found_x
-    if fx is None or fy is None:
-        found = f"no focal length among [{', '.join(sorted(values))}]"
+    fx, fy = read_focal(frame, "x", width, fisheye), read_focal(frame, "y", height, fisheye)
+    if not (fx := fx or fy) or not (fy := fy or fx):
+        found = f"no focal length among [{', '.join(sorted(frame.values))}]"
         raise InputError(frame.where, "fl_x", found, "fl_x in pixels or camera_angle_x in radians")
-    cx, cy = frame.number("cx"), frame.number("cy")
-    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
-    distortion = Distortion(**{key: frame.number(key) or 0.0 for key in names})
+    distortion = Distortion(**{key: frame.number(key, 0.0) for key in names})
     projection = Projection.FISHEYE if fisheye else Projection.PERSPECTIVE
+    cx, cy = frame.number("cx", width / 2), frame.number("cy", height / 2)
     return checks.check_optics(frame.where, "", Intrinsics(width, height, fx, fy, cx, cy, distortion, projection))
 
 
-def read_focal(frame: Frame, axis: str, side: int, fisheye: bool) -> float | None:
-    """Focal length along an axis in pixels: `fl_x` first, then `camera_angle_x` in radians, then `x_fov` in degrees."""
-    given, angle, degrees = (frame.number(key) for key in (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov"))
-    if given is not None:
+def read_focal(frame: Frame, axis: str, side: int, fisheye: bool) -> float:
+    """Focal length along an axis in pixels: `fl_x` first, then `camera_angle_x` in radians, then `x_fov` in degrees; else 0."""
+    angle = frame.number(f"camera_angle_{axis}", math.radians(frame.number(f"{axis}_fov", 0.0)))
+    if (given := frame.number(f"fl_{axis}", 0.0)) or not angle:
         return given
-    if angle is None and degrees is not None:
-        angle = math.radians(degrees)
-    if angle is None:
-        return None
     if not MIN_ANGLE < angle < math.pi:
         raise InputError(frame.where, f"camera_angle_{axis}", f"{angle:g}", "radians, between 0 and pi")
     return side / (angle if fisheye else 2 * math.tan(0.5 * angle))

@@ -34,10 +34,9 @@ def load_llff(folder: Path, name: str | None = None, options: PhotoLoadOptions =
         InputError: a damaged file, or as many photos as poses are not there.
     """
     path = folder / POSES
-    rows = read_npy(path)
-    if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or rows.dtype.kind not in "iuf":
-        raise InputError(path, "", f"shape {rows.shape}, {rows.dtype}", "numbers of shape (photos, 17)")
-    rows = rows.astype(np.float64)
+    rows = checks.parse_floats(path, "", read_npy(path))
+    if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
+        raise InputError(path, "", f"shape {rows.shape}", "numbers of shape (photos, 17)")
     columns = rows[:, :15].reshape(-1, 3, 5)
     c2w = np.tile(np.eye(4), (len(rows), 1, 1))
     c2w[:, :3] = columns[:, :, [1, 0, 2, 3]] * [1, 1, -1, 1]

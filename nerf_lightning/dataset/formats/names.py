@@ -1,6 +1,5 @@
 """Resolves the file names that scene files contain to the files on this disk."""
 
-import itertools
 import logging
 import os
 import re
@@ -29,20 +28,33 @@ def is_image(name: str) -> bool:
     return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith(".")
 
 
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """A key that sorts photo 9 before photo 10."""
+    parts = filter(None, re.split(r"(\d+)", name.lower()))
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
+
+
 def list_images(folder: Path) -> list[Path]:
     """The image files of a folder, sorted by name."""
     return sorted(file for file in folder.iterdir() if is_image(file.name) and file.is_file())
 
 
-def split_name(name: str) -> tuple[str, ...]:
-    """The parts of a path as any system writes it: separated by / or \\, without drive, root and `.` parts."""
-    parts = PurePosixPath(name.replace("\\", "/")).parts
-    return tuple(part for part in parts if part not in ("/", "//", ".") and not part.endswith(":"))
+def walk_images(root: Path) -> Iterator[Path]:
+    """All image files below a folder, hidden ones and hidden folders left out."""
+    count = 0
+    for folder, folders, files in os.walk(root):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        count += len(files)
+        if count > MAX_FILES:
+            return
+        yield from (Path(folder, name) for name in sorted(files) if is_image(name))
 
 
 def fold_name(name: str) -> tuple[str, ...]:
-    """The parts of a path under Unicode (NFC) and case folding, the last without an image's extension."""
-    parts = split_name(unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold()))
+    """The parts of a path as any system writes it, without drive, root and `.` parts, under Unicode (NFC) and case folding;
+    the last without an image's extension."""
+    name = unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold()).replace("\\", "/")
+    parts = tuple(part for part in PurePosixPath(name).parts if part not in ("/", "//") and not part.endswith(":"))
     if parts and (suffix := PurePosixPath(parts[-1]).suffix) in IMAGE_SUFFIXES:
         return (*parts[:-1], parts[-1].removesuffix(suffix))
     return parts
@@ -50,22 +62,16 @@ def fold_name(name: str) -> tuple[str, ...]:
 
 def exact_file(root: Path, name: str) -> Path | None:
     """The file at a path relative to a folder, whose extension may be missing, as Blender exports leave it."""
-    for suffix in ("", *IMAGE_SUFFIXES, *(suffix.upper() for suffix in IMAGE_SUFFIXES)):
-        try:
-            if (candidate := root / (name + suffix)).is_file():
-                return candidate
-        except (OSError, ValueError):  # a name too long, or with a zero byte
-            return None
-    return None
+    suffixes = ("", *IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES))
+    return next((file for suffix in suffixes if os.path.isfile(file := root / (name + suffix))), None)
 
 
 def find_images(root: Path, names: Sequence[str], where: object) -> list[Path | None]:
     """The image files that a scene file names; None where there is none.
 
     A name means the file at that path relative to `root`; or else the one file below `root`, meant by no other name, whose
-    base name, and as many of its folders as possible, are the same under Unicode and case folding, with any separators and
-    apart from the extension. Reduced copies, masks and depth maps count only where nothing else has the name. A line says
-    which names were substituted.
+    base name, and as many of its folders as possible, are the same under `fold_name`. Reduced copies, masks and depth maps
+    count only where nothing else has the name. A line says which names were substituted.
 
     Args:
         root: folder that names are relative to.
@@ -77,48 +83,45 @@ def find_images(root: Path, names: Sequence[str], where: object) -> list[Path | 
     """
     found = {name: exact_file(root, name) for name in names}
     inexact = [name for name, file in found.items() if file is None]
-    free: dict[str, list[Path]] = {}
+    exact, free = set(found.values()), dict[str, list[Path]]()
     for file in walk_images(root) if inexact else ():
-        if file not in found.values():
+        if file not in exact:
             free.setdefault(fold_name(file.name)[-1], []).append(file)
-    owners: dict[Path, tuple[int, str]] = {}
+    claims: dict[Path, list[tuple[int, str]]] = {}
     for name in inexact:
         if (closest := _find_closest(root, name, free, where)) is not None:
             file, length = closest
-            longest, owner = owners.get(file, (0, name))
-            if length == longest:
-                found_text = f"{owner!r} and {name!r}, of which only {file.relative_to(root)} is there"
-                raise InputError(where, "", found_text, "a photo for each", "is the folder of photos complete?")
-            if length > longest:
-                owners[file] = length, name
-    found |= {name: file for file, (_, name) in owners.items()}
-    moved = {name: file for file, (_, name) in owners.items() if root / Path(*split_name(name)) != file}
-    for name, file in list(moved.items())[:1]:
+            claims.setdefault(file, []).append((length, name))
+    moved = []
+    for file, claimants in claims.items():
+        (length, name), *others = sorted(claimants, reverse=True)
+        if others and others[0][0] == length:
+            both = f"{others[0][1]!r} and {name!r}, of which only {file.relative_to(root)} is there"
+            raise InputError(where, "", both, "a photo for each", "is the folder of photos complete?")
+        found[name] = file
+        inside = file.relative_to(root)
+        if PurePosixPath(name.replace("\\", "/")) not in (inside, inside.with_suffix("")):
+            moved.append((inside.as_posix(), name))
+    if moved:
         text = "%s: %d names are not those of the files on disk; taken by their base names, such as %s for %r"
-        log.warning(text, where, len(moved), file.relative_to(root).as_posix(), name)
+        log.warning(text, where, len(moved), *moved[0])
     return [found[name] for name in names]
 
 
 def _find_closest(root: Path, name: str, free: Mapping[str, list[Path]], where: object) -> tuple[Path, int] | None:
     """The file whose folded path shares most parts with a name, from the last on, and how many."""
     wanted = fold_name(name)
-    found = free.get(wanted[-1], []) if wanted else []
-    folders = {file: file.relative_to(root).parts[:-1] for file in found}
-    photos = [file for file in found if not any(map(OTHER_FOLDERS.match, folders[file]))] or found
-    lengths = [_count_shared(wanted, fold_name(file.relative_to(root).as_posix())) for file in photos]
-    best = [file for file, length in zip(photos, lengths, strict=True) if length == max(lengths)]
-    same_suffix = [file for file in best if file.suffix.lower() == PurePosixPath(name).suffix.lower()]
-    best = same_suffix if len(same_suffix) == 1 else best
+    ranks = {}
+    for file in free.get(wanted[-1], []) if wanted else []:
+        own = fold_name(str(inside := file.relative_to(root)))
+        shared = len(os.path.commonprefix([wanted[::-1], own[::-1]]))
+        is_photo = not any(map(OTHER_FOLDERS.match, inside.parts[:-1]))
+        ranks[file] = (shared, is_photo, file.suffix.lower() == PurePosixPath(name).suffix.lower())
+    best = [file for file, rank in ranks.items() if rank == max(ranks.values())]
     if len(best) > 1:
         shown = ", ".join(file.relative_to(root).as_posix() for file in best[:MAX_SHOWN])
         raise InputError(where, "", f"{name!r}, which may mean {len(best)} files: {shown}", "the path of one file")
-    return (best[0], max(lengths)) if best else None
-
-
-def _count_shared(wanted: tuple[str, ...], own: tuple[str, ...]) -> int:
-    """How many parts, from the last on, two paths share."""
-    pairs = zip(reversed(wanted), reversed(own), strict=False)
-    return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
+    return (best[0], ranks[best[0]][0]) if best else None
 
 
 @runtime_checkable
@@ -140,16 +143,3 @@ def keep_present(where: object, photos: Sequence[Photo], files: Sequence[Path | 
         shown = join_truncated(missing, MAX_SHOWN)
         log.warning("%s: %d of %d photos are not there, %s: left out", where, len(missing), len(photos), shown)
     return [(photo, file) for photo, file in zip(photos, files, strict=True) if file is not None]
-
-
-def walk_images(root: Path) -> Iterator[Path]:
-    """All image files below a folder, hidden ones and hidden folders left out."""
-    count = 0
-    for folder, folders, files in os.walk(root):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for name in sorted(files):
-            count += 1
-            if count > MAX_FILES:
-                return
-            if is_image(name):
-                yield Path(folder, name)

@@ -49,22 +49,21 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
         InputError: anything missing, malformed or contradictory.
     """
     data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS))
-    _check_shapes(path, data)
-    count, height, width, channels = data["images_train"].shape
+    checks.require_keys(path, data, NEEDED)
+    images = {key: read_images(path, key, data) for key in PAIRS if key in data}
+    count, height, width, channels = images["images_train"].shape
     size = fit_size(width, height, choose_resize(path, [(width, height)] * count, channels, options.resize))
-    K = _intrinsics(path, data, width, height)
+    K = read_intrinsics(path, data, width, height)
 
     def read_poses(key: str) -> Cameras:
-        c2w = checks.check_poses(path, key + "[{}]", data[key])
-        checks.check_split_size(path, key, len(c2w))
-        return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height).resized(size)
+        c2w = torch.from_numpy(checks.check_poses(path, key + "[{}]", data[key]))
+        return Cameras.of_size(K.repeat(len(c2w), 1, 1), c2w, width, height).resized(size)
 
-    def read_views(key: str) -> Views:
-        images = _bytes(path, key, data[key])
-        images = images if size == (width, height) else np.stack([area_resize(image, *size) for image in images])
-        return Views.of(torch.from_numpy(images), read_poses(PAIRS[key]))
+    def make_views(key: str, stack: UInt8[np.ndarray, "V H W C"]) -> Views:
+        resized = stack if size == (width, height) else np.stack([area_resize(image, *size) for image in stack])
+        return Views.of(torch.from_numpy(resized), read_poses(PAIRS[key]))
 
-    train, *held_out = (read_views(key) for key in PAIRS if key in data)
+    train, *held_out = (make_views(key, stack) for key, stack in images.items())
     if not held_out:
         log.warning("%s: no held-out photos: every %d-th training photo is held out", path, options.holdout)
         split = split_shots(path, len(train), options.holdout)
@@ -76,8 +75,8 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     hints = Hints(
         keep_frame=True,
         path=read_poses("c2ws_test") if has_path else None,
-        background=_background(path, data["background"]) if "background" in data else None,
-        bounds=_bounds(path, data, options),
+        background=read_background(path, data["background"]) if "background" in data else None,
+        bounds=read_bounds(path, data, options) if "aabb" in data else None,
         to_source=checks.check_similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,
         near=near,
         far=far,
@@ -86,24 +85,18 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     return assemble_scene(path, name, [train, *held_out], options, hints)
 
 
-def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    checks.require_keys(path, arrays, NEEDED)
-    one = arrays["images_train"].shape[1:]
-    for key in (key for key in PAIRS if key in arrays):
-        checks.require_keys(path, arrays, [PAIRS[key]])
-        (count, *shape), dtype = arrays[key].shape or (0,), arrays[key].dtype
-        if len(shape) != 3 or shape[2] not in (3, 4) or 0 in shape or (dtype != np.uint8 and dtype.kind != "f"):
-            expected = "images of shape (V, H, W, 3 or 4), uint8 or floats in [0, 1]"
-            raise InputError(path, key, f"shape {arrays[key].shape}, {dtype}", expected)
-        if tuple(shape) != one:
-            raise InputError(path, key, f"shape {arrays[key].shape}", f"images of shape {one}, as in images_train")
-        checks.check_split_size(path, key, count)
-        if (poses := arrays[PAIRS[key]].shape[:1]) != (count,):
-            raise InputError(path, key, f"{count} images for {math.prod(poses)} poses", "one pose for each image")
-
-
-def _bytes(path: Path, key: str, images: Shaped[np.ndarray, "V H W C"]) -> UInt8[np.ndarray, "V H W C"]:
-    """Images as uint8; floats in [0, 1] are scaled and rounded."""
+def read_images(path: Path, key: str, data: Mapping[str, np.ndarray]) -> UInt8[np.ndarray, "V H W C"]:
+    """The images of a split as uint8; floats in [0, 1] are scaled and rounded."""
+    images, one = data[key], data["images_train"].shape[1:]
+    checks.require_keys(path, data, [PAIRS[key]])
+    if images.ndim != 4 or images.shape[3] not in (3, 4) or (images.dtype != np.uint8 and images.dtype.kind != "f"):
+        expected = "images of shape (V, H, W, 3 or 4), uint8 or floats in [0, 1]"
+        raise InputError(path, key, f"shape {images.shape}, {images.dtype}", expected)
+    checks.check_split_size(path, key, images.size)
+    if images.shape[1:] != one:
+        raise InputError(path, key, f"shape {images.shape}", f"images of shape {one}, as in images_train")
+    if (poses := data[PAIRS[key]].shape[:1]) != images.shape[:1]:
+        raise InputError(path, key, f"{len(images)} images for {math.prod(poses)} poses", "one pose for each image")
     if images.dtype == np.uint8:
         return images
     if not (images.min() >= 0 and images.max() <= 1):  # false for nan too
@@ -111,17 +104,17 @@ def _bytes(path: Path, key: str, images: Shaped[np.ndarray, "V H W C"]) -> UInt8
     return np.rint(images * 255).astype(np.uint8)
 
 
-def _intrinsics(path: Path, data: Mapping[str, np.ndarray], width: int, height: int) -> Float[Tensor, "3 3"]:
+def read_intrinsics(path: Path, data: Mapping[str, np.ndarray], width: int, height: int) -> Float[Tensor, "3 3"]:
     """Of all views, pixels."""
-    if "K" in data:
-        return torch.from_numpy(checks.check_intrinsics(path, "K", data["K"], width, height)).float()
-    checks.require_keys(path, data, ["focal"])
-    focal = checks.parse_number(path, "focal", data["focal"])
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return torch.from_numpy(checks.check_intrinsics(path, "focal", K, width, height)).float()
+    key, K = "K", data.get("K")
+    if K is None:
+        checks.require_keys(path, data, ["focal"])
+        key, focal = "focal", checks.parse_number(path, "focal", data["focal"])
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return torch.from_numpy(checks.check_intrinsics(path, key, K, width, height)).float()
 
 
-def _background(path: Path, colour: Shaped[np.ndarray, "..."]) -> tuple[float, float, float]:
+def read_background(path: Path, colour: Shaped[np.ndarray, "..."]) -> tuple[float, float, float]:
     """sRGB in [0, 1]."""
     red, green, blue = checks.parse_array(path, "background", colour, 3).tolist()
     if min(red, green, blue) < 0 or max(red, green, blue) > 1:
@@ -129,12 +122,10 @@ def _background(path: Path, colour: Shaped[np.ndarray, "..."]) -> tuple[float, f
     return red, green, blue
 
 
-def _bounds(path: Path, data: Mapping[str, np.ndarray], options: PhotoLoadOptions) -> Bounds | None:
+def read_bounds(path: Path, data: Mapping[str, np.ndarray], options: PhotoLoadOptions) -> Bounds:
     """The box that a file states."""
-    if "aabb" not in data:
-        return None
     aabb = torch.from_numpy(checks.check_box(path, "aabb", data["aabb"])).float()
-    unbounded = bool(checks.parse_number(path, "unbounded", data.get("unbounded", np.array(0))))
+    unbounded = bool(checks.parse_number(path, "unbounded", data.get("unbounded", 0)))
     return Bounds(aabb, unbounded if options.bounded == "auto" else options.bounded == "false")
 
 
@@ -148,7 +139,7 @@ def save_npz(scene: Scene, path: Path) -> None:
     for cameras in (scene.train.cameras, scene.val.cameras, scene.orbit):
         if not torch.equal(cameras.K, K.expand_as(cameras.K)):
             raise InputError(path, "K", "views with different intrinsics", "one K for all views of an .npz scene")
-    arrays: dict[str, Tensor] = {
+    arrays: dict[str, Any] = {
         "images_train": scene.train.images,
         "c2ws_train": scene.train.cameras.c2w,
         "images_val": scene.val.images,
@@ -157,16 +148,12 @@ def save_npz(scene: Scene, path: Path) -> None:
         "focal": K[0, 0],
         "K": K,
         "aabb": scene.bounds.aabb,
+        "unbounded": scene.bounds.unbounded,
+        "to_source": scene.to_source,
+        "near": scene.bounds.near,
+        "far": scene.bounds.far,
+        "background": scene.background if any(scene.background) else None,
     }
-    for key in ("near", "far"):
-        if (value := getattr(scene.bounds, key)) is not None:
-            arrays[key] = torch.tensor(value, dtype=torch.float64)
-    if scene.bounds.unbounded:
-        arrays["unbounded"] = torch.tensor(True)
-    if any(scene.background):
-        arrays["background"] = torch.tensor(scene.background, dtype=torch.float64)
-    if not torch.equal(scene.to_source, torch.eye(4, dtype=torch.float64)):
-        arrays["to_source"] = scene.to_source
-    content: dict[str, Any] = {key: array.numpy() for key, array in arrays.items()}
+    content: dict[str, Any] = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
     with atomic(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **content)

@@ -15,7 +15,7 @@ from nerf_lightning.dataset.formats.names import find_images, fold_name, keep_pr
 from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.orientation import choose_orientations
-from nerf_lightning.dataset.posed import Hints, Split, build_scene, split_shots
+from nerf_lightning.dataset.posed import Hints, Split, build_scene
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions, Shot
 from nerf_lightning.errors import InputError
@@ -23,8 +23,6 @@ from nerf_lightning.errors import InputError
 log = logging.getLogger(__name__)
 
 WHITE = (1.0, 1.0, 1.0)
-Photo = tuple[Frame, Path]
-"""A frame, and its file."""
 
 
 def load_transforms(path: Path, name: str | None = None, options: PhotoLoadOptions = AS_IT_IS) -> Scene:
@@ -45,8 +43,8 @@ def load_transforms(path: Path, name: str | None = None, options: PhotoLoadOptio
     frames = sorted(read_frames(file), key=lambda frame: frame.name)
     names = [frame.name for frame in frames]
     photos = keep_present(file, frames, find_images(file.parent, names, file))
-    folder = file.resolve().parent
     split = read_split(file, frames[0].values, names, [frame.name for frame, _ in photos])
+    folder = file.resolve().parent
     shots = make_shots(file, photos, folder, options)
     return build_scene(path, name or (folder.name if file.stem == "transforms" else file.stem), shots, options, split)
 
@@ -66,31 +64,29 @@ def load_blender(folder: Path, name: str | None = None, options: PhotoLoadOption
     Raises:
         InputError: anything missing or malformed.
     """
-    files = {split: folder / f"transforms_{split}.json" for split in ("train", "val", "test")}
-    splits = {split: read_frames(file) for split, file in files.items() if split == "train" or file.is_file()}
+    splits = {"train": read_frames(folder / "transforms_train.json")}
+    for split in ("val", "test"):
+        if (file := folder / f"transforms_{split}.json").is_file():
+            splits[split] = read_frames(file)
     names = [frame.name for frames in splits.values() for frame in frames]
     found = dict(zip(names, find_images(folder, names, folder), strict=True))
-    path: Sequence[Frame] | None = None
-    parts: dict[str, list[int]] = {}
-    photos: list[Photo] = []
+    path: list[Frame] = []
+    parts: list[list[int]] = []
+    photos: list[tuple[Frame, Path]] = []
     for split, frames in splits.items():
-        images = [found[frame.name] for frame in frames]
-        if split != "train" and not any(images):
-            log.warning("%s: none of its %d photos is there: taken as a camera path", files[split], len(frames))
-            path = frames if path is None or split == "test" else path
+        files = [found[frame.name] for frame in frames]
+        if split != "train" and not any(files):
+            log.warning("%s: none of its %d photos is there: taken as a camera path", split, len(frames))
+            path = frames
             continue
-        present = keep_present(files[split], frames, images)
-        parts[split] = list(range(len(photos), len(photos) + len(present)))
+        present = keep_present(folder / f"transforms_{split}.json", frames, files)
+        parts.append(list(range(len(photos), len(photos) + len(present))))
         photos += present
     shots = make_shots(folder, photos, folder, options)
-    train, *held_out = parts.values()
-    if held_out:
-        parted = Split(train, *held_out)
-    else:
-        parted = split_shots(folder, len(photos), options.holdout)
+    if len(parts) == 1:
         log.warning("%s: no held-out photos: every %d-th training photo is held out", folder, options.holdout)
-    cameras = None if path is None else make_path(path, shots[0].optics)
-    hints = Hints(alpha_background=WHITE, keep_frame=True, path=cameras)
+    parted = Split(*parts) if parts[1:] else None
+    hints = Hints(WHITE, keep_frame=True, path=make_path(path, shots[0].optics) if path else None)
     return build_scene(folder, name or folder.resolve().name, shots, options, parted, hints)
 
 
@@ -106,33 +102,32 @@ def read_split(file: Path, content: Mapping[str, Any], names: Sequence[str], pre
     Raises:
         InputError: names that are no frame's, or photos in two parts of it.
     """
-    named: dict[str, list[int]] = {}
+    known, named = {fold_name(name) for name in names}, dict[str, list[int]]()
     for part in ("train", "val", "test"):
-        key = f"{part}_filenames"
-        given = content.get(key) or []
+        given = content.get(key := f"{part}_filenames") or []
         if not isinstance(given, list) or not all(isinstance(item, str) for item in given):
             raise InputError(file, key, repr(given)[:60], "a list of file_path strings")
-        folded = {fold_name(item): item for item in given}
-        if strangers := folded.keys() - set(map(fold_name, names)):
-            raise InputError(file, key, f"{folded[min(strangers)]!r}, which is no frame", "the file_path of a frame")
-        if given:
-            named[part] = [i for i, name in enumerate(present) if fold_name(name) in folded]
+        if strangers := [item for item in given if fold_name(item) not in known]:
+            raise InputError(file, key, f"{strangers[0]!r}, which is no frame", "the file_path of a frame")
+        if wanted := {fold_name(item) for item in given}:
+            named[part] = [i for i, name in enumerate(present) if fold_name(name) in wanted]
     if not named:
         return None
-    rest = [i for i in range(len(present)) if not any(i in part for part in named.values())]
+    rest = sorted(set(range(len(present))).difference(*named.values()))
     train = named.get("train", rest)
     val, *test = [named[part] for part in ("val", "test") if named.get(part)] or [rest]
-    if both := sorted(set(train) & {*val, *(i for part in test for i in part)}):
-        found = f"{present[both[0]]!r}, which is in train_filenames too"
-        raise InputError(file, "val_filenames, test_filenames", found, "held-out photos of their own")
+    if both := set(train) & {*val, *(i for part in test for i in part)}:
+        twice = f"{present[min(both)]!r}, which is in train_filenames too"
+        raise InputError(file, "val_filenames, test_filenames", twice, "held-out photos of their own")
     return Split(train, val, *(part for part in test if part != val))
 
 
-def make_shots(source: Path, photos: Sequence[Photo], folder: Path, options: PhotoLoadOptions) -> list[Shot]:
+def make_shots(
+    source: Path, photos: Sequence[tuple[Frame, Path]], folder: Path, options: PhotoLoadOptions
+) -> list[Shot]:
     """Posed photos with their intrinsics and masks."""
-    files = [file for _, file in photos]
     stated = [read_size(frame) for frame, _ in photos]
-    turned = choose_orientations(source, files, stated, options.orientation)
+    turned = choose_orientations(source, [file for _, file in photos], stated, options.orientation)
     masks = read_masks(source, photos, folder)
     shots = []
     for (frame, file), size, upright, mask in zip(photos, stated, turned, masks, strict=True):
@@ -141,20 +136,19 @@ def make_shots(source: Path, photos: Sequence[Photo], folder: Path, options: Pho
     return shots
 
 
-def read_masks(source: Path, photos: Sequence[Photo], folder: Path) -> list[Path | None]:
+def read_masks(source: Path, photos: Sequence[tuple[Frame, Path]], folder: Path) -> list[Path | None]:
     """The masks that frames name, or else those found beside the photos."""
-    named = {frame.where: name for frame, _ in photos if (name := frame.values.get("mask_path")) is not None}
-    if not named:
+    names = [frame.values.get("mask_path") for frame, _ in photos]
+    if not any(names):
         return find_masks([file for _, file in photos], folder)
-    for where, name in named.items():
-        if not isinstance(name, str):
-            raise InputError(where, "mask_path", repr(name)[:60], "a string")
-    found = dict(zip(named, find_images(folder, list(named.values()), source), strict=True))
-    for where, file in found.items():
-        if file is None:
+    named = [str(name) for name in names if name]
+    found = dict(zip(named, find_images(folder, named, source), strict=True))
+    masks = [found.get(str(name)) for name in names]
+    for (frame, _), name, mask in zip(photos, names, masks, strict=True):
+        if name and mask is None:
             expected = "an image, white where the photo is kept"
-            raise InputError(where, "mask_path", f"{named[where]!r}, which is not there", expected)
-    return [found.get(frame.where) for frame, _ in photos]
+            raise InputError(frame.where, "mask_path", f"{name!r}, which is not there", expected)
+    return masks
 
 
 def make_path(frames: Sequence[Frame], optics: Intrinsics) -> Cameras:

@@ -1,6 +1,5 @@
 """Mistakes that people make with the cameras of a file."""
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
@@ -9,13 +8,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from nerf_lightning.dataset.formats.names import natural_key
+
 Rotations = Float[np.ndarray, "V 3 3"]
 Poses = Float[np.ndarray, "V 4 4"]
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 """Camera axes of OpenGL in OpenCV's, and the reverse."""
-SIDEWAYS = "turn them, as dataset.orientation=exif does where their EXIF data say so"
-"""What to do about photos that lie on their sides."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +37,16 @@ def list_conventions(c2w: Poses) -> Iterator[Hypothesis]:
     Args:
         c2w: as read, OpenCV, in the file's world frame.
     """
-    rotation, centre = c2w[:, :3, :3], c2w[:, :3, 3]
+    rotation, centre = c2w[:, :3, :3], c2w[:, :3, 3:]
     transposed = rotation.transpose(0, 2, 1)
-    of_inverse = _apply(-transposed, centre)
+    of_inverse = -transposed @ centre
     flips, changes = (np.eye(3), FLIP), list_axis_changes()[1:]
 
     def suppose(
-        found: str, todo: str, rotation: Rotations, centre: Float[np.ndarray, "V 3"], rare: bool = False
+        found: str, todo: str, rotation: Rotations, centre: Float[np.ndarray, "V 3 1"], rare: bool = False
     ) -> Hypothesis:
-        moved = np.tile(np.eye(4), (len(rotation), 1, 1))
-        moved[:, :3, :3], moved[:, :3, 3] = rotation, centre
+        moved = c2w.copy()
+        moved[:, :3] = np.concatenate([rotation, centre], axis=2)
         return Hypothesis(found, todo, moved, rare=rare)
 
     axes = "camera axes of the other convention: OpenCV has y down and z forward, OpenGL y up and z backward"
@@ -61,13 +60,14 @@ def list_conventions(c2w: Poses) -> Iterator[Hypothesis]:
     for flip in flips:
         found = "camera-to-world rotations beside translations of world-to-camera matrices"
         todo = "put the cameras' centres -R t in the fourth column"
-        yield suppose(found, todo, rotation, _apply(-rotation @ flip, centre))
+        yield suppose(found, todo, rotation, -rotation @ flip @ centre)
     for change in changes:
         if np.linalg.det(change) < 0:
             found = "a mirrored world: left-handed axes, or photos that are flipped"
             todo = "negate one axis, of the world and of the cameras, or flip the photos back"
         elif change[2, 2] == 1:
-            found, todo = "photos that lie on their sides or upside down in their cameras", SIDEWAYS
+            found = "photos that lie on their sides or upside down in their cameras"
+            todo = "turn them, as dataset.orientation=exif does where their EXIF data say so"
         else:
             found, todo = "camera axes in another order", "the columns of a rotation are the camera's axes in the world"
         yield suppose(found, todo, rotation @ change, centre, rare=bool(change[2, 2] != 1))
@@ -77,14 +77,10 @@ def list_conventions(c2w: Poses) -> Iterator[Hypothesis]:
         for flip in flips:
             yield suppose(found, todo, roll_quaternions(rotation @ flip, backward) @ flip, centre)
         turned = roll_quaternions(transposed, backward).transpose(0, 2, 1)
-        yield suppose(found, todo, turned, _apply(-turned, of_inverse))  # world-to-camera poses keep their translations
+        yield suppose(found, todo, turned, -turned @ of_inverse)  # world-to-camera poses keep their translations
     for flip, change in product(flips, changes):
         found, todo = "centres in another world frame than rotations", "turn both alike"
-        yield suppose(found, todo, rotation @ flip, centre @ change.T, rare=True)
-
-
-def _apply(matrices: Rotations, vectors: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
-    return (matrices @ vectors[..., None])[..., 0]
+        yield suppose(found, todo, rotation @ flip, change @ centre, rare=True)
 
 
 def list_axis_changes() -> list[Float[np.ndarray, "3 3"]]:
@@ -113,7 +109,7 @@ def list_orders(names: Sequence[str], c2w: Poses, kept: Int[np.ndarray, "K"]) ->
     """
     every = range(len(names))
     alphabetical = np.array(sorted(every, key=lambda i: names[i]))
-    numeric = np.array(sorted(every, key=lambda i: _split_numbers(names[i])))
+    numeric = np.array(sorted(every, key=lambda i: natural_key(names[i])))
 
     def suppose(found: str, source: Int[np.ndarray, "V"], target: Int[np.ndarray, "V"]) -> Hypothesis:
         moved = c2w.copy()
@@ -130,8 +126,3 @@ def list_orders(names: Sequence[str], c2w: Poses, kept: Int[np.ndarray, "K"]) ->
     if (alphabetical != numeric).any():
         yield suppose(found, alphabetical, numeric)
         yield suppose(found, numeric, alphabetical)
-
-
-def _split_numbers(name: str) -> list[tuple[int, str]]:
-    """Sorts numbers in a name by their value."""
-    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]

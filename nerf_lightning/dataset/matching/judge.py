@@ -95,8 +95,11 @@ def judge_cameras(scene: Scene) -> tuple[list[Doubt], bool]:
         needed = max(chance + MIN_DEVIATIONS * float(shuffled.std()), MIN_SHARE, free - MAX_GAP)
         names = [*scene.train.names, *scene.val.names] or [f"{i:06}" for i in range(len(scene.train))]
         best, share = choose_best(matches, [*list_conventions(c2w), *list_orders(names, every, kept), zoomed])
-        doubt = None if share < needed else compare(best, share, given)
-    doubt = doubt or wrong_focal(matches, c2w, zoomed, free)
+        doubt = compare(best, share, given, needed)
+    if doubt is None:
+        fine, share = (share_explained(matches, c2w, zoom, FINE_TOLERANCE) for zoom in (1.0, zoomed.zoom))
+        deviation = float(np.sqrt(share / len(matches.pair)))
+        doubt = compare(zoomed, share, fine, max(MIN_SHARE, free - MAX_GAP, fine + MIN_DEVIATIONS * deviation))
     if doubt is None and given < DOUBTED and free >= SURE:
         doubt = wrong_poses(matches, c2w, len(train))
     elif doubt is None and given < needed and len(trained) >= MANY_PAIRS:
@@ -142,20 +145,6 @@ def suppose_focal(matches: Matches, c2w: Poses, focal: float) -> Hypothesis:
     return Hypothesis(found, todo, c2w, zoom)
 
 
-def wrong_focal(matches: Matches, c2w: Poses, zoomed: Hypothesis, free: float) -> Doubt | None:
-    """Another focal length, if it explains clearly more.
-
-    Args:
-        matches, c2w: see `explain`.
-        zoomed: has it.
-        free: share of the matches that agree on epipolar geometries.
-    """
-    given, share = (share_explained(matches, c2w, zoom, FINE_TOLERANCE) for zoom in (1.0, zoomed.zoom))
-    deviation = np.sqrt(share / len(matches.pair))
-    least = max(MIN_SHARE, free - MAX_GAP, given + MIN_DEVIATIONS * deviation)
-    return None if share < least else compare(zoomed, share, given)
-
-
 def choose_best(matches: Matches, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, float]:
     """The first of the hypotheses that explain matches best, and the share that it explains."""
     best, share, quality = hypotheses[0], 0.0, 0.0
@@ -170,29 +159,24 @@ def choose_best(matches: Matches, hypotheses: Sequence[Hypothesis]) -> tuple[Hyp
     return best, share
 
 
-def compare(hypothesis: Hypothesis, share: float, given: float) -> Doubt | None:
-    """That the cameras as read explain too little beside a hypothesis, if they do."""
-    if given >= DOUBTED * share:
+def compare(hypothesis: Hypothesis, share: float, given: float, least: float) -> Doubt | None:
+    """That the cameras as read explain too little beside a hypothesis, if they do, and it explains at least so much."""
+    if share < least or given >= DOUBTED * share:
         return None
-    found = (
-        f"{hypothesis.found}: that explains {share:.0%} of the matches between photos, the cameras as read {given:.0%}"
-    )
-    return Doubt(found, hypothesis.todo, given < REFUTED * share)
+    explained = f"that explains {share:.0%} of the matches between photos, the cameras as read {given:.0%}"
+    return Doubt(f"{hypothesis.found}: {explained}", hypothesis.todo, given < REFUTED * share)
 
 
 def wrong_poses(matches: Matches, c2w: Poses, count: int) -> Doubt | None:
     """Poses that explain little more than those of other photos would."""
-    given, chance = (np.zeros(2), np.zeros(2))
-    for i, slack in enumerate((1.0, UNRELATED_TOLERANCE)):
-        given[i] = share_explained(matches, c2w, tolerance=slack)
-        chance[i] = shuffled_shares(matches, c2w, count, slack).mean()
+    slacks = (1.0, UNRELATED_TOLERANCE)
+    given = np.array([share_explained(matches, c2w, tolerance=slack) for slack in slacks])
+    chance = np.array([shuffled_shares(matches, c2w, count, slack).mean() for slack in slacks])
     skill, loose_skill = (given - chance) / (1 - chance)
     if skill >= INEXACT:
         return None
-    found = (
-        f"poses that explain {given[0]:.0%} of the matches between photos, while shuffled ones explain {chance[0]:.0%}:"
-        " they belong to other photos, or are inexact"
-    )
+    explained = f"poses that explain {given[0]:.0%} of the matches between photos, while shuffled ones explain"
+    found = f"{explained} {chance[0]:.0%}: they belong to other photos, or are inexact"
     unrelated = bool(loose_skill < UNRELATED)
     return Doubt(found, "check which pose belongs to which photo", unrelated, True, unrelated)
 

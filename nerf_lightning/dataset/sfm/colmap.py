@@ -6,15 +6,14 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from nerf_lightning.dataset.formats.decode import THREADS, read_pixels
-from nerf_lightning.dataset.formats.header import DAMAGED, DETAILS, read_header
+from nerf_lightning.dataset.formats.decode import DAMAGED, DETAILS, THREADS, read_header, read_pixels
 from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.utils.progress import counted, tracked
@@ -63,14 +62,11 @@ def reconstruct(photos: Sequence[Path], workspace: Path) -> "pycolmap.Reconstruc
     options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_PHOTOS, random_seed=0)
     (workspace / "models").mkdir()
     with counted(len(photos), "placing photos") as step:
-        models = pycolmap.incremental_mapping(
-            database,
-            copies,
-            workspace / "models",
-            options,
-            initial_image_pair_callback=lambda: step(2),
-            next_image_callback=lambda: step(1),
-        )
+        callbacks: dict[str, Any] = {
+            "initial_image_pair_callback": lambda: step(2),
+            "next_image_callback": lambda: step(1),
+        }
+        models = pycolmap.incremental_mapping(database, copies, workspace / "models", options, **callbacks)
     model = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     if model is not None:
         _make_full_size(model, photos, sizes)
@@ -202,13 +198,9 @@ def _write_copy(photo: Path, file: Path) -> tuple[tuple[int, int], bytes]:
 
 def lens_tags(photo: Path) -> bytes:
     """The EXIF tags of a photo that tell of its lens; where they are broken, or there are none, nothing is known."""
-    header = read_header(photo)
-    tags = {} if header is None else header.tags
-    kept = Image.Exif()
+    tags, kept = read_header(photo).tags, Image.Exif()
     try:
-        for tag in (MAKE, MODEL):
-            if tag in tags:
-                kept[tag] = str(tags[tag])
+        kept.update({tag: str(tags[tag]) for tag in (MAKE, MODEL) if tag in tags})
         if float(tags.get(FOCAL, 0)) > 0:
             kept.get_ifd(DETAILS)[FOCAL] = IFDRational(Fraction(float(tags[FOCAL])).limit_denominator(1000))
         if float(tags.get(FOCAL_35MM, 0)) > 0:

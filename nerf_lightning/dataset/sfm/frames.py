@@ -2,7 +2,9 @@
 
 import logging
 import math
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import imageio.v3 as imageio
@@ -12,12 +14,18 @@ from jaxtyping import Float, UInt8
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.dataset.sfm.cached import cached_folder
 from nerf_lightning.dataset.sfm.colmap import MIN_PHOTOS
-from nerf_lightning.dataset.sfm.video import decode
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.libraries import require
 from nerf_lightning.utils.parsing import existing_file
+from nerf_lightning.utils.progress import tracked
+
+if TYPE_CHECKING:
+    import av
 
 log = logging.getLogger(__name__)
 
+VIDEOS = {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv"}
+"""Files that are taken for videos."""
 MAX_FRAMES = 120
 """Taken of a video if nobody says how many: one for every three degrees of a full turn."""
 STEP_FRACTION = 0.01
@@ -32,15 +40,14 @@ JPEG_QUALITY = 95
 
 
 def extract_frames(video: Path) -> Path:
-    """The folder with a video's frames: `NAME_frames` beside the video, or in the cache where nothing can be written there.
+    """The folder with a video's frames, in the cache.
 
     Frames that are there and were made of the same video stay as they are: whoever deletes some does not get them back.
 
     Raises:
-        InputError: see `write_frames`; or a folder of somebody else has that name.
+        InputError: see `write_frames`.
     """
-    beside = video.with_name(f"{video.stem}_frames")
-    folder = cached_folder(beside, [existing_file(video)], lambda empty: write_frames(video, empty))
+    folder = cached_folder(video, [existing_file(video)], lambda empty: write_frames(video, empty))
     log.info("%s: %d frames are in %s", video, len(list(folder.glob("*.jpg"))), folder)
     return folder
 
@@ -68,6 +75,36 @@ def write_frames(video: Path, folder: Path, count: int | None = None) -> None:
         if index in chosen:
             upright = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90) % 4)  # phones set a flag
             imageio.imwrite(folder / f"{index:06d}.jpg", np.ascontiguousarray(upright), quality=JPEG_QUALITY)
+
+
+def decode(video: Path, words: str) -> Iterator["av.VideoFrame"]:
+    """Decodes all whole frames of a video's first picture stream, with a progress bar; memory holds a few.
+
+    Args:
+        video: of any kind that FFmpeg reads.
+        words: what the bar says.
+
+    Raises:
+        InputError: PyAV is not installed; no video, one without pictures, or a damaged one.
+    """
+    require("video", "av", purpose="the optional extra that reads videos", otherwise=", or give a folder of photos")
+    import av
+
+    try:
+        with av.open(str(video)) as container:
+            if not container.streams.video:
+                found = ", ".join(sorted({stream.type for stream in container.streams})) or "no stream"
+                raise InputError(video, "", f"only {found}", "a video with pictures")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            seconds = float(container.duration or 0) / av.time_base
+            total = max(1, stream.frames or round(seconds * float(stream.average_rate or 0)))
+            for frame in tracked(container.decode(stream), total, words):
+                if not frame.is_corrupt:  # FFmpeg paints over what is damaged
+                    yield frame
+    except av.FFmpegError as error:
+        found = f"something unreadable ({error.strerror})"
+        raise InputError(video, "", found, "a whole video", "copy it again, or save it as .mp4") from error
 
 
 def measure(video: Path) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:

@@ -1,12 +1,10 @@
 """A folder of photos: which files, in which order, and where their cameras stood."""
 
 import logging
-import re
 import tempfile
 from pathlib import Path
 
-from nerf_lightning.dataset.formats.colmap import PLACED_FOLDER
-from nerf_lightning.dataset.formats.names import list_images
+from nerf_lightning.dataset.formats.names import list_images, natural_key
 from nerf_lightning.dataset.sfm.cached import cached_folder
 from nerf_lightning.dataset.sfm.colmap import MIN_PHOTOS, reconstruct
 from nerf_lightning.errors import InputError
@@ -16,15 +14,9 @@ from nerf_lightning.utils.text import join_truncated
 log = logging.getLogger(__name__)
 
 MODEL = Path("sparse") / "0"
-"""The model in the folder beside the photos."""
+"""The model in the cached folder."""
 MAX_NAMES = 5
 """That a line lists."""
-
-
-def natural(path: Path) -> list[tuple[int, int, str]]:
-    """A key that sorts photo 9 before photo 10."""
-    parts = re.findall(r"(\d+)|(\D+)", path.name.lower())
-    return [(0, int(number), "") if number else (1, 0, text) for number, text in parts]
 
 
 def find_photos(folder: Path, key: str) -> list[Path]:
@@ -39,7 +31,7 @@ def find_photos(folder: Path, key: str) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError("config", key, f"{folder}, which is no folder", "a folder of photos")
-    photos = sorted(list_images(folder), key=natural)
+    photos = sorted(list_images(folder), key=lambda photo: natural_key(photo.name))
     if not photos:
         others = sorted({file.suffix.lower() for file in folder.iterdir() if file.suffix})
         found = f"only {', '.join(others)} files" if others else "no photo"
@@ -57,7 +49,7 @@ def place_photos(folder: Path) -> Path:
         folder: of photos of one scene; several sizes, cameras and focal lengths may be among them.
 
     Returns:
-        The folder of a binary COLMAP model: `placed/sparse/0` beside the photos, or in the cache where that cannot be written.
+        The folder of a binary COLMAP model, in the cache.
 
     Raises:
         InputError: pycolmap is not installed, a photo cannot be read, or the photos do not hang together.
@@ -82,4 +74,4 @@ def place_photos(folder: Path) -> Path:
         (empty / MODEL).mkdir(parents=True)
         model.write_binary(empty / MODEL)
 
-    return cached_folder(folder / PLACED_FOLDER, photos, fill) / MODEL
+    return cached_folder(folder, photos, fill) / MODEL
