@@ -73,7 +73,7 @@ def test_smallest_refuses_what_loses_too_much(tmp_path: Path, monkeypatch: pytes
     scores = iter([30.0, 29.5, 29.6, 29.7, 29.4])
     monkeypatch.setattr(smallest, "held_out_psnr", lambda *_: next(scores))
     monkeypatch.setattr(smallest, "seen_cells", lambda system, _: smallest.occupied_cells(system) & False)  # not all
-    with pytest.raises(InputError, match=r"0\.30 dB lost with --precision half, expected at most 0\.1 dB"):
+    with pytest.raises(InputError, match=r"0\.30 dB lost, expected at most 0\.1 dB"):
         smallest.smallest(*make_run(tmp_path, "recipe=hashgrid_small"), 0.1)
 
 

@@ -95,19 +95,13 @@ def test_chunk_follows_the_device(tmp_path: Path):
     assert isinstance(flat, NeRF2D) and flat.chunk == 5
 
 
-def test_resumed_batch_is_scaled_to_the_device():
+def test_enlarge_scales_rays_and_samples_of_a_step():
     picture = PixelDataModule(Picture("sunset", "test", builtin_picture(8)), pixels=10)
     picture.enlarge(4)
     assert len(picture.draw(0).uv) == 40
     scene = make_scene(MARBLE, size=4, views=3, held_out=1)
-    small, large, fixed = (RayDataModule(scene, 100, samples) for samples in (1000, 1000, None))
+    large = RayDataModule(scene, 100, 1000)
     large.enlarge(8)
-    fixed.enlarge(8)
     assert (large.rays, large.first_rays, large.samples, len(large.draw(0).pixels)) == (800, 800, 8000, 800)
     large.note_samples(4000)
     assert large.rays == 1040
-    small.load_state_dict(large.state_dict())
-    assert small.rays == 130, "resumed where a step takes an eighth"
-    other = RayDataModule(scene, 100)
-    other.load_state_dict(fixed.state_dict())
-    assert other.rays == 100
