@@ -37,7 +37,7 @@ SMALL = ("dataset.samples=8192", "sampler.samples=96")
 """Steps that plain PyTorch takes in some hundredths of a second on a CPU."""
 PICTURE = ("+experiment=picture", "dataset.max_side=128", "dataset.pixels=2048")
 OFF = ("snapshots", "orbit", "checkpoints", "progress", "heldout")
-PICTURE_OFF = ("training_gif", "charts", "baselines", "enlarge")
+PICTURE_OFF = ("pictures", "enlarge")
 """Callbacks that write what nobody looks at here."""
 MAX_LOSS_DB = 0.3
 """How far the mean over seeds may be below the CPU's."""

@@ -28,7 +28,7 @@ from nerf_lightning.cli.view import view
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.literal import override_of
 from nerf_lightning.dataset import PhotoLoadOptions, Scene, open_scene
-from nerf_lightning.dataset.size import AUTO, auto_resize
+from nerf_lightning.dataset.resize import AUTO, auto_resize
 from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.runs.open import open_scene_run
@@ -172,7 +172,7 @@ def train(
         FileExistsError: if the folder holds a run (options=["overwrite=true"] replaces it), or one is going on in it.
         KeyboardInterrupt: after Ctrl-C; the last state is saved, and the command line's `resume=` goes on from it.
     """
-    if not isinstance(scene, Scene):
+    if isinstance(scene, str | Path):
         size = auto_resize(seconds, steps, the_device(device), torch.get_num_threads())
         scene = open_scene(os.path.abspath(user_path(scene)), options=PhotoLoadOptions(size))
     default = Path("outputs", scene.name, datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))

@@ -64,3 +64,17 @@ def test_core_sets_no_attribute_of_another_object():
                 if owner not in OWN | OUTSIDE and node.attr not in ("data", "grad"):  # of a tensor
                     found.append(f"{file.name}:{node.lineno}: {ast.unparse(node)}")
     assert found == []
+
+
+KINDS = {"NeRF2D", "NeRF3D", "System", "PixelDataModule", "RayDataModule", "Picture", "Scene"}
+
+
+def test_kinds_are_asked_for_in_one_place():
+    """2D or 3D is decided where a system is built for its data; else their methods differ."""
+    found = []
+    for file in (ROOT / "nerf_lightning").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
+                names = {one.id for one in ast.walk(node.args[1]) if isinstance(one, ast.Name)}
+                found += [f"{file.parent.name}/{file.name}"] * bool(names & KINDS)
+    assert found == ["config/build.py"]

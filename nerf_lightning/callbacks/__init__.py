@@ -7,13 +7,12 @@ from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.live import Live
 from nerf_lightning.callbacks.orbit import Orbit
-from nerf_lightning.callbacks.pictures import Baselines, Enlarge, PictureCharts, TrainingGif
+from nerf_lightning.callbacks.pictures import Enlarge, PictureReport
 from nerf_lightning.callbacks.progress import Progress
 from nerf_lightning.callbacks.snapshots import Snapshots
 from nerf_lightning.callbacks.throughput import Throughput
 
 __all__ = [
-    "Baselines",
     "Budget",
     "Checkpoints",
     "Enlarge",
@@ -22,9 +21,8 @@ __all__ = [
     "HeldOut",
     "Live",
     "Orbit",
-    "PictureCharts",
+    "PictureReport",
     "Progress",
     "Snapshots",
     "Throughput",
-    "TrainingGif",
 ]

@@ -4,22 +4,10 @@ from typing import TypeVar
 
 import lightning as L
 
-from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.dataset import DataModule
 
 Kind = TypeVar("Kind", bound=L.Callback)
 Value = TypeVar("Value")
-
-
-class ChecksData(L.Callback):
-    """A callback whose options must fit the data."""
-
-    def check(self, data: RayDataModule | PixelDataModule) -> None:
-        """Called before a run writes anything.
-
-        Raises:
-            InputError: where they do not.
-        """
-        raise TypeError(f"{type(self).__name__} must define check(data)")
 
 
 def attached(trainer: L.Trainer, kind: type[Kind]) -> Kind | None:
@@ -27,7 +15,7 @@ def attached(trainer: L.Trainer, kind: type[Kind]) -> Kind | None:
     return next((callback for callback in trainer.callbacks if isinstance(callback, kind)), None)  # type: ignore[attr-defined]
 
 
-def data_of(trainer: L.Trainer) -> RayDataModule | PixelDataModule:
+def data_of(trainer: L.Trainer) -> DataModule:
     """The data module of the run."""
     return trainer.datamodule  # type: ignore[attr-defined]
 

@@ -1,4 +1,4 @@
-"""Budget: how long to train, by the steps or by the clock, and the clock itself."""
+"""Budget: how long to train, by the steps or by the clock, and the clock itself; and what it leaves for rendering."""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -8,8 +8,8 @@ from typing import Any
 import lightning as L
 
 from nerf_lightning.callbacks.attached import agreed, attached, data_of
-from nerf_lightning.callbacks.plateau import HALF_AGAIN, Plateau
-from nerf_lightning.callbacks.render_plan import MIN_SECONDS, RenderPlan
+from nerf_lightning.callbacks.plateau import Plateau
+from nerf_lightning.callbacks.render_plan import MIN_SECONDS, PROBE_PIXELS, RenderPlan, allot
 from nerf_lightning.dataset.subset import thin
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System, TrainingState
@@ -77,10 +77,8 @@ class Budget(L.Callback):
 
     def spent(self, step: int) -> float:
         """Fraction of the limits spent after `step` steps."""
-        done = [step / self.steps] if self.steps is not None else []
-        if self.limit_seconds is not None:
-            done.append(self.seconds / self.limit_seconds)
-        return max(done)
+        by_steps = step / self.steps if self.steps is not None else 0.0
+        return max(by_steps, self.seconds / self.limit_seconds if self.limit_seconds is not None else 0.0)
 
     def progress(self, step: int) -> float:
         """Share of the training done after `step` steps, in [0, 1]: that of the limits spent, until there is a plateau."""
@@ -144,38 +142,60 @@ class Budget(L.Callback):
         some = thin(max(map(data.pixels_held_out, chosen)), LOOK_PIXELS)
         with self.rendering(trainer, "views to look for a plateau"):
             quality = fmean(view.psnr for view in system.evaluate_held_out(data, chosen, some))
-        flat = plateau.note(spent, quality)
-        if not agreed(trainer, flat):
+        if not agreed(trainer, plateau.note(spent, quality)):
             return
         growth = system.field.growth
         if growth is not None and self.state.progress < growth.end:
-            reached = growth.end
-            self._line = (spent, reached, (1 - reached) / (1 - spent))
+            self._line = (spent, growth.end, (1 - growth.end) / (1 - spent))
             plateau.start()
             return
-        rest, again = plateau.gain(1 / spent) or 0.0, plateau.gain(HALF_AGAIN) or 0.0
+        rest = plateau.gain(1 / spent) or 0.0
         self._line = (spent, self.state.progress, (1 - self.state.progress) / (COOLING * spent))
         self.stopped = {"seconds": round(self.seconds, 3), "step": step, "rest_db": round(rest, 3)}
         print(
-            f"budget: plateau after {self.seconds:.1f} s: half as much time again would bring {again:.2f} dB, the rest of the"
-            f" budget {rest:.2f} dB; cooling down",
-            flush=True,
+            f"budget: plateau after {self.seconds:.1f} s: the rest would bring {rest:.2f} dB; cooling down", flush=True
         )
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
         self.state.clock.stop()
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "seconds": self.seconds,
-            "line": list(self._line),
-            "stopped": self.stopped,
-            "plateau": None if self.plateau is None else self.plateau.state(),
-        }
+        plateau = None if self.plateau is None else self.plateau.state
+        return {"seconds": self.seconds, "line": self._line, "stopped": self.stopped, "plateau": plateau}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        start, reached, slope = state_dict["line"]
-        self._line, self.stopped = (start, reached, slope), state_dict["stopped"]
+        self._line, self.stopped = state_dict["line"], state_dict["stopped"]
         self.state.clock.set_seconds(state_dict["seconds"])
         if self.plateau is not None and state_dict["plateau"] is not None:
-            self.plateau.load(state_dict["plateau"])
+            self.plateau.state = state_dict["plateau"]
+
+
+class Renders(L.Callback):
+    """A callback that renders views, in the time that the run has for them."""
+
+    weight = 1.0
+    """Of its time, where there is not enough for all."""
+
+    def pixels_left(self, trainer: L.Trainer) -> float:
+        """Pixels that are still to be rendered, where there is time for all."""
+        raise TypeError(f"{type(self).__name__} must define pixels_left(trainer)")
+
+    def share(self, trainer: L.Trainer, system: System, pixels: float | None = None) -> float:
+        """The share of so many pixels for which there is time; None takes all that are left."""
+        plan, data = Budget.of(trainer).plan, data_of(trainer)
+        if plan.pixel_seconds is None:
+            some = thin(data.pixels_held_out(0), PROBE_PIXELS)
+            with Budget.of(trainer).rendering(trainer, "a first look"):
+                (view,) = system.evaluate_held_out(data, [0], some)
+            plan.note(view.pixels, view.seconds)
+        cost = (self.pixels_left(trainer) if pixels is None else pixels) * (plan.pixel_seconds or 0.0)
+        return min(1.0, render_seconds(trainer)[self] / cost) if cost else 1.0
+
+
+def render_seconds(trainer: L.Trainer) -> dict[Renders, float]:
+    """Seconds that each callback may still render; 0 before the first view."""
+    budget = Budget.of(trainer)
+    jobs = [one for one in trainer.callbacks if isinstance(one, Renders)]  # type: ignore[attr-defined]
+    costs = {one: one.pixels_left(trainer) * (budget.plan.pixel_seconds or 0.0) for one in jobs}
+    allowance = budget.render_seconds(trainer.global_step) - budget.plan.spent
+    return allot(costs, {one: one.weight for one in jobs}, allowance)

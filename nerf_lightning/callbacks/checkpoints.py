@@ -92,12 +92,12 @@ class Checkpoints(L.Callback):
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         """The final state competes for `best.ckpt` too, on the same views as the earlier ones."""
-        evaluation, held_out = attached(trainer, Evaluation), attached(trainer, HeldOut)
+        held_out, measured = attached(trainer, HeldOut), attached(trainer, Evaluation)
         last = Path(trainer.default_root_dir) / FOLDER / "last.ckpt"
-        if evaluation is None or not trainer.is_global_zero or not last.exists():
+        if measured is None or not trainer.is_global_zero or not last.exists():
             return
         earlier, views = ([], None) if held_out is None else (held_out.curve, held_out.views)
-        same = [evaluation.views[view] for view in subsample(len(evaluation.views), views)]
+        same = [measured.views[view] for view in subsample(len(measured.views), views)]
         final = statistic_of(same, fmean, "psnr")
         if not earlier or (final is not None and final > max(point[2] for point in earlier)):
             link_file(last, last.with_name("best.ckpt"))  # of a large picture's field each is 900 MB

@@ -11,13 +11,12 @@ import psutil
 import torch
 
 from nerf_lightning.callbacks.attached import agreed, data_of
-from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.rendering import Renders
+from nerf_lightning.callbacks.budget import Budget, Renders
 from nerf_lightning.callbacks.throughput import TRAIN_SECONDS
-from nerf_lightning.dataset import Scene, Views
+from nerf_lightning.dataset import Views
 from nerf_lightning.dataset.rays import view_batch
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
-from nerf_lightning.system import RENDERED_PIXELS, NeRF3D, System, aligned_psnr, misfits, psnr_of_photos
+from nerf_lightning.system import RENDERED_PIXELS, System, aligned_psnr, misfits, psnr_of_photos
 from nerf_lightning.utils.text import subsample
 
 FIGURES = (
@@ -44,16 +43,13 @@ class Evaluation(Renders):
         self.photos: list[float] = []
         """PSNR of the training photos; none of a picture."""
         self._rows = 1.0  # share of each held-out view's that is measured
-        self._pixels = 0  # measured
 
     def pixels_left(self, trainer: L.Trainer) -> float:
-        data, scene = data_of(trainer), data_of(trainer).scene
+        data, test = data_of(trainer), data_of(trainer).scene.test
         pixels = self._rows * sum(map(data.pixels_held_out, range(len(self.views), data.held_out_views)))
-        if isinstance(scene, Scene):
-            aligned = self.figures["psnr_aligned"] is not None or not is_corrected(trainer.lightning_module)
-            pixels += 0 if aligned else RENDERED_PIXELS * len(scene.val)
-            pixels += 0 if scene.test is None or self.figures["test"] is not None else len(scene.test.pixels)
-        return pixels
+        if trainer.lightning_module.is_corrected and self.figures["psnr_aligned"] is None:
+            pixels += RENDERED_PIXELS * data.held_out_views
+        return pixels + (len(test.pixels) if test is not None and self.figures["test"] is None else 0)
 
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         data = data_of(trainer)
@@ -67,28 +63,28 @@ class Evaluation(Renders):
     def on_test_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        plan, pixels = Budget.of(trainer).plan, batch.height * batch.width
+        plan = Budget.of(trainer).plan
         plan.stop()
-        plan.note(pixels, outputs["seconds"])
+        plan.note(batch.height * batch.width, outputs["seconds"])
         self.views.append(outputs)
-        self._pixels += pixels
 
-    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
+    def on_test_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         data, figures = data_of(trainer), self.figures
         data.test_on(WHOLE)
         figures |= figures_of(self.views)
-        figures["rows_measured"] = round(self._pixels / sum(map(data.pixels_held_out, range(len(self.views)))), 4)
+        figures["rows_measured"] = round(self._rows, 4)
         figures["render_seconds_per_view"] = statistic_of(self.views, median, "seconds")
         if trainer.logger is not None:
             known = {f"val/{key}": figures[key] for key in ("psnr", "ssim") if figures[key] is not None}
             trainer.logger.log_metrics({**known, TRAIN_SECONDS: Budget.of(trainer).seconds}, trainer.global_step)
-        if isinstance(pl_module, NeRF3D) and isinstance(data.scene, Scene):
-            train, val, test = data.scene.train, data.scene.val, data.scene.test
-            if is_corrected(pl_module):
-                share = self.share(trainer, pl_module)
-                with Budget.of(trainer).plan.rendering("aligned held-out photos"):
-                    figures["psnr_aligned"] = round(fmean(aligned_psnr(pl_module, val, share)), 4)
-            figures["test"] = None if test is None else self._measure_test(trainer, pl_module, test)
+        if pl_module.is_corrected:
+            share = self.share(trainer, pl_module)
+            with Budget.of(trainer).plan.rendering("aligned held-out photos"):
+                figures["psnr_aligned"] = round(fmean(aligned_psnr(pl_module, data.scene.val, share)), 4)
+        if data.scene.test is not None:
+            figures["test"] = self._measure_test(trainer, pl_module, data.scene.test)
+        if data.has_cameras:
+            train = data.scene.train
             self.photos = psnr_of_photos(pl_module, train)
             figures["misfits"] = [
                 {"photo": train.name(i), "number": i, "psnr": round(self.photos[i], 2)} for i in misfits(self.photos)
@@ -105,11 +101,6 @@ class Evaluation(Renders):
                 measured.append({"psnr": result.psnr, "ssim": result.ssim})
             plan.note(result.pixels, result.seconds)
         return {**figures_of(measured), "views": len(measured), "views_in_split": len(views)}
-
-
-def is_corrected(system: L.LightningModule) -> bool:
-    """Whether cameras or light of the training photos were corrected."""
-    return isinstance(system, NeRF3D) and system.corrections is not None and bool(system.corrections.enabled_at)
 
 
 def figures_of(views: Sequence[dict[str, float]]) -> dict[str, Any]:

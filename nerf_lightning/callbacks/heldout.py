@@ -1,50 +1,39 @@
 """HeldOut: the quality curve, on views that are never trained on."""
 
-import math
 from statistics import fmean
-from typing import Any
+from typing import Annotated, Any
 
 import lightning as L
 
 from nerf_lightning.callbacks.attached import agreed, data_of
-from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.callbacks.budget import Budget, Renders
 from nerf_lightning.callbacks.evaluation import statistic_of
-from nerf_lightning.callbacks.rendering import Renders
 from nerf_lightning.callbacks.throughput import TRAIN_SECONDS
-from nerf_lightning.dataset.subset import WHOLE, thin
-from nerf_lightning.errors import InputError
+from nerf_lightning.dataset.subset import thin
 from nerf_lightning.system import System
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.options import Above, Below, Count
 from nerf_lightning.utils.signals import raise_if_signalled
 from nerf_lightning.utils.text import subsample
 
-MAX_SSIM_PIXELS = 1 << 21
-"""Pixels of a view beyond which SSIM, which takes some ten times as long as rendering, is left to the test."""
-
 
 class HeldOut(Renders):
-    """Measures held-out PSNR, and SSIM up to `MAX_SSIM_PIXELS`, at fractions of the budget, with the training clock stopped.
+    """Measures held-out PSNR at fractions of the budget, with the training clock stopped.
 
     The last point of the curve, at the end of the budget, comes from the `Evaluation` of all views. Where rendering would take
-    longer than training (see `Renders`), the others are measured on every n-th row and column, without SSIM.
+    longer than training (see `Renders`), the others are measured on every n-th row and column.
 
     Args:
-        at: fractions of the budget, ascending, in (0, 1).
+        at: fractions of the budget.
         views: how many held-out views, evenly chosen; None takes all.
-
-    Raises:
-        InputError: for fractions outside (0, 1), or not in order.
     """
 
-    def __init__(self, at: list[float], views: Count | None = None):
-        if any(not 0 < fraction < 1 for fraction in at) or sorted(at) != list(at):
-            raise InputError("callbacks.heldout.at", "", str(list(at)), "ascending fractions between 0 and 1")
-        self.at = list(at)
+    def __init__(self, at: list[Annotated[float, Above(0), Below(1)]], views: Count | None = None):
+        self.at = at
         self.views = views
         self.curve: list[list[float]] = []
         """[training seconds, step, PSNR], a row for each measurement that has a figure."""
         self.next_mark = 0
-        """Index in `at` of the next measurement."""
+        """How many of them were passed when it was measured last."""
 
     @property
     def latest(self) -> float | None:
@@ -60,34 +49,32 @@ class HeldOut(Renders):
         passed = sum(pl_module.state.progress >= fraction for fraction in self.at)
         if passed <= self.next_mark or pl_module.state.progress >= 1.0:
             return
-        figures = self.measure(trainer, pl_module)
-        self.next_mark, seconds = passed, Budget.of(trainer).seconds
-        if "psnr" in figures:
-            self.curve.append([round(seconds, 3), trainer.global_step, figures["psnr"]])
+        quality, seconds = self.measure(trainer, pl_module), Budget.of(trainer).seconds
+        self.next_mark = passed
+        if quality is None:
+            return
+        self.curve.append([round(seconds, 3), trainer.global_step, quality])
         if trainer.logger is not None:
-            named = {f"val/{key}": value for key, value in figures.items()}
-            trainer.logger.log_metrics({**named, TRAIN_SECONDS: seconds}, trainer.global_step)
+            trainer.logger.log_metrics({"val/psnr": quality, TRAIN_SECONDS: seconds}, trainer.global_step)
 
-    def measure(self, trainer: L.Trainer, pl_module: System) -> dict[str, float]:
-        """Mean figures of the views; those of which no pixel is known do not count."""
+    def measure(self, trainer: L.Trainer, pl_module: System) -> float | None:
+        """Mean PSNR of the views; those of which no pixel is known do not count."""
         data, budget = data_of(trainer), Budget.of(trainer)
         chosen = subsample(data.held_out_views, self.views)
         pixels = fmean(map(data.pixels_held_out, chosen))
         subset = thin(pixels, agreed(trainer, self.share(trainer, pl_module)) * pixels)
-        scored = trainer.logger is not None and subset == WHOLE and pixels <= MAX_SSIM_PIXELS
-        views: list[dict[str, float]] = []  # not their pictures, which would be held together
+        views = []  # not their pictures, which would be held together
         for number, view in enumerate(chosen, 1):
             with budget.rendering(trainer, f"held-out view {number} of {len(chosen)}"):
                 (result,) = pl_module.evaluate_held_out(data, [view], subset)
-                budget.plan.note(result.pixels, result.seconds)
-                views.append({"psnr": result.psnr, "ssim": result.ssim if scored else math.nan})
+            budget.plan.note(result.pixels, result.seconds)
+            views.append({"psnr": result.psnr})
             if trainer.world_size == 1:  # several processes leave together, at the end of a step
                 raise_if_signalled()
-        means = {key: statistic_of(views, fmean, key) for key in ("psnr", "ssim")}
-        return {key: value for key, value in means.items() if value is not None}
+        return statistic_of(views, fmean, "psnr")
 
     def state_dict(self) -> dict[str, Any]:
         return {"curve": self.curve, "next_mark": self.next_mark}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.curve, self.next_mark = [list(point) for point in state_dict["curve"]], state_dict["next_mark"]
+        self.curve, self.next_mark = state_dict["curve"], state_dict["next_mark"]

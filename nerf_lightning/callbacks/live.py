@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import ChecksData, data_of
+from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.progress import describe_progress
-from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
+from nerf_lightning.dataset import DataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.utils.options import AtLeast, AtMost, Port
@@ -21,7 +21,7 @@ MAX_SIDE, IMAGE_SECONDS = 512, 0.06
 """Of an image: pixels along its longer side, and the time that it may take."""
 
 
-class Live(ChecksData):
+class Live(L.Callback):
     """Serves a page that shows the field between training steps, with the training clock stopped, and how far training is.
 
     It draws only while somebody is looking, and for at most a share of the time. When training is done, the page stays open
@@ -48,16 +48,16 @@ class Live(ChecksData):
         self.page: FieldPage | None = None
         self._next = 0.0  # when drawing may take time again, by `time.perf_counter`
 
-    def check(self, data: RayDataModule | PixelDataModule) -> None:
-        if isinstance(data, PixelDataModule):
+    def check(self, data: DataModule) -> None:
+        """Called before a run writes anything."""
+        if not data.has_cameras:
             raise InputError("config", "callbacks", "live", "a scene's run", "pictures have training.gif")
         require_viser()
 
-    def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
+    def setup(self, trainer: L.Trainer, pl_module: NeRF3D, stage: str) -> None:
         if stage != "fit" or not trainer.is_global_zero:
             return
         scene = data_of(trainer).scene
-        assert isinstance(pl_module, NeRF3D) and isinstance(scene, Scene)  # `check` sees to it
         resolve_host(self.host)
 
         from nerf_lightning.view.field_page import FieldPage
@@ -90,9 +90,9 @@ class Live(ChecksData):
         """
         if self.page is None:
             return
+        self.page.again()
+        self.page.show_progress(1.0, "training is done" + ("" if psnr is None else f": held out {psnr:.2f} dB"))
         page, self.page = self.page, None
-        page.again()
-        page.show_progress(1.0, "training is done" + ("" if psnr is None else f": held out {psnr:.2f} dB"))
         try:
             if stay and page.visitors:
                 print("live: training is done; the page stays open until it is closed, or Ctrl-C", flush=True)

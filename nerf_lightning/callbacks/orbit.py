@@ -11,10 +11,8 @@ import torch
 from jaxtyping import UInt8
 
 from nerf_lightning.callbacks.attached import data_of
-from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.rendering import Renders
+from nerf_lightning.callbacks.budget import Budget, Renders
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.panels import panel, to_bytes, write_animation
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.files import atomic
@@ -23,23 +21,22 @@ from nerf_lightning.utils.text import subsample
 
 FILE = "orbit.gif"
 """Below the run folder."""
-MAX_FRAMES, MAX_SIDE = 60, 800
-"""By default; the side is the longer one of a frame, in pixels."""
+MAX_SIDE = 800
+"""Longer one of a frame, in pixels."""
 
 
 class Orbit(Renders):
     """Renders the scene's orbit after the test.
 
     Args:
-        frames: how many of the orbit's views, evenly chosen, at their full size; 0 makes no GIF. None takes 60 of at most
-            `MAX_SIDE` pixels, or smaller ones where there is not time for them (see `Renders`).
+        frames: how many of the orbit's views, evenly chosen, of at most `MAX_SIDE` pixels, or smaller where there is not time
+            for them (see `Renders`); 0 makes no GIF.
         fps: frames a second.
     """
 
-    def __init__(self, frames: Annotated[int, AtLeast(0)] | None = None, fps: FramesPerSecond = 20):
+    def __init__(self, frames: Annotated[int, AtLeast(0)] = 60, fps: FramesPerSecond = 20):
         self.frames = frames
         self.fps = fps
-        self.in_full = frames is not None
         self._done = 0.0  # share of the frames
 
     def pixels_left(self, trainer: L.Trainer) -> float:
@@ -47,22 +44,20 @@ class Orbit(Renders):
 
     def cameras(self, trainer: L.Trainer) -> Cameras:
         """Of the frames, at the size for which there may be time."""
-        scene = data_of(trainer).scene
-        assert isinstance(scene, Scene)  # NeRF3D trains on nothing else
-        count = MAX_FRAMES if self.frames is None else self.frames
-        chosen = scene.orbit[torch.tensor(subsample(len(scene.orbit), count), dtype=torch.long)]
-        return chosen if self.in_full else chosen.scaled(min(1.0, MAX_SIDE / scene.orbit.longest))
+        orbit = data_of(trainer).scene.orbit
+        chosen = orbit[torch.tensor(subsample(len(orbit), self.frames)).long()]
+        return chosen.scaled(min(1.0, MAX_SIDE / orbit.longest))
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF3D) -> None:
         if self.frames == 0 or not trainer.is_global_zero:
             return
         full = self.cameras(trainer)
-        scale = 1.0 if self.in_full else math.sqrt(self.share(trainer, pl_module))
+        scale = math.sqrt(self.share(trainer, pl_module))
         cameras = full.scaled(scale).to(pl_module.device)
         if scale < 1:
+            size = f"{len(full)} frames of {cameras.width}x{cameras.height}"
             print(
-                f"{FILE}: {len(full)} frames of {cameras.width}x{cameras.height}, so that rendering takes no longer than"
-                f" training; callbacks.orbit.frames={len(full)} draws them at full size"
+                f"{FILE}: {size}, so that rendering takes no longer than training; nerf_lightning render takes any size"
             )
         with atomic(Path(trainer.default_root_dir) / FILE) as temporary:
             write_animation(temporary, self._draw(trainer, pl_module, cameras), 1 / self.fps)

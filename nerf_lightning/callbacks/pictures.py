@@ -3,7 +3,7 @@
 import math
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import imageio.v3 as imageio
@@ -13,26 +13,22 @@ from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from nerf_lightning.callbacks.attached import ChecksData, attached, data_of
-from nerf_lightning.callbacks.evaluation import Evaluation
+from nerf_lightning.callbacks.attached import data_of
 from nerf_lightning.callbacks.results import artifact_bytes, quality_curve
 from nerf_lightning.callbacks.snapshots import FOLDER
-from nerf_lightning.dataset import Picture, PixelDataModule, RayDataModule, pixel_grid
+from nerf_lightning.dataset import pixel_grid
 from nerf_lightning.drawing.ink import BLUE, DPI, pixels_of
 from nerf_lightning.drawing.panels import averaged, narrowed, panel, to_bytes, write_animation, write_png
 from nerf_lightning.drawing.spectra import spectrum_chart
-from nerf_lightning.errors import InputError
 from nerf_lightning.system import NeRF2D, System
 from nerf_lightning.utils.files import atomic, known, write_json
-from nerf_lightning.utils.options import Count, FramesPerSecond
+from nerf_lightning.utils.options import Above, AtMost, Count, FramesPerSecond
 
 Image = UInt8[np.ndarray, "H W 3"]
 QUALITIES = (*range(5, 90, 5), *range(90, 101))
 """Of the JPEGs that are tried: bytes grow fastest near 100."""
 SAMPLINGS = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 """Colours at half resolution, and at full."""
-MAX_PIXELS = 1 << 28
-"""Of an enlarged picture."""
 
 
 def error_chart(rgb: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], title: str) -> Figure:
@@ -64,8 +60,18 @@ def curve_chart(curve: list[list[float]], title: str) -> Figure:
     return figure
 
 
-class PictureCharts(L.Callback):
-    """Writes error.png, spectrum.png and curve.png into the run folder after the test."""
+class PictureReport(L.Callback):
+    """After the test, writes error.png, spectrum.png and curve.png; training.gif of the snapshots, where there are any; and
+    baselines.json, which compares the field with a JPEG and with a shrunk picture of the same bytes.
+
+    Args:
+        fps: frames a second of training.gif; the last one stays for three.
+        width: most pixels across; wider snapshots are shrunk.
+    """
+
+    def __init__(self, fps: FramesPerSecond = 3, width: Count = 640):
+        self.fps = fps
+        self.width = width
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
         if not trainer.is_global_zero:
@@ -77,29 +83,20 @@ class PictureCharts(L.Callback):
         spectrum = spectrum_chart(result.truth.numpy(), result.rgb.numpy(), title)
         write_png(folder / "spectrum.png", pixels_of(spectrum))
         write_png(folder / "curve.png", pixels_of(curve_chart(quality_curve(trainer), title)))
+        if files := sorted((folder / FOLDER).glob("step_*.png")):
+            self.write_gif(files, folder / "training.gif")
+        found = compare_with_jpeg(data.scene.image.numpy(), artifact_bytes(pl_module))
+        write_json(folder / "baselines.json", known({**found, "field": round(result.psnr, 4)}))
+        jpeg = "none that small" if found["jpeg"] is None else format_quality(found["jpeg"]["psnr"])
+        bicubic = format_quality(found["bicubic"]["psnr"])
+        print(f"in {found['bytes'] / 1e3:,.1f} kB: JPEG {jpeg}; shrunk and enlarged by bicubic interpolation {bicubic}")
 
-
-class TrainingGif(L.Callback):
-    """Makes training.gif of the snapshots, where there are any, after training.
-
-    Args:
-        fps: frames a second; the last one stays for three.
-        width: most pixels across; wider snapshots are shrunk.
-    """
-
-    def __init__(self, fps: FramesPerSecond = 3, width: Count = 640):
-        self.fps = fps
-        self.width = width
-
-    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        folder = Path(trainer.default_root_dir)
-        files = sorted((folder / FOLDER).glob("step_*.png"))
-        if not files or not trainer.is_global_zero:
-            return
+    def write_gif(self, files: list[Path], target: Path) -> None:
+        """Makes an animation of pictures at the size of the last."""
         height, width, _ = narrowed(imageio.imread(files[-1]), self.width).shape
         pictures = (imageio.imread(file) for file in [*files, files[-1], files[-1]])
         frames = (cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA) for one in pictures)
-        with atomic(folder / "training.gif") as temporary:
+        with atomic(target) as temporary:
             write_animation(temporary, frames, 1 / self.fps)
 
 
@@ -108,11 +105,11 @@ def quality_of(image: Image, truth: Image) -> float:
     return math.inf if np.array_equal(image, truth) else round(cv2.PSNR(image, truth), 4)
 
 
-def words(psnr_db: float) -> str:
+def format_quality(psnr_db: float) -> str:
     return "without loss" if psnr_db == math.inf else f"{psnr_db:.2f} dB"
 
 
-def jpegs(image: Image) -> list[dict[str, Any]]:
+def encode_jpegs(image: Image) -> list[dict[str, Any]]:
     """Quality, size in bytes and PSNR of JPEGs of a picture."""
     found, bgr = [], np.ascontiguousarray(image[..., ::-1])
     for quality, sampling in product(QUALITIES, SAMPLINGS):
@@ -124,7 +121,7 @@ def jpegs(image: Image) -> list[dict[str, Any]]:
     return found
 
 
-def shrunk(image: Image, limit: int) -> dict[str, Any]:
+def shrink(image: Image, limit: int) -> dict[str, Any]:
     """The picture shrunk to `limit` bytes at three bytes a pixel, then enlarged again by bicubic interpolation."""
     height, width = image.shape[:2]
     scale = min(1.0, (limit / image.nbytes) ** 0.5)
@@ -134,35 +131,14 @@ def shrunk(image: Image, limit: int) -> dict[str, Any]:
     return {"width": small[0], "height": small[1], "bytes": less.nbytes, "psnr": quality_of(back, image)}
 
 
-class Baselines(L.Callback):
-    """After the test, compares the field with a JPEG and with a shrunk picture of the same bytes: prints, baselines.json."""
-
-    def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        evaluation, scene = attached(trainer, Evaluation), data_of(trainer).scene
-        if evaluation is None or not isinstance(scene, Picture) or not trainer.is_global_zero:
-            return
-        image, size, quality = scene.image.numpy(), artifact_bytes(pl_module), evaluation.figures["psnr"]
-        coded, small = jpegs(image), shrunk(image, size)
-        same = max((one for one in coded if one["bytes"] <= size), key=lambda one: one["psnr"], default=None)
-        good = [one for one in coded if quality is not None and one["psnr"] >= quality]
-        found = {
-            "bytes": size,
-            "picture_bytes": image.nbytes,
-            "field": quality,
-            "jpeg": same,
-            "bicubic": small,
-            "jpeg_as_good": min(good, key=lambda one: one["bytes"], default=None),
-        }
-        write_json(Path(trainer.default_root_dir) / "baselines.json", known(found))
-        text = f"in {size / 1e3:,.1f} kB (the picture's pixels have {image.nbytes / 1e3:,.1f} kB): JPEG "
-        text += "none that small" if same is None else words(same["psnr"])
-        text += f"; shrunk and enlarged by bicubic interpolation {words(small['psnr'])}"
-        if good:
-            text += f"; a JPEG as good as the field has {min(one['bytes'] for one in good) / 1e3:,.1f} kB"
-        print(text)
+def compare_with_jpeg(image: Image, size: int) -> dict[str, Any]:
+    """The best JPEG of at most so many bytes, None where none is that small, and the picture shrunk to them."""
+    fitting = [one for one in encode_jpegs(image) if one["bytes"] <= size]
+    best = max(fitting, key=lambda one: one["psnr"], default=None)
+    return {"bytes": size, "picture_bytes": image.nbytes, "jpeg": best, "bicubic": shrink(image, size)}
 
 
-class Enlarge(ChecksData):
+class Enlarge(L.Callback):
     """Renders a 2D field at another scale after the test: enlarged.png alone, enlarged_panel.png beside bicubic.
 
     If the picture was shrunk for training (`dataset.max_side`) or is the built-in one, the true larger picture is known, and
@@ -170,39 +146,28 @@ class Enlarge(ChecksData):
 
     Args:
         scale: factor on width and height; None does nothing.
-
-    Raises:
-        InputError: from `check`, where scale is not above 0, or makes a picture beyond `MAX_PIXELS`.
     """
 
-    def __init__(self, scale: float | None = None):
+    def __init__(self, scale: Annotated[float, Above(0), AtMost(64)] | None = None):
         self.scale = scale
-
-    def check(self, data: RayDataModule | PixelDataModule) -> None:
-        if self.scale is None or not isinstance(data, PixelDataModule):
-            return
-        width, height = data.scene.size
-        if not (self.scale > 0 and self.scale**2 * width * height <= MAX_PIXELS):
-            expected = f"above 0, for a picture of at most {MAX_PIXELS} pixels"
-            raise InputError("render.scale", "", str(self.scale), expected)
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF2D) -> None:
         scene, folder = data_of(trainer).scene, Path(trainer.default_root_dir)
-        if self.scale is None or not isinstance(scene, Picture) or not trainer.is_global_zero:
+        if self.scale is None or not trainer.is_global_zero:
             return
         width, height = (max(1, round(side * self.scale)) for side in scene.size)
         rgb = pl_module.colours(pixel_grid(height, width).to(pl_module.device)).cpu()
         field, truth = to_bytes(rgb.view(height, width, 3)), scene.at(width, height)
         method = cv2.INTER_CUBIC if self.scale > 1 else cv2.INTER_AREA  # bicubic alone would skip pixels when shrinking
         bicubic = cv2.resize(scene.image.numpy(), (width, height), interpolation=method)
-        scores: dict[str, Any] = {"scale": self.scale, "width": width, "height": height, "field": None, "bicubic": None}
-        names, shown = "bicubic | field", [bicubic, field]
-        text = "no larger original to judge by (dataset.max_side=... shrinks a picture for training and keeps it)"
-        if truth is not None:
-            scores |= {"field": quality_of(field, truth.numpy()), "bicubic": quality_of(bicubic, truth.numpy())}
-            names, shown = "bicubic | field | truth", [*shown, truth.numpy()]
-            text = f"field {words(scores['field'])}, bicubic {words(scores['bicubic'])}"
+        images = {"bicubic": bicubic, "field": field} | ({} if truth is None else {"truth": truth.numpy()})
+        scores = {
+            name: None if truth is None else quality_of(images[name], images["truth"]) for name in ("field", "bicubic")
+        }
         write_png(folder / "enlarged.png", field)
-        write_png(folder / "enlarged_panel.png", panel(shown, f"{names}    {width}x{height}"))
-        write_json(folder / "enlarged.json", known(scores))
-        print(f"{self.scale:g} times as large ({width}x{height}): {text}")
+        write_png(folder / "enlarged_panel.png", panel([*images.values()], f"{' | '.join(images)}    {width}x{height}"))
+        size = {"scale": self.scale, "width": width, "height": height}
+        write_json(folder / "enlarged.json", known({**size, **scores}))
+        text = ", ".join(f"{name} {format_quality(psnr)}" for name, psnr in scores.items() if psnr is not None)
+        unknown = "no larger original to judge by (dataset.max_side=... shrinks a picture for training and keeps it)"
+        print(f"{self.scale:g} times as large ({width}x{height}): {text or unknown}")

@@ -1,7 +1,6 @@
 """Plateau: when more training is no longer worth its time, judged by the held-out quality over time."""
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -25,14 +24,13 @@ class Plateau:
 
     def __init__(self, patience: float):
         self.patience = patience
-        self.points: list[tuple[float, float]] = []
-        """(fraction of the budget spent, dB)."""
-        self.flat = 0
-        """Measurements in a row after which 50 % more time would not be worth it."""
+        self.state: tuple[list[tuple[float, float]], int] = ([], 0)
+        """(fraction of the budget spent, dB) of each measurement, and how many in a row say that more are not worth it."""
 
     def due(self, spent: float) -> bool:
         """Whether it is time for another measurement."""
-        return spent >= (self.points[-1][0] * SPACING if self.points else FIRST)
+        points, _ = self.state
+        return spent >= (points[-1][0] * SPACING if points else FIRST)
 
     def note(self, spent: float, quality: float) -> bool:
         """Adds a measurement.
@@ -40,15 +38,17 @@ class Plateau:
         Returns:
             Whether there is a plateau: two measurements in a row say so, as one may be luck.
         """
-        self.points.append((spent, quality))
+        points, flat = self.state
+        points.append((spent, quality))
         gain = self.gain(HALF_AGAIN)
-        self.flat = self.flat + 1 if gain is not None and gain < self.patience else 0
-        return self.flat >= 2
+        flat = flat + 1 if gain is not None and gain < self.patience else 0
+        self.state = points, flat
+        return flat >= 2
 
     def gain(self, factor: float) -> float | None:
         """dB that `factor` times the time spent would gain by the present trend; None with too few measurements."""
-        last = self.points[-1][0] if self.points else 0.0
-        recent = [point for point in self.points if point[0] * LOOK_BACK >= last]
+        points, _ = self.state
+        recent = [point for point in points if point[0] * LOOK_BACK >= points[-1][0]]
         if len(recent) < FEWEST:
             return None
         spent, quality = np.array(recent).T
@@ -56,16 +56,4 @@ class Plateau:
 
     def start(self) -> None:
         """Forgets the trend, as training enters another stage."""
-        self.points = self.points[-1:]
-        self.flat = 0
-
-    def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps."""
-        return {"points": [list(point) for point in self.points], "flat": self.flat}
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Restores what `state` returned."""
-        self.points = [(spent, quality) for spent, quality in state["points"]]
-        self.flat = state["flat"]
-        if any(spent <= 0 for spent, _ in self.points):
-            raise ValueError("a plateau's measurement before training")
+        self.state = self.state[0][-1:], 0

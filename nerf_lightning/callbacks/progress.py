@@ -10,9 +10,8 @@ from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as RichProgress
 
 from nerf_lightning.callbacks.attached import attached, data_of
-from nerf_lightning.callbacks.budget import Budget
+from nerf_lightning.callbacks.budget import Budget, render_seconds
 from nerf_lightning.callbacks.heldout import HeldOut
-from nerf_lightning.callbacks.rendering import render_seconds_left
 from nerf_lightning.system import System
 from nerf_lightning.utils.progress import animates, clock
 
@@ -28,10 +27,10 @@ def seconds_left(trainer: L.Trainer) -> float | None:
     None while they cannot be told.
     """
     budget = Budget.of(trainer)
-    training, rendering = budget.seconds_left(trainer.global_step), render_seconds_left(trainer)
-    if training is None or rendering is None or (training and budget.seconds < FIRST_SECONDS):
+    training = budget.seconds_left(trainer.global_step)
+    if training is None or budget.plan.pixel_seconds is None or (training and budget.seconds < FIRST_SECONDS):
         return None
-    return training + rendering
+    return training + sum(render_seconds(trainer).values())
 
 
 def describe_progress(trainer: L.Trainer) -> list[str]:
@@ -66,15 +65,13 @@ class Progress(L.Callback):
             self.bar.start()
             self.bar.add_task(name, total=1.0, status="")
 
-    def show(self, trainer: L.Trainer, system: System, view: str = "", now: bool = False) -> None:
-        """Shows how far the run is, rendering included, or how good a `view` is: if it is time for that, or `now`."""
+    def show(self, trainer: L.Trainer, system: System, now: bool = False) -> None:
+        """Shows how far the run is, rendering included, if it is time for that, or `now`."""
         if not now and time.monotonic() - self._shown < (self.every_seconds if self.bar is None else BAR_SECONDS):
             return
         self._shown = time.monotonic()
         seconds, budget, parts = seconds_left(trainer), Budget.of(trainer), describe_progress(trainer)
-        if view:
-            parts[0] = view
-        elif self._rays:
+        if self._rays:
             parts.insert(1, f"{self._rays / max(budget.seconds - self._mark, 1e-9):,.0f} rays/s")
             self._mark, self._rays = budget.seconds, 0
         done = budget.seconds + budget.plan.spent
@@ -107,13 +104,6 @@ class Progress(L.Callback):
 
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         self.open("test")
-
-    def on_test_batch_end(
-        self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        views = data_of(trainer).held_out_views
-        view = f"view {batch_idx + 1} of {views}: {outputs['psnr']:.2f} dB"
-        self.show(trainer, pl_module, view, now=batch_idx + 1 == views)
 
     def teardown(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
         self.close()

@@ -1,4 +1,4 @@
-"""RenderPlan: what a run renders beside its training, so that it takes no longer than that and its end can be told."""
+"""Rendering beside training: it takes no longer than training does, and its end can be told."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -43,11 +43,11 @@ class RenderPlan:
         """Of rendering; None before the first view."""
         self.subject = ""
         """What is being rendered."""
-        self._listeners: list[Callable[[], None]] = []
+        self._listener: Callable[[], None] = lambda: None
 
     def subscribe(self, listener: Callable[[], None]) -> None:
         """Calls it whenever something else is being rendered."""
-        self._listeners.append(listener)
+        self._listener = listener
 
     @contextmanager
     def rendering(self, subject: str) -> Iterator[None]:
@@ -61,8 +61,7 @@ class RenderPlan:
     def start(self, subject: str) -> None:
         """The same where the block is not one."""
         self.subject, self._since = subject, time.perf_counter()
-        for listener in self._listeners:
-            listener()
+        self._listener()
 
     def stop(self) -> None:
         self.spent += time.perf_counter() - self._since
@@ -70,8 +69,5 @@ class RenderPlan:
 
     def note(self, pixels: int, seconds: float) -> None:
         """Called with the time that a view took."""
-        if self.pixel_seconds is None:
-            self.pixel_seconds = seconds / pixels
-        else:
-            weight = SMOOTHING * min(1.0, pixels / PROBE_PIXELS)
-            self.pixel_seconds += weight * (seconds / pixels - self.pixel_seconds)
+        each, weight = seconds / pixels, SMOOTHING * min(1.0, pixels / PROBE_PIXELS)
+        self.pixel_seconds = each if self.pixel_seconds is None else (1 - weight) * self.pixel_seconds + weight * each

@@ -18,9 +18,8 @@ from nerf_lightning.callbacks.evaluation import Evaluation
 from nerf_lightning.callbacks.guard import Guard
 from nerf_lightning.callbacks.heldout import HeldOut
 from nerf_lightning.callbacks.throughput import Throughput
-from nerf_lightning.dataset import PictureBatch
 from nerf_lightning.refine import summarize_corrections
-from nerf_lightning.system import NeRF2D, NeRF3D, System
+from nerf_lightning.system import System
 from nerf_lightning.utils.files import known
 from nerf_lightning.utils.machine import describe_machine
 
@@ -54,14 +53,8 @@ def summarize_run(
     """
     device, budget = trainer.strategy.root_device, Budget.of(trainer)
     throughput, guard = attached(trainer, Throughput), attached(trainer, Guard)
-    evaluation = attached(trainer, Evaluation) or Evaluation()
-    if error is None:
-        status, diagnosis = judge_run(trainer, system, evaluation)
-    elif not isinstance(error, Exception):  # Ctrl-C, SIGTERM
-        status, diagnosis = "interrupted", f"at step {trainer.global_step}; resume= continues"
-    else:
-        status, diagnosis = "failed", " ".join(f"{type(error).__name__}: {error}".split())
-    corrections = system.corrections if isinstance(system, NeRF3D) else None
+    evaluation, corrections = attached(trainer, Evaluation) or Evaluation(), system.corrections
+    status, diagnosis = judge_run(trainer, system, evaluation) if error is None else describe_error(trainer, error)
     results = {
         "scene": data_of(trainer).scene.describe(),
         "background": system.background,
@@ -88,14 +81,19 @@ def summarize_run(
         "curve": quality_curve(trainer),
         "warnings": list(warnings),
         "plateau": budget.stopped,
-        "corrections": summarize_corrections(corrections)
-        if corrections is not None and corrections.is_finite
-        else None,
+        "corrections": summarize_corrections(corrections) if corrections and corrections.is_finite else None,
         "recoveries": [asdict(one) for one in guard.recoveries] if guard is not None else [],
         "status": status,
         "diagnosis": diagnosis,
     }
     return known(results)
+
+
+def describe_error(trainer: L.Trainer, error: BaseException) -> tuple[str, str]:
+    """Status and diagnosis of a run that ended early."""
+    if not isinstance(error, Exception):  # Ctrl-C, SIGTERM
+        return "interrupted", f"at step {trainer.global_step}; resume= continues"
+    return "failed", " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def judge_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> tuple[str, str]:
@@ -108,9 +106,8 @@ def judge_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> tup
     quality, plain = (fmean(view[key] for view in counted) for key in ("psnr", "plain_psnr"))
     view, nothing = data_of(trainer).held_out(0).to(system.device), min(plain + NO_BETTER, SEEN_AS_EQUAL)
     if quality < nothing:
-        cause = system.diagnose(view)
         diagnosis = f"held-out PSNR {quality:.2f} dB is no better than one plain colour ({plain:.2f} dB)"
-        return "collapsed", f"{diagnosis}: {cause}" if cause else diagnosis
+        return "collapsed", ": ".join(filter(None, (diagnosis, system.diagnose(view))))
     status = "stopped_early" if Budget.of(trainer).progress(trainer.global_step) < 1.0 else "finished"
     trained = [psnr for psnr in evaluation.photos if math.isfinite(psnr)]
     if trained and quality < min(fmean(trained) - WIDE_GAP, GOOD):
@@ -118,13 +115,12 @@ def judge_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> tup
             f"training photos {fmean(trained):.1f} dB, held-out views {quality:.1f} dB: too few views for this model,"
             " or poses that do not fit their photos"
         )
-    if isinstance(system, NeRF2D) and isinstance(view, PictureBatch):
-        between = system.between(view)
-        if between is not None and between < nothing:
-            return status, (
-                f"between its pixels the field is no better than one plain colour ({between:.1f} dB):"
-                " it holds frequencies that the pixels do not show"
-            )
+    between = system.between(view)
+    if between is not None and between < nothing:
+        return status, (
+            f"between its pixels the field is no better than one plain colour ({between:.1f} dB):"
+            " it holds frequencies that the pixels do not show"
+        )
     return status, ""
 
 

@@ -6,39 +6,39 @@ from typing import Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import ChecksData, data_of
-from nerf_lightning.callbacks.budget import Budget
-from nerf_lightning.callbacks.rendering import Renders
-from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.callbacks.attached import data_of
+from nerf_lightning.callbacks.budget import Budget, Renders
+from nerf_lightning.dataset import DataModule
 from nerf_lightning.dataset.subset import thin
 from nerf_lightning.drawing.panels import narrowed, result_panel, to_bytes, write_png
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
+from nerf_lightning.utils.options import Count
 
 LOGGED_WIDTH = 640
 """Widest picture for TensorBoard, in pixels: it takes 0.1 s for each megabyte."""
 FOLDER, FINAL, TRUTH = "snapshots", "final.png", "truth.png"
 """Below the run folder: all snapshots, the latest render alone, and what it should look like, which is written once."""
-MAX_PIXELS = 800 * 800
-"""Of a snapshot of a scene, which is for looking at."""
 
 
-class Snapshots(ChecksData, Renders):
+class Snapshots(Renders):
     """Writes truth, render and depth of one held-out view as PNG and to TensorBoard, and once more at the end.
 
-    Of views beyond `MAX_PIXELS`, and where there is not time for all (see `Renders`), every n-th row and column is rendered.
+    Of views beyond `max_pixels`, and where there is not time for all (see `Renders`), every n-th row and column is rendered.
 
     Args:
         steps: after which steps; None means 10, 20, 50, 100, 200, 500, ...
         view: index of the held-out view.
+        max_pixels: of a snapshot, which is for looking at; None takes all.
 
     Raises:
         InputError: from `check`, if there is no such view.
     """
 
-    def __init__(self, steps: list[int] | None = None, view: int = 0):
+    def __init__(self, steps: list[int] | None = None, view: int = 0, max_pixels: Count | None = 640_000):
         self.steps = steps
         self.view = view
+        self.max_pixels = max_pixels
         self._written: int | None = None  # the step of the latest
 
     def steps_until(self, last: float) -> list[int]:
@@ -48,7 +48,8 @@ class Snapshots(ChecksData, Renders):
         spaced = (digit * 10**power for power in count(1) for digit in (1, 2, 5))
         return list(takewhile(lambda step: step <= last, spaced))
 
-    def check(self, data: RayDataModule | PixelDataModule) -> None:
+    def check(self, data: DataModule) -> None:
+        """Called before a run writes anything."""
         views = data.held_out_views
         if not 0 <= self.view < views:
             raise InputError("callbacks.snapshots.view", "", str(self.view), f"a held-out view from 0 to {views - 1}")
@@ -57,29 +58,27 @@ class Snapshots(ChecksData, Renders):
         step, progress = trainer.global_step, Budget.of(trainer).progress(trainer.global_step)
         last = step / progress if progress else step
         left = {one for one in (*self.steps_until(last), round(last)) if one >= step and one != self._written}
-        return len(left) * self.max_pixels(trainer)
+        return len(left) * self.pixels(trainer)
 
-    def max_pixels(self, trainer: L.Trainer) -> int:
+    def pixels(self, trainer: L.Trainer) -> int:
         """Of a snapshot for which there is time."""
-        data = data_of(trainer)
-        pixels = data.pixels_held_out(self.view)
-        return pixels if isinstance(data, PixelDataModule) else min(pixels, MAX_PIXELS)
+        pixels = data_of(trainer).pixels_held_out(self.view)
+        return min(pixels, self.max_pixels or pixels)
 
     def write(self, trainer: L.Trainer, pl_module: System) -> None:
         if not trainer.is_global_zero:
             return
         budget, data, step = Budget.of(trainer), data_of(trainer), trainer.global_step
         folder, logger = Path(trainer.default_root_dir), trainer.logger
-        most = self.share(trainer, pl_module) * self.max_pixels(trainer)
-        subset = thin(data.pixels_held_out(self.view), most)
+        most = self.share(trainer, pl_module) * self.pixels(trainer)
         with budget.rendering(trainer, "snapshot"):
+            subset = thin(data.pixels_held_out(self.view), most)
             (result,) = pl_module.evaluate_held_out(data, [self.view], subset)
         budget.plan.note(result.pixels, result.seconds)
         self._written = step
         with budget.paused():  # not `rendering`: a signal may not break what others write on
-            picture = result_panel(
-                result, f"{data.scene.name}, step {step}, {budget.seconds:.0f} s, {result.psnr:.2f} dB"
-            )
+            caption = f"{data.scene.name}, step {step}, {budget.seconds:.0f} s, {result.psnr:.2f} dB"
+            picture = result_panel(result, caption)
             write_png(folder / FOLDER / f"step_{step:07d}.png", picture)
             write_png(folder / FINAL, to_bytes(result.rgb))
             if not (folder / TRUTH).exists():

@@ -52,7 +52,10 @@ def view(
     require_viser()
     resolve_host(host)
     if path is not None and not has_run(path):
-        page = _open_scene(path, resize, holdout, host, port)
+        from nerf_lightning.dataset import PhotoLoadOptions, open_scene
+        from nerf_lightning.view.scene_page import ScenePage
+
+        page: Page = ScenePage(open_scene(str(path), options=PhotoLoadOptions(resize, holdout)), host, port)
     else:
         page = _open_run(find_run(path), device, side, host, port)
     try:
@@ -81,15 +84,7 @@ def has_run(path: Path) -> bool:
         return False
 
 
-def _open_scene(path: Path, resize: int | str | None, holdout: int, host: str, port: int) -> "Page":
-    from nerf_lightning.dataset import PhotoLoadOptions, open_scene
-    from nerf_lightning.view.scene_page import ScenePage
-
-    return ScenePage(open_scene(str(path), options=PhotoLoadOptions(resize, holdout)), host, port)
-
-
 def _open_run(source: Path, device: str, side: int, host: str, port: int) -> "Page":
-    from nerf_lightning.dataset import Scene
     from nerf_lightning.runs.data import data_again
     from nerf_lightning.runs.open import open_scene_run
     from nerf_lightning.utils.device import the_device
@@ -101,5 +96,4 @@ def _open_run(source: Path, device: str, side: int, host: str, port: int) -> "Pa
         scene = data_again(found.cfg, found.scene).scene
     except InputError as error:
         print(f"without photos: {error}", flush=True)
-    assert scene is None or isinstance(scene, Scene)  # of a scene's run
     return FieldPage(source.resolve().name, found.system, found.orbit, scene, host, port, side)

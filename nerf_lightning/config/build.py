@@ -10,7 +10,7 @@ from typing import Any
 import hydra
 import lightning as L
 import torch
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
@@ -20,25 +20,22 @@ from nerf_lightning.callbacks import Budget, Evaluation
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.config.literal import escape
-from nerf_lightning.dataset import PixelDataModule, RayDataModule
-from nerf_lightning.dataset.size import AUTO, auto_resize
+from nerf_lightning.dataset import DataModule, PixelDataModule, RayDataModule
+from nerf_lightning.dataset.resize import AUTO, auto_resize
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import VolumeRenderer
+from nerf_lightning.renderer.background import Background
 from nerf_lightning.sampler import Sampler
 from nerf_lightning.sources import from_photos
 from nerf_lightning.system import NeRF2D, NeRF3D, System
 from nerf_lightning.system.compiled import BACKEND
 from nerf_lightning.utils.device import CPU, the_device
-from nerf_lightning.utils.files import output_path
 from nerf_lightning.utils.options import check_options
 
 KNOWN = ("cpu", "cuda", "mps")
 """Devices that Lightning knows; for any other it would silently take the CPU."""
-
-MAX_DEVICES = 64
-"""Lightning starts a process for each: a slip would bring the machine down."""
 
 PRECISIONS = ("32-true", "16-mixed", "bf16-mixed", 32, "32", 16, "16", "bf16")
 """Lightning's that training takes: the kernels, and what the renderer integrates, are in single precision."""
@@ -128,7 +125,7 @@ def device_of(cfg: DictConfig) -> torch.device:
     return the_device(str(OmegaConf.select(cfg, "trainer.accelerator", default="auto")))
 
 
-def build_data(cfg: DictConfig, path: str | Path | None = None) -> RayDataModule | PixelDataModule:
+def build_data(cfg: DictConfig, path: str | Path | None = None) -> DataModule:
     """The data module, with its scene loaded; `path` names other photos than the configuration does."""
     chosen = {}
     if cfg.dataset.get("resize") == AUTO:
@@ -176,10 +173,20 @@ def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) ->
     seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
     renderer = make(cfg, "renderer", VolumeRenderer, scene_background=frame.background, **seen)
     corrections = None
-    if cfg.get("refine") is not None and frame.cameras is not None:
-        photographed = {"cameras": frame.cameras, "bounds": frame.bounds, "exposures": frame.exposures}
-        corrections = make(cfg, "refine", Corrections, **photographed)
+    if frame.cameras is not None:
+        check_background(cfg, frame, renderer.background)
+        if cfg.get("refine") is not None:
+            photographed = {"cameras": frame.cameras, "bounds": frame.bounds, "exposures": frame.exposures}
+            corrections = make(cfg, "refine", Corrections, **photographed)
     return NeRF3D(field, sampler, renderer, **common, corrections=corrections)
+
+
+def check_background(cfg: DictConfig, frame: "SceneFrame", background: Background) -> None:
+    """Photos without alpha show one background colour; with another, the field would learn that colour as a wall."""
+    is_same = torch.allclose(background.color, torch.tensor(frame.background), atol=1e-3)
+    if not frame.alpha and (background.is_random or not is_same):
+        expected = f"scene: the photos have no alpha and stand on {[round(c, 3) for c in frame.background]}"
+        raise InputError("config: renderer.background", "", str(cfg.renderer.background), expected)
 
 
 def corrects_poses(cfg: DictConfig) -> bool:
@@ -212,7 +219,7 @@ class PictureFrame:
 Frame = SceneFrame | PictureFrame
 
 
-def frame_of(data: RayDataModule | PixelDataModule) -> Frame:
+def frame_of(data: DataModule) -> Frame:
     """What a system takes from the data."""
     if isinstance(data, PixelDataModule):
         return PictureFrame(*data.scene.size)
@@ -220,21 +227,6 @@ def frame_of(data: RayDataModule | PixelDataModule) -> Frame:
     pixel = train.cameras.pixel_width(bounds.centre)
     seen = train.cameras, train.channels == 4, train.exposures
     return SceneFrame(replace(bounds, pixel=pixel or None), data.scene.background, *seen)
-
-
-def check_background(cfg: DictConfig, data: RayDataModule | PixelDataModule, system: System) -> None:
-    """Photos without alpha show one background colour; with another, the field would learn that colour as a wall."""
-    if isinstance(data, PixelDataModule) or data.scene.train.channels == 4:
-        return
-    assert isinstance(system, NeRF3D)  # what build_system makes for rays
-    wanted = "random" if system.renderer.background.is_random else system.background
-    if wanted != [round(c, 3) for c in data.scene.background]:
-        raise InputError(
-            "config: renderer.background",
-            "",
-            str(cfg.renderer.background),
-            f"scene: the photos of {data.scene.name} have no alpha and stand on {list(data.scene.background)}",
-        )
 
 
 def budget_options(cfg: DictConfig) -> dict[str, Any]:
@@ -251,33 +243,13 @@ def build_budget(cfg: DictConfig) -> Budget:
     return Budget(**limits)
 
 
-def build_logger(cfg: DictConfig, folder: Path) -> Logger:
-    """Where curves go. TensorBoard's gives options that it does not know to its writer, which is made later, as its folder is.
-
-    Raises:
-        InputError: for options that neither knows, and a folder that cannot be written.
-    """
-    logger = make(cfg, "logger", Logger, save_dir=folder)
-    if isinstance(logger, TensorBoardLogger):
-        from torch.utils.tensorboard import SummaryWriter
-
-        own = {"_target_", *inspect.signature(type(logger)).parameters}
-        check_options("logger", SummaryWriter, {k: v for k, v in resolved(cfg.logger).items() if k not in own})
-    if isinstance(logger, CSVLogger | TensorBoardLogger):
-        output_path(logger.log_dir)
-    return logger
-
-
 def build_trainer(cfg: DictConfig, folder: Path, device: torch.device) -> L.Trainer:
     """The Trainer with its callbacks, on a device, writing into `folder`."""
-    logger = build_logger(cfg, folder) if cfg.get("logger") is not None else False
+    logger = make(cfg, "logger", Logger, save_dir=folder) if cfg.get("logger") is not None else False
     chosen = [name for name, node in (cfg.get("callbacks") or {}).items() if node is not None]
     callbacks = [make(cfg, f"callbacks.{name}", L.Callback) for name in chosen]
     # The budget comes first, as the others read its clock, and figures come before pictures.
     callbacks = [build_budget(cfg), Evaluation(), *callbacks]
-    devices = str(OmegaConf.select(cfg, "trainer.devices"))
-    if devices.isdecimal() and int(devices) > MAX_DEVICES:
-        raise InputError("config", "trainer.devices", devices[:60], f"at most {MAX_DEVICES}, one process each")
     precision = OmegaConf.select(cfg, "trainer.precision")
     if precision not in (None, *PRECISIONS):
         raise InputError("config", "trainer.precision", repr(precision), f"one of {', '.join(map(str, PRECISIONS))}")

@@ -2,14 +2,16 @@
 earlier steps, which checkpoints keep, and held-out views whole."""
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import lightning as L
 from torch import Tensor
 
+from nerf_lightning.dataset.matching.judge import Doubt
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.utils.device import CPU, fits
+from nerf_lightning.utils.device import CPU
+from nerf_lightning.utils.memory import fits
 
 Batch = TypeVar("Batch")
 Photos = TypeVar("Photos", Views, Tensor)
@@ -51,6 +53,10 @@ class StepDataModule(L.LightningDataModule, Generic[Photos]):
         seed: of the draw.
     """
 
+    has_cameras: ClassVar[bool]
+    """Whether it draws from the posed photos of a scene, not from a picture."""
+    scene: Any
+    """The `Scene` or `Picture`."""
     held_out_views: int
 
     def __init__(self, photos: Photos, seed: int):
@@ -74,6 +80,13 @@ class StepDataModule(L.LightningDataModule, Generic[Photos]):
     def draw_from(self, photos: Photos, step: int, part: slice) -> Any:
         """A part of the batch of a step."""
         raise TypeError(f"{type(self).__name__} must define draw_from(photos, step, part)")
+
+    def start_again(self) -> None:
+        """Before another training on the same photos."""
+
+    def find_doubts(self, corrected: bool) -> list[Doubt]:
+        """What to warn of before training, see `check_scene`."""
+        return []
 
     def held_out(self, view: int, subset: PixelSubset = WHOLE) -> Any:
         """One held-out view."""

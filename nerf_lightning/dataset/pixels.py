@@ -36,6 +36,8 @@ class Picture:
     """sRGB."""
     at: Callable[[int, int], UInt8[Tensor, "h w 3"] | None] = unknown
     """Width, height -> the true picture at that size, or None if unknown."""
+    test: ClassVar[None] = None
+    """It has no test split."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -96,6 +98,7 @@ class PixelDataModule(StepDataModule[Tensor]):
         seed: of the draw.
     """
 
+    has_cameras = False
     held_out_views = 1
 
     def __init__(self, scene: Picture, pixels: Count | None = None, seed: int = 0):
@@ -113,6 +116,10 @@ class PixelDataModule(StepDataModule[Tensor]):
         index = torch.randint(height * width, (self.pixels,), generator=generator, device=photos.device)[part]
         uv = torch.stack([(index % width + 0.5) / width, (index // width + 0.5) / height], dim=-1)
         return PixelBatch(uv, photos.view(-1, 3)[index].float() / 255)
+
+    def small_batch(self) -> PixelBatch:
+        """A few places, to compile kernels with."""
+        return PixelBatch(*torch.rand(64, 5, generator=step_generator(0, Stream.BATCH, 0)).split([2, 3], dim=1))
 
     def some_pixels(self) -> PixelBatch:
         """As in `RayDataModule`; here, all pixels."""

@@ -9,23 +9,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays
-from nerf_lightning.export.reach import NOTHING, Cells, visible_cells
+from nerf_lightning.export.smallest import NOTHING, Cells, visible_cells
 from nerf_lightning.export.volume import COARSEST, FINEST
 from nerf_lightning.model import TensoRFField, VoxelField
 from nerf_lightning.model.layers.pruning import vertices_in, widened
-from nerf_lightning.model.layers.view_dependence import encode_directions
 from nerf_lightning.model.voxels import EMPTY
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.progress import tracked
-from nerf_lightning.utils.text import subsample
 
 CELLS, STEPS = 128, 192
 """Along a side of the grid, and along a ray, that stand for another sampler."""
-DEGREE, DIRECTIONS = 1, 24
-"""Of the harmonics that stand for another field's colours, and how many cameras' directions they are fitted to."""
-DAMPING = 1e-2
-"""Of that fit, per direction: what a few directions do not tell stays near 0."""
+DEGREE = 1
+"""Of the harmonics that stand for another field's colours."""
 LOGITS = 6.0
 """Largest: beyond, a byte does not change."""
 MOST = 700_000
@@ -44,7 +40,7 @@ class Drawable(NamedTuple):
     system: NeRF3D
     config: dict[str, Any]
     """Of its run, with what was put in the place of the run's own."""
-    changes: list[str]
+    change: str
     """What that was, in words; where there is any, the occupied cells are those that the cameras see."""
 
 
@@ -54,40 +50,27 @@ def is_drawable(system: NeRF3D) -> bool:
 
 
 def drawable(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: int | None) -> Drawable:
-    """The system itself where a page can draw it; otherwise a copy with another field, another sampler, or both.
+    """The system itself where a page can draw it; otherwise a copy with voxels and an occupancy grid.
 
     Args:
         system: trained.
         cameras: views of the content: what they see is kept.
         config: of its run, as plain values.
-        cells: along a side of voxels that stand for another field; None takes as many as photos show, but not too many.
+        cells: along a side of the voxels; None takes as many as photos show, but not too many.
     """
-    config = copy.deepcopy(config)
-    changes: list[str] = []
     if is_drawable(system):
-        return Drawable(system, config, changes)
-    field, sampler = system.field, system.sampler
-    keeps_field, keeps_sampler = isinstance(field, TensoRFField | VoxelField), isinstance(sampler, OccupancySampler)
+        return Drawable(system, config, "")
+    field, options = voxels_like(system, cameras, cells)
+    sampler = OccupancySampler(field.bounds, STEPS, CELLS, chunk=system.chunk)
+    sampler.import_state({"grid.occupied": cells_around(field, CELLS).flatten()})
     made = copy.copy(system)
-    made._modules = dict(system._modules)  # the copy's parts are replaced, not changed
-    grid = sampler.grid.resolution if isinstance(sampler, OccupancySampler) else CELLS
-    if keeps_field:
-        seen = widened(visible_cells(system, cameras, grid))
-    else:
-        made.field, options = voxels_like(system, cameras, cells)
-        config["model"] = target_of(VoxelField, **options)
-        changes.append(f"voxels, {made.field.side - 1} a side, in place of its own field")
-        seen = cells_around(made.field, grid)
-    if not keeps_sampler:
-        config["sampler"] = target_of(OccupancySampler, samples=STEPS, resolution=CELLS)
-        changes.append(f"{STEPS} steps between {CELLS} cells a side in place of its own samples")
-    steps = OccupancySampler(field.bounds, STEPS, CELLS, chunk=system.chunk)
-    made.sampler = copy.deepcopy(sampler) if keeps_sampler else steps
-    made.sampler.import_state({"occupied": seen.flatten()})
-    made.sampler.to(system.device)
-    if not keeps_field:
-        teach(made, system, cameras)
-    return Drawable(made, config, changes)
+    made._modules = {**system._modules, "field": field, "sampler": sampler.to(system.device)}
+    teach(made, system, cameras)
+    replaced = {
+        "model": target_of(VoxelField, **options),
+        "sampler": target_of(OccupancySampler, samples=STEPS, resolution=CELLS),
+    }
+    return Drawable(made, config | replaced, f"voxels, {field.side - 1} a side, in place of its own field")
 
 
 def target_of(kind: type, **options: Any) -> dict[str, Any]:
@@ -97,7 +80,7 @@ def target_of(kind: type, **options: Any) -> dict[str, Any]:
 
 @torch.no_grad()
 def voxels_like(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[VoxelField, dict[str, Any]]:
-    """Voxels with the densities of a system's field, and its colours as some cameras see them, and their options.
+    """Voxels with the densities of a system's field and its colours as the nearest camera sees them, and their options.
 
     Args:
         system, cameras, cells: as in `drawable`.
@@ -119,16 +102,17 @@ def voxels_like(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[Vo
             break
         across = max(COARSEST, min(across - 1, int(across * math.sqrt(MOST / count))))
     chosen = keep[vertices]
-    centres = cameras.centres[torch.tensor(subsample(len(cameras), DIRECTIONS))].to(system.device)
-    found = [fitted(system, part, centres, voxels.terms) for part in places[chosen].split(CHUNK)]
-    colours, views = (torch.cat(column) for column in zip(*found, strict=True))
+    centres = cameras.centres.to(system.device)
+    colours = []
+    for part in places[chosen].split(CHUNK):
+        nearest = centres[torch.cdist(part, centres).argmin(1)]
+        rgb = system.field(part, torch.nn.functional.normalize(part - nearest, dim=1))[1]
+        colours.append(torch.logit(rgb, 1 / (1 + math.exp(LOGITS))))
     raw = (density[chosen] * voxels.unit_length).log().clamp(EMPTY, 15.0) / voxels.density_rate
-    nothing = (
-        raw.new_full((1,), EMPTY / voxels.density_rate),
-        colours.new_zeros(1, 3),
-        views.new_zeros(1, views.shape[1]),
-    )
-    voxels.set_vertices(keep.flatten(), [torch.cat(pair) for pair in zip(nothing, (raw, colours, views), strict=True)])
+    empty = torch.full_like(raw[:1], EMPTY / voxels.density_rate)
+    rows = torch.cat([torch.zeros_like(places[:1]), *colours])
+    views = rows.new_zeros(len(rows), 3 * voxels.terms)
+    voxels.set_vertices(keep.flatten(), [torch.cat([empty, raw]), rows, views])
     return voxels, options
 
 
@@ -172,20 +156,3 @@ def cells_around(voxels: VoxelField, grid: int) -> Cells:
     found = torch.zeros(grid, grid, grid, dtype=torch.bool, device=kept.device)
     found[x, y, z] = True
     return widened(found)
-
-
-def fitted(
-    system: NeRF3D, places: Float[Tensor, "N 3"], centres: Float[Tensor, "D 3"], terms: int
-) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N C"]]:
-    """Colours of voxels at some places, and the harmonics closest to how they change between the cameras' directions: by least
-    squares, before the sigmoid."""
-    directions = torch.nn.functional.normalize(places[:, None] - centres, dim=2)
-    several = places[:, None].expand_as(directions).flatten(0, 1)
-    rgb = system.field(several, directions.flatten(0, 1))[1].view(directions.shape)
-    logits = torch.logit(rgb, 1 / (1 + math.exp(LOGITS)))
-    basis = encode_directions(directions.flatten(0, 1), 1 + terms)[:, 1:].view(*directions.shape[:2], -1)
-    mean, middle = logits.mean(1, keepdim=True), basis.mean(1, keepdim=True)
-    basis = basis - middle
-    normal = basis.mT @ basis + DAMPING * len(centres) * torch.eye(terms, device=basis.device)
-    views = torch.linalg.solve(normal, basis.mT @ (logits - mean))
-    return mean[:, 0] - (middle @ views)[:, 0], views.mT.flatten(1)

@@ -2,24 +2,22 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import OmegaConf
 
 import nerf_lightning
-from nerf_lightning.dataset import PictureBatch, RayDataModule
 from nerf_lightning.drawing.panels import to_bytes
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.drawable import drawable, is_drawable
 from nerf_lightning.export.page import field_page, gallery_page, picture_page
-from nerf_lightning.export.reach import occupied_cells
-from nerf_lightning.export.smallest import held_out_psnr, smallest, some_cameras
+from nerf_lightning.export.smallest import held_out_psnr, occupied_cells, smallest, some_cameras
 from nerf_lightning.runs.compact import without_folders
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import RunFolder, plain_config
 from nerf_lightning.runs.index import FIELD_PAGE, find_runs, read_run, varied
 from nerf_lightning.runs.open import open_run
-from nerf_lightning.system import NeRF2D, NeRF3D
 from nerf_lightning.utils.files import write_text
 from nerf_lightning.utils.html import address_from
 from nerf_lightning.utils.text import subsample
@@ -32,42 +30,39 @@ def build_page(
     source: Path,
     device: torch.device,
     cells: int | None = None,
-    precision: str | None = None,
     loss_db: float = 0.1,
     photos: Path | None = None,
 ) -> tuple[str, str]:
     """A run as a web page, and what to say of it; options as in `cli.export.export_html`."""
     found = open_run(source, device)
-    if isinstance(found.system, NeRF3D) and source.is_file() and not photos and is_drawable(found.system):
-        assert found.orbit is not None  # a scene's run
+    system: Any = found.system
+    if found.orbit is not None and source.is_file() and not photos and is_drawable(system):
         content = without_folders(source.read_bytes())  # the page holds that very file
         facts = describe_run(source, found, [("size", f"{len(content) / 1000:,.1f} kB")])
-        return field_page(content, found.system, found.orbit, found.scene["name"], facts), "without photos"
+        return field_page(content, system, found.orbit, found.scene["name"], facts), "without photos"
     data = data_again(found.cfg, found.scene, photos)
-    if isinstance(found.system, NeRF2D):
-        view = data.held_out(0).to(found.system.device)
-        assert isinstance(view, PictureBatch)  # what a NeRF2D is fed
-        rgb = found.system.colours(view.uv).view(view.height, view.width, 3)
-        quality = f"PSNR {held_out_psnr(found.system, data):.2f} dB"
+    if found.orbit is None:
+        view: Any = data.held_out(0).to(system.device)
+        rgb = system.colours(view.uv).view(view.height, view.width, 3)
+        quality = f"PSNR {held_out_psnr(system, data):.2f} dB"
         facts = describe_run(source, found, [("quality", quality), ("size", f"{view.width} x {view.height} pixels")])
         return picture_page(to_bytes(rgb.cpu()), data.scene.name, facts), quality
-    assert isinstance(data, RayDataModule) and isinstance(found.system, NeRF3D) and found.orbit is not None
-    drawn = drawable(found.system, some_cameras(data), plain_config(found.cfg), cells)
-    seen = occupied_cells(drawn.system) if drawn.changes else None
-    compact = smallest(drawn.system, data, drawn.config, loss_db, precision, seen)
-    before = held_out_psnr(found.system, data) if drawn.changes else compact.before
-    content, changes = without_folders(compact.content), "; ".join(drawn.changes)
+    drawn = drawable(system, some_cameras(data), plain_config(found.cfg), cells)
+    seen = occupied_cells(drawn.system) if drawn.change else None
+    compact = smallest(drawn.system, data, drawn.config, loss_db, seen)
+    before = held_out_psnr(system, data) if drawn.change else compact.before
+    content = without_folders(compact.content)
     measured = [
         ("held-out PSNR", f"{compact.psnr:.2f} dB"),
         ("size", f"{len(content) / 1000:,.1f} kB, {compact.precision} precision"),
     ]
-    if changes:
-        measured.append(("drawn with", f"{changes}: {before - compact.psnr:.2f} dB lost"))
+    if drawn.change:
+        measured.append(("drawn with", f"{drawn.change}: {before - compact.psnr:.2f} dB lost"))
     train, chosen = data.scene.train, subsample(len(data.scene.train), MAX_PHOTOS)
     cameras, names = train.cameras[torch.tensor(chosen)].to("cpu"), [train.name(i) for i in chosen]
     facts = describe_run(source, found, measured)
     page = field_page(content, drawn.system, found.orbit, data.scene.name, facts, cameras, names)
-    return page, f"held-out PSNR {before:.2f} -> {compact.psnr:.2f} dB" + (f" ({changes})" if changes else "")
+    return page, f"held-out PSNR {before:.2f} -> {compact.psnr:.2f} dB" + (f" ({drawn.change})" if drawn.change else "")
 
 
 def describe_run(source: Path, found: RunFolder, measured: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

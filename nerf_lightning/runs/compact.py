@@ -21,9 +21,9 @@ from nerf_lightning.errors import InputError, found_in
 from nerf_lightning.runs.checkpoint import check_finite
 from nerf_lightning.runs.folder import RunFolder, config_from
 from nerf_lightning.runs.scene_file import frame_from
-from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.parsing import VALUE_ERRORS, Headers, existing_file, parse_json, read_content, read_npz
+from nerf_lightning.utils.parsing import VALUE_ERRORS, existing_file, parse_json, read_content, read_npz
 
 FORMAT, VERSION = "nerf_lightning compact", 1
 WORTH_BYTES = 2048
@@ -44,8 +44,8 @@ def encode(system: System, precision: str, config: dict[str, Any], scene: dict[s
     arrays: Arrays = {}
     codes: dict[str, Any] = {}
     learned = dict(system.field.named_parameters())
-    for part, tensors in parts(system).items():
-        for name, tensor in tensors.items():
+    for part, module in system.parts.items():
+        for name, tensor in module.export_state().items():
             code = "bits" if tensor.dtype == torch.bool else "half" if name in learned else "exact"
             if code == "half" and precision == "byte" and tensor.numel() >= WORTH_BYTES:
                 code = "byte"
@@ -54,14 +54,6 @@ def encode(system: System, precision: str, config: dict[str, Any], scene: dict[s
             arrays |= _coded(whole, tensor.detach().cpu().numpy(), code)
     header = {"format": FORMAT, "version": VERSION, "config": config, "scene": scene, "arrays": codes}
     return _packed(header, arrays)
-
-
-def parts(system: System) -> dict[str, dict[str, Tensor]]:
-    """The tensors to keep of each part of a system."""
-    packed = {"field": system.field.export_state()}
-    if isinstance(system, NeRF3D):
-        packed["sampler"] = system.sampler.export_state()
-    return packed
 
 
 def _coded(name: str, array: np.ndarray, code: str) -> Arrays:
@@ -117,9 +109,9 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
         with found_in(path):
             system = build_system(cfg, frame, device)
         tensors = {key: _decoded(key, arrays, one["code"], one["shape"]) for key, one in header["arrays"].items()}
-        system.field.import_state(_of("field", tensors))
-        if isinstance(system, NeRF3D):
-            system.sampler.import_state(_of("sampler", tensors))
+        for part, module in system.parts.items():
+            prefix = f"{part}."
+            module.import_state({key[len(prefix) :]: value for key, value in tensors.items() if key.startswith(prefix)})
     except InputError:
         raise
     except VALUE_ERRORS as error:
@@ -136,14 +128,12 @@ def _unpacked(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]
         InputError: as `decode`.
     """
     expected = "a compact file of this package"
-
-    def check(headers: Headers) -> None:
-        require_keys(path, headers, ["header"])
-        if (size := headers["header"].nbytes) > MAX_HEADER_BYTES:
-            raise InputError(path, "header", f"{size} bytes", f"{expected}: at most {MAX_HEADER_BYTES}")
-
-    arrays = read_npz(content, None, check, path, expected)
-    header = parse_json(arrays.pop("header").tobytes(), f"{path}: header", expected)
+    arrays = read_npz(content, None, path, expected)
+    require_keys(path, arrays, ["header"])
+    text = arrays.pop("header").tobytes()
+    if len(text) > MAX_HEADER_BYTES:
+        raise InputError(path, "header", f"{len(text)} bytes", f"{expected}: at most {MAX_HEADER_BYTES}")
+    header = parse_json(text, f"{path}: header", expected)
     format_, version = (header.get(key) for key in ("format", "version")) if isinstance(header, dict) else (None, None)
     if (format_, version) != (FORMAT, VERSION):
         found = f"{format_}, version {version}"
@@ -169,11 +159,6 @@ def _packed(header: dict[str, Any], arrays: Arrays) -> bytes:
     file = io.BytesIO()
     np.savez_compressed(file, **arrays, header=np.frombuffer(json.dumps(header, allow_nan=False).encode(), np.uint8))
     return file.getvalue()
-
-
-def _of(part: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    prefix = f"{part}."
-    return {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
 
 
 def load_compact(path: Path, device: torch.device = CPU) -> RunFolder:

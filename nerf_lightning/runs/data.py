@@ -13,9 +13,9 @@ from omegaconf import DictConfig
 from nerf_lightning.cameras import Cameras, in_other_frame, transform
 from nerf_lightning.config.build import SceneFrame, build_data
 from nerf_lightning.config.literal import escape
-from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
+from nerf_lightning.dataset import BUILT_IN, DataModule
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.size import AUTO
+from nerf_lightning.dataset.resize import AUTO
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.scene_file import frame_from
 
@@ -23,12 +23,12 @@ SAME_FRAME = 1e-5
 """Frames that differ less, in entries of the similarity between them, are one: in the unit of the run's own."""
 
 
-def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
+def in_frame_of(scene: Any, content: Mapping[str, Any]) -> Any:
     """A scene in the frame that a run was trained in, which other photos of it, or a later version of this package, may place
     and turn in another way: both know the frame of the files they came from.
 
     Args:
-        scene: just read.
+        scene: just read; a picture stays as it is.
         content: of the run's scene.json.
     """
     frame, _, to_source = frame_from(content, "scene.json") if "aabb" in content else (None, None, None)
@@ -41,17 +41,14 @@ def in_frame_of(scene: Scene, content: Mapping[str, Any]) -> Scene:
     def placed(cameras: Cameras) -> Cameras:
         return replace(cameras, c2w=in_other_frame(cameras.c2w, moved).float())
 
-    train, val, test = (
-        None if views is None else replace(views, cameras=placed(views.cameras))
-        for views in (scene.train, scene.val, scene.test)
-    )
-    assert train is not None and val is not None  # every scene has them
+    splits = {name: getattr(scene, name) for name in ("train", "val", "test")}
+    views = {name: one and replace(one, cameras=placed(one.cameras)) for name, one in splits.items()}
     points = None if scene.points is None else transform(moved, scene.points.double()).float()
-    scene = replace(scene, train=train, val=val, test=test, orbit=placed(scene.orbit), points=points)
-    return replace(scene, bounds=frame.bounds, to_source=to_source)
+    kept = {"bounds": frame.bounds, "to_source": to_source}
+    return replace(scene, **views, **kept, orbit=placed(scene.orbit), points=points)
 
 
-def seen_by_corrected(scene: Scene, content: Mapping[str, Any]) -> Scene:
+def seen_by_corrected(scene: Any, content: Mapping[str, Any]) -> Any:
     """A run's scene with its training cameras as the training has corrected them, if it has.
 
     Raises:
@@ -75,7 +72,7 @@ def seen_by_corrected(scene: Scene, content: Mapping[str, Any]) -> Scene:
 
 def data_again(
     cfg: DictConfig, scene: Mapping[str, Any], photos: str | Path | None = None, corrected: bool = True
-) -> RayDataModule | PixelDataModule:
+) -> DataModule:
     """The data module of a run. The network is never used, as the run may be a stranger's.
 
     Args:
@@ -96,10 +93,9 @@ def data_again(
     if at_hand.dataset.get("resize") == AUTO and "longest" in scene:
         at_hand.dataset.resize = scene["longest"]
     data = build_data(at_hand, photos)
-    if isinstance(data, RayDataModule):
-        data.scene = in_frame_of(data.scene, scene)
-        if photos is None and corrected:
-            data.scene = seen_by_corrected(data.scene, scene)
+    data.scene = in_frame_of(data.scene, scene)
+    if photos is None and corrected:
+        data.scene = seen_by_corrected(data.scene, scene)
     name = scene.get("name", data.scene.name)
     if photos is None and data.scene.name != name:
         expected = f"{name!r}, which the run was trained on"

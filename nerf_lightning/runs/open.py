@@ -49,7 +49,7 @@ def open_scene_run(path: Path, device: torch.device) -> SceneRun:
         InputError: as there, and for a picture's run.
     """
     found = open_run(path, device)
-    if not isinstance(found.system, NeRF3D) or found.orbit is None or found.to_source is None:
+    if found.orbit is None:
         raise InputError(path, "", "a picture's run", "a scene's run", "final.png shows a picture")
     return SceneRun(**vars(found))
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.config.build import Frame, PictureFrame, SceneFrame, frame_of
-from nerf_lightning.dataset import BUILT_IN, PixelDataModule, RayDataModule, Scene
+from nerf_lightning.dataset import BUILT_IN, DataModule
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import write_json
@@ -21,10 +21,7 @@ WHOLE = "the scene of a run, whole"
 
 
 def save_scene(
-    data: RayDataModule | PixelDataModule,
-    folder: Path,
-    corrected: Cameras | None = None,
-    focal_factor: float | None = None,
+    data: DataModule, folder: Path, corrected: Cameras | None = None, focal_factor: float | None = None
 ) -> None:
     """Writes what rendering needs of the scene, without its photos, and the training cameras if training has corrected them,
     perhaps with a factor on their focal length."""
@@ -34,13 +31,13 @@ def save_scene(
     write_json(folder / "scene.json", content)
 
 
-def scene_content(data: RayDataModule | PixelDataModule) -> dict[str, Any]:
+def scene_content(data: DataModule) -> dict[str, Any]:
     """The same as plain values."""
     scene, frame = data.scene, frame_of(data)
     content: dict[str, Any] = dict(scene.describe())
     if scene.source != BUILT_IN:
         content["source"] = os.path.abspath(scene.source)
-    if isinstance(scene, Scene) and isinstance(frame, SceneFrame):
+    if isinstance(frame, SceneFrame):
         content |= {
             # Of any photo: `resize=auto` chooses by the budget, device and memory, which differ when the run is opened again.
             "longest": max(views.cameras.longest for views in (scene.train, scene.val)),

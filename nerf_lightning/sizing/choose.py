@@ -71,19 +71,16 @@ class Measured:
     """Of training."""
 
 
-def stop_growing(rungs: Sequence[Measured], target: Target, noise: float) -> str:
-    """Why there is no point in growing further; "" where there is one. `noise` is the dB by which seeds differ."""
+def stop_growing(rungs: Sequence[Measured], target: Target) -> bool:
+    """Whether there is no point in growing further: the target is near, or the last rungs gained less than they cost."""
     if target.psnr is not None:
-        return "the target is near" if rungs[-1].psnr >= target.psnr - FULL_GAIN_DB else ""
+        return rungs[-1].psnr >= target.psnr - FULL_GAIN_DB
     if len(rungs) <= MAX_IDLE:
-        return ""
+        return False
     # The best before counts, not the last: two rungs that fall and rise again have gained nothing.
     base = max(rungs[:-MAX_IDLE], key=lambda one: one.psnr)
-    for one in rungs[-MAX_IDLE:]:
-        doublings = max(math.log2(one.size / base.size), 1.0)
-        if one.psnr - base.psnr > max(noise, target.within_db / GAIN_SHARE * doublings):
-            return ""
-    return f"the last {MAX_IDLE} rungs gained less than they cost"
+    each = target.within_db / GAIN_SHARE
+    return all(one.psnr - base.psnr <= each * max(math.log2(one.size / base.size), 1.0) for one in rungs[-MAX_IDLE:])
 
 
 def find_best(rungs: Sequence[Measured]) -> int:
@@ -112,10 +109,9 @@ def choose_second(first: int, psnr: float, rungs: Sequence[Measured], target: Ta
         return None if best == first else best
     if psnr < target.psnr:
         return first + 1 if first < last else None
-    expected = [one.psnr + psnr - rungs[first].psnr for one in rungs[:first]]
-    likely = [rung for rung, figure in enumerate(expected) if figure >= target.psnr]
-    close = [first - 1] if first and expected[-1] >= target.psnr - TOLERANCE_DB else []
-    return next(iter(likely + close), None)
+    needed = rungs[first].psnr + target.psnr - psnr
+    likely = (rung for rung in range(first) if rungs[rung].psnr >= needed - (TOLERANCE_DB if rung == first - 1 else 0))
+    return next(likely, None)
 
 
 def choose_final(full: Mapping[int, Measured], target: Target) -> tuple[int, bool]:

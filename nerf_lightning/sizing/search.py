@@ -4,21 +4,20 @@ import copy
 import inspect
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from statistics import stdev
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.callbacks import Budget
 from nerf_lightning.config import build
 from nerf_lightning.config.limits import limits_of
-from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.dataset import DataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.reach import confined_to, seen_cells
-from nerf_lightning.export.smallest import held_out_psnr, smallest, some_cameras
+from nerf_lightning.export.smallest import confined_to, held_out_psnr, seen_cells, smallest, some_cameras
 from nerf_lightning.model import as_wide
 from nerf_lightning.runs.compact import encode
 from nerf_lightning.runs.folder import load_run, plain_config
@@ -35,7 +34,7 @@ from nerf_lightning.sizing.choose import (
     choose_second,
     stop_growing,
 )
-from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.system import System
 from nerf_lightning.training.job import find_progress
 from nerf_lightning.training.process import prepare_process, warm_up
 from nerf_lightning.training.train import train
@@ -45,15 +44,12 @@ from nerf_lightning.utils.parsing import read_json
 from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.utils.text import subsample
 
-Data = RayDataModule | PixelDataModule
 LADDER_SHARE = 0.75
 """Share of a budget in steps that climbing the whole ladder takes."""
 RUNG_STEPS = 300
 """Steps on each rung where the budget is in seconds: what is chosen must not depend on what else the machine does."""
 VIEWS = 8
 """Held-out views that measure a rung, and training views that decide what its file must hold."""
-EXTRA_SEEDS = 2
-"""Further trainings of the smallest rung, to measure the spread over seeds."""
 MAX_SAMPLER_LOSS_DB = 0.05
 """By which a sampler may be worse than the best, on the same field."""
 GRID_UPDATES = 4
@@ -71,38 +67,17 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> dic
     Returns:
         The content of rightsize.json: `target`; `growing`, the rungs as they were while growing; `full`, those trained with the
         whole budget, by number; `rung`, the chosen one, with its options of `model` and `sampler`, and the `psnr` and
-        `artifact_bytes` of its compact file; whether it `reached` the target; the `device`; `noise_db`, by which seeds differ;
-        and the `search_seconds` of training in all.
+        `artifact_bytes` of its compact file; whether it `reached` the target; the `device`; and the `search_seconds` of
+        training in all.
 
     Raises:
         InputError: where the device, the data or an option of the ladder is no good; or the folder holds something else.
     """
-    device = build.device_of(cfg)
-    silence_lightning()
-    prepare_process(cfg)
-    data = build.build_data(cfg)
-    data.enlarge(limits_of(cfg, device).batch)
-    build.build_system(set_options(cfg, "model", ladder.rungs[0]), build.frame_of(data), device)
-    build.build_trainer(cfg, output, device)  # wrong options raise before anything is written
+    device, data = prepare(cfg, ladder, output)
     begin(output, cfg, target, ladder)
-    rungs: list[Measured] = []
-    systems: list[System] = []
-    noise = seconds = 0.0
-    stop = "the ladder ends there"
-    for system, rung in climb(cfg, data, ladder.rungs, output):
-        options = ", ".join(f"{key}={value}" for key, value in ladder.rungs[len(rungs)].items())
-        print(f"rung {len(rungs)}: {options}: {format_figures(rung.psnr, rung.size)}", flush=True)
-        rungs.append(rung)
-        systems.append(system)
-        if len(rungs) == 1:
-            seeds = [set_options(cfg, "", {"seed": cfg.seed + extra}) for extra in range(1, EXTRA_SEEDS + 1)]
-            others = [next(climb(one, data, ladder.rungs, output))[1] for one in seeds]
-            noise, seconds = stdev(one.psnr for one in (rung, *others)), sum(one.seconds for one in others)
-        if reason := stop_growing(rungs, target, noise):
-            stop = reason
-            break
+    rungs, systems = climb(cfg, data, ladder.rungs, target, output)
     first = choose_first(rungs, target)
-    print(f"climbed to rung {len(rungs) - 1}: {stop}; rung {first} seems enough", flush=True)
+    print(f"climbed to rung {len(rungs) - 1}; rung {first} seems enough", flush=True)
     sampler = find_sampler(set_options(cfg, "model", ladder.rungs[first]), data, systems[first], ladder.samplers)
     full = {first: train_in_full(cfg, ladder.rungs[first], sampler, data, output / f"rung_{first}")}
     second = choose_second(first, full[first].psnr, rungs, target, len(ladder.rungs) - 1)
@@ -122,11 +97,22 @@ def search(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> dic
         "sampler": sampler,
         "psnr": compact.psnr,
         "artifact_bytes": len(compact.content),
-        "noise_db": noise,
-        "search_seconds": seconds + sum(one.seconds for one in (*rungs, *full.values())),
+        "search_seconds": sum(one.seconds for one in (*rungs, *full.values())),
         "growing": [asdict(one) for one in rungs],
         "full": {str(rung): asdict(one) for rung, one in full.items()},
     }
+
+
+def prepare(cfg: DictConfig, ladder: Ladder, output: Path) -> tuple[torch.device, DataModule]:
+    """The device and the data, after all options were checked."""
+    device = build.device_of(cfg)
+    silence_lightning()
+    prepare_process(cfg)
+    data = build.build_data(cfg)
+    data.enlarge(limits_of(cfg, device).batch)
+    build.build_system(set_options(cfg, "model", ladder.rungs[0]), build.frame_of(data), device)
+    build.build_trainer(cfg, output, device)
+    return device, data
 
 
 def begin(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None:
@@ -161,7 +147,7 @@ def configure_rung(cfg: DictConfig, ladder: Sequence[Options], rung: int) -> Dic
     return set_options(changed, "model", ladder[rung])
 
 
-def train_rung(cfg: DictConfig, data: Data, folder: Path, smaller: System | None = None) -> tuple[System, float]:
+def train_rung(cfg: DictConfig, data: DataModule, folder: Path, smaller: System | None = None) -> tuple[System, float]:
     """Trains a system, from what a smaller one has learned if there is room for it.
 
     Returns:
@@ -169,8 +155,7 @@ def train_rung(cfg: DictConfig, data: Data, folder: Path, smaller: System | None
     """
     prepare_process(cfg)
     silence_lightning()
-    if isinstance(data, RayDataModule):
-        data.start_again()
+    data.start_again()
     device = build.device_of(cfg)
     system = build.build_system(cfg, build.frame_of(data), device)
     if smaller is not None and as_wide(system.field, smaller.field):
@@ -182,20 +167,30 @@ def train_rung(cfg: DictConfig, data: Data, folder: Path, smaller: System | None
     return system.to(device).eval(), Budget.of(trainer).seconds
 
 
-def climb(cfg: DictConfig, data: Data, ladder: Sequence[Options], folder: Path) -> Iterator[tuple[System, Measured]]:
-    """Trains the smallest rung, then continues with each larger one, for as many steps each.
+def climb(
+    cfg: DictConfig, data: DataModule, ladder: Sequence[Options], target: Target, folder: Path
+) -> tuple[list[Measured], list[System]]:
+    """Trains the smallest rung, then continues with each larger one, for as many steps each, while that pays.
 
     A rung that is smaller than the last in something starts anew.
+
+    Returns:
+        The rungs, and their systems.
     """
-    smaller: System | None = None
+    rungs: list[Measured] = []
+    systems: list[System] = []
     before = Options()
-    for rung in range(len(ladder)):
-        part = configure_rung(cfg, ladder, rung)
+    for number, options in enumerate(ladder):
+        part = configure_rung(cfg, ladder, number)
         model = build.resolved(part.model)
-        system, seconds = train_rung(part, data, folder, smaller if has_room(model, before) else None)
+        system, seconds = train_rung(part, data, folder, systems[-1] if systems and has_room(model, before) else None)
         parameters = sum(p.numel() for p in system.parameters() if p.requires_grad)
-        yield system, Measured(measure_psnr(system, data), compact_bytes(part, system, data), parameters, seconds)
-        smaller, before = system, model
+        rung = Measured(measure_psnr(system, data), compact_bytes(part, system, data), parameters, seconds)
+        print(f"rung {number}: {format_options(options)}: {format_figures(rung.psnr, rung.size)}", flush=True)
+        rungs, systems, before = [*rungs, rung], [*systems, system], model
+        if stop_growing(rungs, target):
+            break
+    return rungs, systems
 
 
 def has_room(model: Options, before: Options) -> bool:
@@ -204,7 +199,7 @@ def has_room(model: Options, before: Options) -> bool:
     return all(b >= a for a, b in both if isinstance(a, int | float) and isinstance(b, int | float))
 
 
-def measure_psnr(system: System, data: Data) -> float:
+def measure_psnr(system: System, data: DataModule) -> float:
     """Mean dB over a few held-out views.
 
     Raises:
@@ -216,22 +211,19 @@ def measure_psnr(system: System, data: Data) -> float:
     return found
 
 
-def compact_bytes(cfg: DictConfig, system: System, data: Data) -> int:
+def compact_bytes(cfg: DictConfig, system: Any, data: DataModule) -> int:
     """Approximate size of a system's compact file: only a few views decide what it must hold."""
-    seen = seen_cells(system, some_cameras(data, VIEWS)) if isinstance(data, RayDataModule) else None
+    seen = seen_cells(system, some_cameras(data, VIEWS)) if data.has_cameras else None
     return len(encode(confined_to(system, seen), "byte", plain_config(cfg), scene_content(data)))
 
 
-def find_sampler(cfg: DictConfig, data: Data, system: System, samplers: Sequence[Options]) -> Options:
+def find_sampler(cfg: DictConfig, data: DataModule, system: System, samplers: Sequence[Options]) -> Options:
     """The coarsest of some samplers with which a trained field renders as well as with the best; options that its kind of
     sampler does not have are left out."""
-    if not isinstance(system, NeRF3D) or not isinstance(data, RayDataModule):
-        return {}
-    known = inspect.signature(build.target_of(cfg, "sampler")).parameters
+    known = inspect.signature(build.target_of(cfg, "sampler")).parameters if samplers else {}
     scores: list[tuple[Options, float]] = []
     for options in (one for one in samplers if one.keys() <= known.keys()):
-        probe = build.build_system(set_options(cfg, "sampler", options), build.frame_of(data), system.device)
-        assert isinstance(probe, NeRF3D)  # of the same data
+        probe: Any = build.build_system(set_options(cfg, "sampler", options), build.frame_of(data), system.device)
         probe.field = system.field
         probe.to(system.device)
         probe.sampler.mark_invisible_cells(data.scene.train.cameras)
@@ -244,17 +236,20 @@ def find_sampler(cfg: DictConfig, data: Data, system: System, samplers: Sequence
     return next((options for options, psnr in scores if psnr >= enough), {})
 
 
-def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: Data, folder: Path) -> Measured:
-    """Trains a run of its own, with the whole budget. One that is finished is kept, one that
-    was interrupted continues."""
+def train_in_full(cfg: DictConfig, model: Options, sampler: Options, data: DataModule, folder: Path) -> Measured:
+    """Trains a run of its own, with the whole budget. One that is finished is kept, one that was interrupted continues."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
-    print(f"{folder}: {', '.join(f'{key}={value}' for key, value in model.items())}, in full", flush=True)
+    print(f"{folder}: {format_options(model)}, in full", flush=True)
     done, checkpoint = find_progress(read_run(folder), whole)
     if done is None:
         train(whole, checkpoint, folder)
     results, run = read_run(folder).results, load_run(folder, device=build.device_of(cfg))
     size = compact_bytes(run.cfg, run.system, data)
     return Measured(results["psnr"], size, results["parameters"], results["train_seconds"])
+
+
+def format_options(options: Options) -> str:
+    return ", ".join(f"{key}={value}" for key, value in options.items())
 
 
 def format_figures(psnr: float, size: int) -> str:

@@ -112,17 +112,16 @@ def train_trial(trial: Trial, folder: Path) -> dict[str, Any]:
     """
     from nerf_lightning.config.compose import composed
     from nerf_lightning.config.literal import override_of
-    from nerf_lightning.dataset import Picture, save_npz
+    from nerf_lightning.dataset import save_npz
     from nerf_lightning.drawing.panels import write_png
     from nerf_lightning.training.train import train
 
     condition, method = CONDITIONS[trial.condition], METHODS[trial.method]
-    made = condition.make(trial.seed)
-    if isinstance(made, Picture):
+    made: Any = condition.make(trial.seed)
+    if condition.flat:
         path = folder / "image.png"
         write_png(path, made.image.numpy())
-        given = [f"callbacks.{name}=null" for name in ("training_gif", "charts", "baselines")]
-        given += [f"dataset.max_side={max(made.size) // UPSCALE}", f"render.scale={UPSCALE}"]
+        given = ["callbacks.pictures=null", f"dataset.max_side={max(made.size) // UPSCALE}", f"render.scale={UPSCALE}"]
     else:
         path = folder / "scene.npz"
         save_npz(made, path)

@@ -52,8 +52,7 @@ class NeRF3D(System):
         backend: str | None = None,
         state: TrainingState | None = None,
     ):
-        super().__init__(optimizer, schedule, seed, chunk, backend, state)
-        self.field = field
+        super().__init__(field, optimizer, schedule, seed, chunk, backend, state)
         self.sampler = sampler
         self.renderer = renderer
         self.corrections = corrections
@@ -68,9 +67,8 @@ class NeRF3D(System):
         factors = {name: self.schedule(progress, step) * factor for name, factor in scheduled.items()}
         return factors if self.corrections is None else {**factors, **self.corrections.lr_factors(progress)}
 
-    def warm_start_from(self, smaller: System) -> None:
+    def warm_start_from(self, smaller: "NeRF3D") -> None:
         super().warm_start_from(smaller)
-        assert isinstance(smaller, NeRF3D)  # checked by the field
         self.sampler.warm_start_from(smaller.sampler)
         self.sampler.set_resolution_scale(self.field.resolution_scale)
 

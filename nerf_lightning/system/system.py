@@ -15,10 +15,13 @@ from torch import Tensor
 from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.model import Field, PictureField
+from nerf_lightning.refine import Corrections
+from nerf_lightning.sampler import CHUNK
 from nerf_lightning.system.metrics import psnr, ssim
 from nerf_lightning.system.state import TrainingState
 from nerf_lightning.utils.device import synchronize
 from nerf_lightning.utils.memory import give_back_freed_memory
+from nerf_lightning.utils.seeding import Stream, step_generator
 
 MakeOptimizer = Callable[[list[dict[str, Any]]], torch.optim.Optimizer]
 Schedule = Callable[[float, int], float]
@@ -96,6 +99,7 @@ class System(L.LightningModule):
     """Base of the two systems.
 
     Args:
+        field: place -> rgb, or position, direction -> density, rgb.
         optimizer: makes the optimiser from the parameters.
         schedule: factor on its learning rate by progress and step.
         seed: of all randomness in training steps.
@@ -104,30 +108,51 @@ class System(L.LightningModule):
         state: of the training, shared with the callbacks that steer it; None makes one.
     """
 
-    field: Field | PictureField
-
     def __init__(
         self,
+        field: Field | PictureField,
         optimizer: MakeOptimizer,
         schedule: Schedule,
-        seed: int,
-        chunk: int,
+        seed: int = 0,
+        chunk: int = CHUNK,
         backend: str | None = None,
         state: TrainingState | None = None,
     ):
         super().__init__()
+        self.field = field
         self.make_optimizer = optimizer
         self.schedule = schedule
         self.seed = seed
         self.chunk = chunk
         self.backend = backend
         self.state = state or TrainingState()
+        self.corrections: Corrections | None = None
+        """Of the training photos' cameras and light."""
         self.stats = StepStats(torch.tensor(math.nan), 0, 0)
 
     def warm_start_from(self, smaller: "System") -> None:
         """Continues from what a system with a smaller field of the same kind has learned."""
         field: Any = self.field
         field.warm_start_from(smaller.field)
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """What a compact file keeps, by name: modules with `export_state` and `import_state`."""
+        return {name: module for name, module in self.named_children() if hasattr(module, "export_state")}
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether cameras or light of the training photos were corrected."""
+        return self.corrections is not None and bool(self.corrections.enabled_at)
+
+    def compute_losses(self, batch: Any, generator: torch.Generator) -> tuple[dict[str, Tensor], StepStats]:
+        """The losses of a step by name, and what it did. All its randomness comes from `generator`."""
+        raise TypeError(f"{type(self).__name__} must define compute_losses(batch, generator)")
+
+    def rehearse(self, batch: Any) -> None:
+        """Computes the gradients of a step, so that kernels are compiled."""
+        losses, _ = self.compute_losses(batch.to(self.device), step_generator(0, Stream.STEP, 0, self.device))
+        total_loss(losses).backward()
 
     def param_groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups of parameters, each with a name; without `lr`, one takes the optimiser's own."""
@@ -171,6 +196,10 @@ class System(L.LightningModule):
     @property
     def background(self) -> list[float] | None:
         """The background of evaluated views; None for a picture."""
+        return None
+
+    def between(self, view: Any) -> float | None:
+        """PSNR of a picture's field between its pixels; None where there is none to measure."""
         return None
 
     def diagnose(self, view: Any) -> str:

@@ -28,11 +28,10 @@ class TensorBoard(TensorBoardLogger):
 
     Args:
         save_dir: the run's folder, which holds the file.
-        writer: options of torch's SummaryWriter, such as `flush_secs`.
     """
 
-    def __init__(self, save_dir: str | Path, **writer: Any):
-        super().__init__(save_dir, name="", version="", default_hp_metric=False, **writer)
+    def __init__(self, save_dir: str | Path):
+        super().__init__(save_dir, name="", version="", default_hp_metric=False)
 
     @functools.cached_property
     def began(self) -> float:
@@ -46,19 +45,13 @@ class TensorBoard(TensorBoardLogger):
             self.experiment.add_scalar(name, value, step, walltime=date)
 
     @rank_zero_only
-    def log_config(self, file: Path) -> None:
-        """Shows a run's configuration among the texts."""
-        lines = file.read_text(encoding="utf-8").splitlines()
-        self.experiment.add_text("config", "\n".join(f"    {line}" for line in lines))  # indented: Markdown's code
-
-    @rank_zero_only
     def log_summary(self, options: Mapping[str, Any], results: Mapping[str, Any]) -> None:
-        """Fills the tab HParams and closes the file. PSNR and seconds are there as curves, whose last values it shows."""
+        """Fills the HParams tab and closes the file. PSNR and seconds are curves, whose last values the tab shows."""
         from torch.utils.tensorboard.summary import hparams
 
-        told = {key: options.get(key) or "" for key in ("method", "recipe")}
-        told |= {"seed": options["seed"], "bytes": results["artifact_bytes"]}
-        for summary in hparams(told, dict.fromkeys(("val/psnr", TRAIN_SECONDS), 0.0)):
+        values = {key: options.get(key) or "" for key in ("method", "recipe")}
+        values |= {"seed": options["seed"], "bytes": results["artifact_bytes"]}
+        for summary in hparams(values, dict.fromkeys(("val/psnr", TRAIN_SECONDS), 0.0)):
             self.experiment.file_writer.add_summary(summary)
         self.experiment.close()
 

@@ -10,14 +10,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
-from nerf_lightning.dataset import PixelBatch, PixelDataModule, RayDataModule, draw_rays
+from nerf_lightning.dataset import DataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
-from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.system.system import total_loss
+from nerf_lightning.system import System
 from nerf_lightning.utils.memory import keep_freed_memory
 from nerf_lightning.utils.progress import animates
-from nerf_lightning.utils.seeding import Stream, step_generator
 
 
 def prepare_process(cfg: DictConfig, may_compile: bool = False) -> None:
@@ -45,11 +43,10 @@ def check_processes(trainer: L.Trainer) -> None:
     cluster = getattr(trainer.strategy, "cluster_environment", None)
     if HydraConfig.get().mode == RunMode.MULTIRUN and not getattr(cluster, "creates_processes_externally", False):
         todo = "or a launcher that starts the processes itself"
-        processes = str(trainer.world_size)
-        raise InputError("config", "trainer.devices", processes, "one process a job in a sweep", todo)
+        raise InputError("config", "trainer.devices", str(trainer.world_size), "one process a job in a sweep", todo)
 
 
-def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch.device) -> None:
+def warm_up(system: System, data: DataModule, device: torch.device) -> None:
     """Runs a small step on a copy, so that kernels are compiled before the clock starts.
 
     A CPU's kernels are compiled once and cached; those of `compile`, in every process.
@@ -58,12 +55,4 @@ def warm_up(system: System, data: RayDataModule | PixelDataModule, device: torch
     note = " (the first time they are compiled: half a minute)" if is_compiled else ""
     console = Console()
     with console.status(f"getting the kernels ready{note}") if animates(console) else nullcontext():
-        trial, generator = copy.deepcopy(system).to(device), step_generator(0, Stream.BATCH, 0)
-        if isinstance(trial, NeRF3D):
-            assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
-            batch = draw_rays(data.scene.train, 64, generator, with_texture=trial.renderer.uses_texture).to(device)
-            losses, _ = trial.compute_losses(batch, step_generator(0, Stream.STEP, 0, device))
-            total_loss(losses).backward()
-        else:
-            uv, rgb = torch.rand(64, 5, generator=generator).to(device).split([2, 3], dim=1)
-            trial.loss(PixelBatch(uv, rgb)).backward()  # type: ignore[operator]  # a NeRF2D's
+        copy.deepcopy(system).to(device).rehearse(data.small_batch())

@@ -7,10 +7,10 @@ from typing import Any
 
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 
-from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.dataset import DataModule
 from nerf_lightning.refine import format_report, summarize_corrections
 from nerf_lightning.runs.scene_file import save_scene
-from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.system import System
 from nerf_lightning.utils.machine import CROWDED, crowding
 from nerf_lightning.utils.text import join_truncated
 
@@ -18,16 +18,15 @@ MAX_NAMED_PHOTOS = 10
 """Photos that do not fit which are printed; all stand in results.json."""
 
 
-def report_photos(system: System, data: RayDataModule | PixelDataModule, results: dict[str, Any], folder: Path) -> None:
+def report_photos(system: System, data: DataModule, results: dict[str, Any], folder: Path) -> None:
     """Saves corrected cameras, and prints what training has found out about the photos."""
-    if isinstance(system, NeRF3D) and system.corrections is not None and system.corrections.is_finite:
-        assert isinstance(data, RayDataModule)  # what build_system makes a NeRF3D for
+    if system.corrections is not None and system.corrections.is_finite:
         if "poses" in system.corrections.enabled_at:
             cameras = system.corrections.poses.refine_cameras(data.scene.train.cameras)
             save_scene(data, folder, cameras, summarize_corrections(system.corrections)["focal_factor"])
         found = results["psnr_aligned"]
         aligned = "" if found is None else f"; {found:.2f} dB held out with held-out photos corrected too"
-        print(format_report(system.corrections, data.scene.train.name) + aligned)
+        print(format_report(system.corrections) + aligned)
     if results["misfits"]:
         named = join_truncated(
             [f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results["misfits"]], MAX_NAMED_PHOTOS

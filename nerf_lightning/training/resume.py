@@ -7,7 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerf_lightning.config.build import build_data, resolved, with_photos
 from nerf_lightning.config.literal import escape
-from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
+from nerf_lightning.dataset import DataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
 from nerf_lightning.runs.data import data_again
@@ -35,7 +35,7 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     return saved, checkpoint
 
 
-def load_data(cfg: DictConfig, scene: Scene | None, resumed: Path | None) -> RayDataModule | PixelDataModule:
+def load_data(cfg: DictConfig, scene: Scene | None, resumed: Path | None) -> DataModule:
     """The data to train on: a loaded scene, that of a resumed run in its frame, or the configuration's."""
     if resumed is not None:
         return data_again(cfg, load_scene(resumed), cfg.dataset.get("path"), corrected=False)

@@ -1,13 +1,11 @@
-"""Sweeps as a whole: how many jobs there are, a table of all, and what became of them. Imports nothing heavy."""
+"""Sweeps as a whole: a table of all jobs, and what became of them. Imports nothing heavy."""
 
 import csv
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
@@ -33,29 +31,12 @@ def write_table(root: Path, runs: Sequence[Run]) -> None:
             writer.writerow([run.folder.relative_to(root), run.status, *values, *figures, run.diagnosis])
 
 
-def count_jobs(config: DictConfig) -> int | None:
-    """Number of jobs of a sweep over a grid; None where the sweeper chooses them as it goes."""
-    if not config.hydra.sweeper._target_.endswith("BasicSweeper"):
-        return None
-    params = [f"{key}={value}" for key, value in (config.hydra.sweeper.get("params") or {}).items()]
-    parsed = OverridesParser.create().parse_overrides([*params, *config.hydra.overrides.task])
-    choices = {one.key_or_group: len([*one.sweep_iterator()]) if one.is_sweep_override() else 1 for one in parsed}
-    return math.prod(choices.values())
-
-
 class SweepReport(Callback):
-    """Hydra's hooks around the jobs: their number, then their comparison, and exit code 1 unless all are done."""
-
-    jobs: int | None = None
+    """Hydra's hooks around the jobs: their folder, then their comparison, and exit code 1 unless all are done."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         # Names come from this process's command line: resolved here, they are cached for jobs in other processes.
         print(f"sweep: {config.hydra.sweep.dir}, one folder a job, such as {config.hydra.sweep.subdir}", flush=True)
-        self.jobs = count_jobs(config)
-
-    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        if self.jobs is not None:
-            print(f"job {config.hydra.job.num + 1} of {self.jobs}", flush=True)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         from nerf_lightning.comparison.points import PUBLISHED, read_references

@@ -11,15 +11,15 @@ import lightning as L
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from lightning.pytorch.callbacks import LambdaCallback
 from omegaconf import DictConfig
 
 from nerf_lightning.callbacks import Budget, Live
-from nerf_lightning.callbacks.attached import ChecksData, attached
+from nerf_lightning.callbacks.attached import attached
 from nerf_lightning.callbacks.results import summarize_run
 from nerf_lightning.config.build import (
     build_system,
     build_trainer,
-    check_background,
     check_groups,
     corrects_poses,
     device_of,
@@ -27,16 +27,15 @@ from nerf_lightning.config.build import (
     resolved,
 )
 from nerf_lightning.config.limits import limits_of
-from nerf_lightning.dataset import PixelDataModule, RayDataModule, Scene
-from nerf_lightning.dataset.plausible import check_scene
+from nerf_lightning.dataset import DataModule, Scene
 from nerf_lightning.errors import InputError, NoRoom
 from nerf_lightning.runs.find import link_latest
 from nerf_lightning.runs.folder import save_config
 from nerf_lightning.runs.owner import clear
 from nerf_lightning.runs.scene_file import save_scene
-from nerf_lightning.system import NeRF3D, System
+from nerf_lightning.system import System
 from nerf_lightning.system.compiled import BACKEND, check_compiler
-from nerf_lightning.training.loggers import TensorBoard, finishing_wandb, log_summary
+from nerf_lightning.training.loggers import finishing_wandb, log_summary
 from nerf_lightning.training.process import check_processes, prepare_process, warm_up
 from nerf_lightning.training.report import report, report_photos
 from nerf_lightning.training.resume import load_data, resume
@@ -47,27 +46,13 @@ from nerf_lightning.utils.memory import check_memory, out_of_memory
 log = logging.getLogger(__name__)
 
 
-class WriteDescription(L.Callback):
-    """Writes what opens a run again once its training begins: a resumed run stays as it was where its state does not fit."""
-
-    def __init__(self, cfg: DictConfig, data: RayDataModule | PixelDataModule, folder: Path):
-        self.cfg, self.data, self.folder = cfg, data, folder
-
-    def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        save_config(self.cfg, self.folder)
-        save_scene(self.data, self.folder)
-        link_latest(self.folder)
-        if isinstance(trainer.logger, TensorBoard):
-            trainer.logger.log_config(self.folder / "config.yaml")
-
-
 @dataclass(frozen=True)
 class TrainingRun:
     """What a run is made of."""
 
     cfg: DictConfig
     folder: Path
-    data: RayDataModule | PixelDataModule
+    data: DataModule
     system: System
     trainer: L.Trainer
     warnings: list[str]
@@ -118,35 +103,37 @@ def prepare(cfg: DictConfig) -> torch.device:
 
 
 def build(
-    cfg: DictConfig,
-    data: RayDataModule | PixelDataModule,
-    device: torch.device,
-    folder: Path,
-    checkpoint: Path | None,
+    cfg: DictConfig, data: DataModule, device: torch.device, folder: Path, checkpoint: Path | None
 ) -> TrainingRun:
     """Makes system and trainer for the data, checks that they fit each other, and empties the folder unless a run continues."""
     data.enlarge(limits_of(cfg, device).batch)
-    doubts = check_scene(data.scene, corrects_poses(cfg)) if isinstance(data, RayDataModule) else []
+    doubts = data.find_doubts(corrects_poses(cfg))
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt.text)
     system = prepare_system(cfg, data, device, any(doubt.far_off for doubt in doubts))
     trainer = build_trainer(cfg, folder, device)
     check_processes(trainer)
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
-        if isinstance(callback, ChecksData):
-            callback.check(data)
+        if check := getattr(callback, "check", None):
+            check(data)
     if trainer.is_global_zero:
         if checkpoint is None:
             clear(folder)
-        trainer.callbacks.insert(0, WriteDescription(cfg, data, folder))  # type: ignore[attr-defined]
+        first = LambdaCallback(on_train_start=lambda *_: write_description(cfg, data, folder))
+        trainer.callbacks.insert(0, first)  # type: ignore[attr-defined]
     with trainer.precision_plugin.train_step_context():
         warm_up(system, data, trainer.strategy.root_device)
     return TrainingRun(cfg, folder, data, system, trainer, [doubt.text for doubt in doubts])
 
 
-def prepare_system(
-    cfg: DictConfig, data: RayDataModule | PixelDataModule, device: torch.device, poses_are_off: bool
-) -> System:
+def write_description(cfg: DictConfig, data: DataModule, folder: Path) -> None:
+    """Writes what opens a run again, once its training begins: a resumed run stays as it was where its state does not fit."""
+    save_config(cfg, folder)
+    save_scene(data, folder)
+    link_latest(folder)
+
+
+def prepare_system(cfg: DictConfig, data: DataModule, device: torch.device, poses_are_off: bool) -> System:
     """The system to train.
 
     Raises:
@@ -155,11 +142,10 @@ def prepare_system(
     system = build_system(cfg, frame_of(data), device)
     what = "numbers, with their gradients and moments,"
     check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
-    if isinstance(system, NeRF3D) and system.corrections is not None and poses_are_off:
+    if system.corrections is not None and poses_are_off:
         system.corrections.enable_poses_at_once()
     if system.field.sizing:
         log.info("model: %s", system.field.sizing)
-    check_background(cfg, data, system)
     return system
 
 

@@ -19,12 +19,10 @@ def test_budget_paused_clock_stands(clock, system, trainer_with):
             clock.wait(1000)
         clock.wait(1000)
         assert budget.seconds == 10, "the inner pause does not start the clock"
-    clock.wait(5)
-    assert budget.seconds == 15
     with pytest.raises(ZeroDivisionError), budget.paused():
         clock.wait(1000)
         raise ZeroDivisionError
-    clock.wait(1)
+    clock.wait(6)
     assert budget.seconds == 16, "runs again after an error"
     budget.on_train_end(trainer, system)
     clock.wait(1000)
@@ -35,40 +33,23 @@ def test_budget_paused_clock_stands(clock, system, trainer_with):
 
 
 @pytest.mark.parametrize(
-    ("steps", "seconds", "step", "spent", "expected"),
+    ("steps", "seconds", "step", "spent", "progress", "left", "rendering"),
     [
-        (200, None, 50, 30, 0.25),
-        (200, None, 300, 30, 1),
-        (None, 60, 50, 30, 0.5),
-        (200, 60, 50, 30, 0.5),
-        (200, 60, 150, 30, 0.75),
-        (200, 60, 50, 61, 1),
+        (200, None, 50, 30, 0.25, 90, 120),
+        (200, None, 300, 30, 1, 0, 30),
+        (200, 60, 50, 30, 0.5, 30, 60),
+        (200, 60, 150, 30, 0.75, 10, 40),
+        (None, 8, 50, 9, 1, 0, 30),
+        (200, None, 0, 0, 0, None, 30),
     ],
 )
-def test_progress_two_limits_follows_nearer(steps, seconds, step, spent, expected, clock, system, trainer_with):
-    budget = Budget(steps, seconds)
-    budget.on_train_start(trainer_with(budget), system)
-    clock.wait(spent)
-    assert budget.progress(step) == expected
-
-
-@pytest.mark.parametrize(
-    ("steps", "seconds", "step", "spent", "left", "rendering"),
-    [
-        (200, None, 50, 30, 90, 120),
-        (None, 60, 50, 20, 40, 60),
-        (200, 90, 100, 30, 30, 60),
-        (None, 8, 50, 9, 0, 30),
-        (200, None, 0, 0, None, 30),
-    ],
-)
-def test_seconds_left_two_limits_follow_nearer(
-    steps, seconds, step, spent, left, rendering, clock, system, trainer_with
+def test_budget_of_two_limits_follows_nearer(
+    steps, seconds, step, spent, progress, left, rendering, clock, system, trainer_with
 ):
     budget = Budget(steps, seconds)
     budget.on_train_start(trainer_with(budget), system)
     clock.wait(spent)
-    assert budget.seconds_left(step) == pytest.approx(left)
+    assert budget.progress(step) == progress and budget.seconds_left(step) == pytest.approx(left)
     assert budget.render_seconds(step) == pytest.approx(rendering), "as long as training, and at least half a minute"
 
 

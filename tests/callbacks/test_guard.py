@@ -166,14 +166,8 @@ def test_guard_plain_picture_is_no_failure(tmp_path: Path):
 def test_guard_dead_relu_is_replaced_and_saved(tmp_path: Path):
     """Of the seeds 0 to 7 this one dies: its density is zero everywhere, and no gradient comes back."""
     save_npz(make_scene(MARBLE, (1.0, 1.0, 1.0)), tmp_path / "scene.npz")
-    given = [
-        "dataset=photos",
-        f"dataset.path={tmp_path}/scene.npz",
-        *METHODS["relu mlp"].options,
-        "seed=7",
-        "threads=1",
-    ]
-    train(composed([*given, "budget.steps=100", "callbacks.orbit.frames=0"], tmp_path))
+    given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", *METHODS["relu mlp"].options, "seed=7"]
+    train(composed([*given, "threads=1", "budget.steps=100", "callbacks.orbit.frames=0"], tmp_path))
     (one,) = json.loads((tmp_path / "results.json").read_text())["recoveries"]
     assert "no density anywhere" in one["cause"] and "softplus" in one["action"] and one["step"] <= 80
     activation = load_run(tmp_path).system.field.activation

@@ -1,7 +1,4 @@
-import pytest
-
 from nerf_lightning.callbacks import Budget, HeldOut
-from nerf_lightning.errors import InputError
 
 
 def test_heldout_measures_at_fractions_with_clock_stopped(clock, system, trainer_with):
@@ -35,9 +32,3 @@ def test_heldout_step_passing_several_marks_adds_one_row(clock, system, trainer_
         system.state.advance(progress)
         resumed.on_train_batch_end(trainer, system, None, None, 0)
     assert resumed.curve == [[0, 5, 11], [0, 7, 12]], "what was measured before the pause is not measured again"
-
-
-@pytest.mark.parametrize("at", [[0.0], [1.0], [0.5, 0.2]])
-def test_heldout_bad_fractions_are_refused(at: list[float]):
-    with pytest.raises(InputError, match="callbacks.heldout.at"):
-        HeldOut(at)

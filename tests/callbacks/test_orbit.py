@@ -1,18 +1,16 @@
-"""The orbit takes no longer than training, unless it is asked for."""
+"""The orbit takes no longer than training."""
 
 from pathlib import Path
 
 import imageio.v3 as imageio
-import pytest
 
 from nerf_lightning.config.compose import composed
 from nerf_lightning.training.train import train
 
 
-@pytest.mark.parametrize(("asked", "frames", "side"), [("null", 60, 3), ("3", 3, 32)])
-def test_orbit_slow_field_is_small(asked: str, frames: int, side: int, tmp_path: Path, monkeypatch, capsys):
+def test_orbit_of_a_slow_field_is_small(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("nerf_lightning.callbacks.budget.Budget.render_seconds", lambda self, step: 1e-9)
-    off = ["callbacks.heldout=null", "callbacks.snapshots=null", "~logger"]
-    train(composed(["+experiment=smoke_3d", "budget.steps=2", f"callbacks.orbit.frames={asked}", *off], tmp_path))
-    assert imageio.imread(tmp_path / "orbit.gif").shape[0] == frames
-    assert (f"60 frames of {side}x{side}" in capsys.readouterr().out) == (asked == "null")
+    off = ["callbacks.heldout=null", "callbacks.snapshots=null", "callbacks.orbit.frames=3", "~logger"]
+    train(composed(["+experiment=smoke_3d", "budget.steps=2", *off], tmp_path))
+    frames, height, _, _ = imageio.imread(tmp_path / "orbit.gif").shape
+    assert frames == 3 and height < 200, "3 pixels, magnified, and a caption"

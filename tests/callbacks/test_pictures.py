@@ -10,20 +10,24 @@ import pytest
 import torch
 from PIL import Image
 
-from nerf_lightning.callbacks import Baselines, Budget, Enlarge, Evaluation, HeldOut, PictureCharts, TrainingGif
-from nerf_lightning.callbacks.pictures import curve_chart, error_chart, jpegs, quality_of, shrunk, words
-from nerf_lightning.dataset import Picture, PixelDataModule
+from nerf_lightning.callbacks import Budget, Enlarge, Evaluation, HeldOut, PictureReport
+from nerf_lightning.callbacks.pictures import (
+    compare_with_jpeg,
+    curve_chart,
+    encode_jpegs,
+    error_chart,
+    format_quality,
+    quality_of,
+    shrink,
+)
+from nerf_lightning.dataset import PixelDataModule
 from nerf_lightning.dataset.picture import builtin_picture
 from nerf_lightning.drawing.panels import narrowed
-from nerf_lightning.errors import InputError
 from nerf_lightning.model import PictureField
 from nerf_lightning.sources import from_picture
 from nerf_lightning.system import NeRF2D, constant
 
 CURVE = [[0.5, 10, 20.0], [1.5, 100, 25.0], [4.0, 300, 31.0]]
-
-
-# error.png, spectrum.png, curve.png
 
 
 def test_error_chart_shows_error_of_each_pixel():
@@ -48,28 +52,22 @@ def test_curve_chart_runs_over_seconds_and_steps():
         assert list(line.get_ydata()) == [20, 25, 31]
 
 
-def test_picture_charts_after_test_are_written(clock, system, trainer_with, tmp_path: Path):
-    charts, held_out = PictureCharts(), HeldOut([])
+def test_picture_report_after_test_is_written(clock, system, trainer_with, tmp_path: Path):
+    report, held_out = PictureReport(), HeldOut([])
     held_out.curve = CURVE
-    charts.on_test_end(trainer_with(Budget(steps=1), Evaluation(), held_out, charts), system)
+    report.on_test_end(trainer_with(Budget(steps=1), Evaluation(), held_out, report), system)
     names = {"error.png", "spectrum.png", "curve.png"}
-    assert {path.name for path in tmp_path.iterdir()} == names
+    assert {path.name for path in tmp_path.iterdir()} == {*names, "baselines.json"}, "no snapshots, no GIF"
     for name in names:
         picture = imageio.imread(tmp_path / name)
         assert min(picture.shape[:2]) > 300 and picture.std() > 1
 
 
-# final.png, and what TensorBoard gets
-
-
 @pytest.mark.parametrize(
-    ("height", "width", "most", "size"), [(40, 60, 60, (40, 60)), (40, 60, 30, (20, 30)), (2, 60, 6, (1, 6))]
+    ("size", "most", "expected"), [((40, 60), 60, (40, 60)), ((40, 60), 30, (20, 30)), ((2, 60), 6, (1, 6))]
 )
-def test_narrowed_keeps_proportion(height: int, width: int, most: int, size: tuple[int, int]):
-    assert narrowed(np.zeros((height, width, 3), np.uint8), most).shape == (*size, 3)
-
-
-# training.gif
+def test_narrowed_keeps_proportion(size: tuple[int, int], most: int, expected: tuple[int, int]):
+    assert narrowed(np.zeros((*size, 3), np.uint8), most).shape == (*expected, 3)
 
 
 def frames_of(path: Path) -> list[tuple[int, int, tuple[int, int]]]:
@@ -83,23 +81,17 @@ def frames_of(path: Path) -> list[tuple[int, int, tuple[int, int]]]:
     return frames
 
 
-def test_training_gif_shows_snapshots_in_order(trainer_with, system, tmp_path: Path):
-    gif, levels = TrainingGif(fps=5), [10, 200, 60, 120]
-    gif.on_test_end(trainer_with(gif), system)
-    assert not list(tmp_path.iterdir()), "no snapshots, no GIF"
-    (tmp_path / "snapshots").mkdir()
-    for number, level in reversed([*enumerate(levels)]):
-        path = tmp_path / "snapshots" / f"step_{10 * number:07d}.png"
+def test_training_gif_shows_snapshots_in_order(tmp_path: Path):
+    levels = [10, 200, 60, 120]
+    files = [tmp_path / f"step_{number}.png" for number in range(4)]
+    for path, level in zip(files, levels, strict=True):
         imageio.imwrite(path, np.full((20, 30, 3), level, np.uint8))
-    gif.on_test_end(trainer_with(gif), system)
+    PictureReport(fps=5).write_gif(files, tmp_path / "training.gif")
     frames = frames_of(tmp_path / "training.gif")
     assert [level for level, _, _ in frames[:4]] == levels and {level for level, _, _ in frames[3:]} == {120}
     assert [duration for _, duration, _ in frames[:3]] == [200] * 3
     assert sum(duration for _, duration, _ in frames[3:]) == 600
     assert {size for _, _, size in frames} == {(30, 20)}
-
-
-# baselines.json
 
 
 @pytest.fixture(scope="module")
@@ -108,44 +100,29 @@ def sunset() -> np.ndarray:
 
 
 def test_quality_of_lossless_is_infinite(sunset):
-    assert quality_of(sunset, sunset.copy()) == math.inf and words(math.inf) == "without loss"
+    assert quality_of(sunset, sunset.copy()) == math.inf and format_quality(math.inf) == "without loss"
     off_by_one = np.where(sunset > 127, sunset - 1, sunset + 1).astype(np.uint8)
     assert quality_of(sunset, off_by_one) == pytest.approx(20 * math.log10(255), abs=1e-4)
 
 
 def test_shrunk_picture_keeps_proportions_within_bytes(sunset):
     wide = sunset[:20]
-    assert [shrunk(wide, 2400 // n**2)["width"] for n in (1, 2, 4, 5)] == [40, 20, 10, 8]
+    assert [shrink(wide, 2400 // n**2)["width"] for n in (1, 2, 4, 5)] == [40, 20, 10, 8]
     limits = (30, 100, 700, 1500, 2399)
-    found = [shrunk(wide, limit) for limit in limits]
+    found = [shrink(wide, limit) for limit in limits]
     for one, limit in zip(found, limits, strict=True):
         assert one["bytes"] == 3 * one["width"] * one["height"] <= limit
     qualities = [one["psnr"] for one in found]
     assert qualities == sorted(qualities) and qualities[-1] > qualities[0] + 3
 
 
-@pytest.mark.parametrize(("size", "quality"), [(2000, 25.0), (2000, None), (100, 25.0)])
-def test_baselines_after_test_compare_same_bytes(
-    size, quality, sunset, trainer_with, system, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.setattr("nerf_lightning.callbacks.pictures.artifact_bytes", lambda system: size)
-    evaluation = Evaluation()
-    evaluation.figures["psnr"] = quality
-    trainer = trainer_with(evaluation)
-    trainer.datamodule = from_picture(max_side=40)
-    Baselines().on_test_end(trainer, system)
-    found, text = json.loads((tmp_path / "baselines.json").read_text()), capsys.readouterr().out
-    coded = jpegs(sunset)
-    small = [one["psnr"] for one in coded if one["bytes"] <= size]
-    good = [one["bytes"] for one in coded if quality is not None and one["psnr"] >= quality]
-    assert (found["bytes"], found["picture_bytes"], found["field"]) == (size, 4800, quality)
+@pytest.mark.parametrize("size", [2000, 100])
+def test_compare_with_jpeg_takes_the_same_bytes(size, sunset):
+    found = compare_with_jpeg(sunset, size)
+    small = [one["psnr"] for one in encode_jpegs(sunset) if one["bytes"] <= size]
+    assert (found["bytes"], found["picture_bytes"]) == (size, 4800)
     assert (found["jpeg"]["psnr"] == max(small) if small else found["jpeg"] is None) and (size > 100) == bool(small)
-    assert found["jpeg_as_good"]["bytes"] == min(good) if good else found["jpeg_as_good"] is None
-    assert found["bicubic"] == shrunk(sunset, size)
-    assert ("none that small" in text) == (size == 100) and ("as good as" in text) == (quality is not None)
-
-
-# enlarged.png
+    assert found["bicubic"] == shrink(sunset, size)
 
 
 class Ramp(PictureField):
@@ -198,11 +175,3 @@ def test_enlarge_without_larger_original_gives_no_scores(enlarge, tmp_path: Path
     assert scores["field"] is None and scores["bicubic"] is None
     assert imageio.imread(tmp_path / "enlarged.png").shape == (60, 120, 3)
     assert "3 times as large (120x60): no larger original" in capsys.readouterr().out
-
-
-def test_enlarge_scale_out_of_range_is_refused_before_training():
-    data = PixelDataModule(Picture("square", "made", torch.zeros(4, 4, 3, dtype=torch.uint8)))
-    Enlarge(2.0**12).check(data)
-    for scale in (2.0**12 + 1, 0.0, math.nan):
-        with pytest.raises(InputError, match="render.scale"):
-            Enlarge(scale).check(data)

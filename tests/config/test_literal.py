@@ -1,6 +1,5 @@
 """Text on command lines: every path is read as it is written."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +30,6 @@ ODD = (
         "\\${a}",
         "日本",
         "2024",
-        "1e5",
     ),
     *("true", "a;b&c", "~a", "choice(a,b)", NASTY),
 )
@@ -117,16 +115,3 @@ def test_run_and_picture_of_odd_names_train_resume_and_evaluate(inside, tmp_path
     code, _, err = inside("evaluate", f"run {NASTY}", "--photos", f"(2)/{picture.name}")
     assert code == 0, err
     assert f"(2)/{picture.name}" in (run / "evaluation" / "views.json").read_text(encoding="utf-8")
-
-
-def test_sweep_in_an_odd_folder_on_an_odd_path_trains(inside, tmp_path: Path):
-    for name in ("a (1)", "b, ü"):
-        write_picture(tmp_path / name)
-    paths = f"dataset.path={os.path.join('a (1)', 'photo, 1.png')}"
-    code, _, err = inside("-m", *SMALL, paths, "hydra.sweep.dir=sweep (1), ü", "seed=0,1")
-    assert code == 0, err
-    configs = [
-        yaml.safe_load(path.read_text(encoding="utf-8")) for path in (tmp_path / "sweep (1), ü").rglob("config.yaml")
-    ]
-    assert [config["dataset"]["path"] for config in configs] == [str(tmp_path / "a (1)" / "photo, 1.png")] * 2
-    assert sorted(config["seed"] for config in configs) == [0, 1]

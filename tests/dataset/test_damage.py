@@ -162,7 +162,7 @@ COLMAP = [
     (put(f"{MODEL}/images.bin", 44, "d", math.nan), "0000.png: found the pose"),
     (put(f"{MODEL}/images.bin", 68, "i", 77), "0000.png: found camera 77"),
     (lambda scene: (scene / MODEL / "images.bin").write_bytes(bytes(8)), "0 photos"),
-    (lambda scene: (scene / MODEL / "images.bin").unlink(), "a folder with images, sparse"),
+    (lambda scene: (scene / MODEL / "images.bin").unlink(), "a folder without a scene"),
     (no_photos, "at least half of the photos"),
     (picture("images/0003.png", 48, 40, 3), "0003.png: found 40x48 pixels, expected 48x40"),
     (text("images/0003.png", "a photo"), "0003.png: found 7 bytes"),

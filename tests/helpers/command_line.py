@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-BARE = ["callbacks.baselines=null", "callbacks.charts=null", "callbacks.training_gif=null", "callbacks.enlarge=null"]
+BARE = ["callbacks.pictures=null", "callbacks.enlarge=null"]
 
 
 def popen(*arguments: str, cwd: Path, python: str = sys.executable, path: str = str(ROOT)) -> subprocess.Popen[str]:

@@ -14,8 +14,7 @@ import torch
 
 from nerf_lightning.callbacks import Checkpoints
 from nerf_lightning.config.compose import composed
-from nerf_lightning.refine import corrections
-from nerf_lightning.system import aligned
+from nerf_lightning.system import photos, trial
 from nerf_lightning.training.train import train
 
 SCENE = [
@@ -23,8 +22,7 @@ SCENE = [
     *("dataset.samples=2048", "sampler.samples=32", "sampler.resolution=16", "callbacks.orbit=null"),
 ]
 PICTURE = [
-    *("+experiment=picture", "dataset.max_side=24", "dataset.pixels=256", "callbacks.baselines=null"),
-    *("callbacks.training_gif=null", "callbacks.charts=null"),
+    *("+experiment=picture", "dataset.max_side=24", "dataset.pixels=256", "callbacks.pictures=null"),
 ]
 MODELS = {
     "hashgrid": [*SCENE, "refine=auto", "model.levels=3", "model.finest=32", "model.log2_entries=10", "model.width=16"],
@@ -43,15 +41,15 @@ ANOTHER = "siren, another seed"
 STEPS = 14
 
 
-aligned.TOGETHER = aligned.APART = 1  # held-out photos are not what is compared
+photos.STEPS_TOGETHER = photos.STEPS_APART = 1  # held-out photos are not what is compared
 
 
 class Stop(Exception):
     """Training is to end here."""
 
 
-@patch.dict(corrections.MIN_GAIN, poses=-1.0, light=-1.0)  # refine=auto begins with its first trial
-@patch.multiple(corrections, FIRST_TRIAL_STEP=2, EARLY_STEPS=2)
+@patch.dict(trial.MIN_GAIN, poses=-1.0, light=-1.0)  # refine=auto begins with its first trial
+@patch.multiple(trial, FIRST_TRIAL_STEP=2, EARLY_STEPS=2)
 def fingerprints(folder: Path, stop: int) -> dict[str, str]:
     save = Checkpoints.on_train_batch_end
 

@@ -4,6 +4,7 @@ from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.errors import InputError
+from nerf_lightning.model import FieldOutput
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from tests.helpers.ragged_samples import ragged_samples
@@ -66,6 +67,14 @@ def test_render_uncovered_part_shows_background(background, colour, sigma, kerne
     torch.testing.assert_close(seen.opacity[0], opacity)
     torch.testing.assert_close(seen.rgb[0], opacity * red[0] + (1 - opacity) * torch.tensor(colour).float())
     assert (float(seen.depth) == 0) == (sigma == 0)
+
+
+def test_render_without_gradient_keeps_nothing_of_each_sample():
+    samples, residual = ragged_samples([5]), torch.rand(5, 3)
+    output = VolumeRenderer(view_loss_weight=1.0)(
+        along_z(1), samples, lambda *_: FieldOutput(torch.ones(5), torch.rand(5, 3), residual)
+    )
+    assert output.weights is None and output.view_residual is None
 
 
 def test_backgrounds_random_need_generator():

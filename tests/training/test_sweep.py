@@ -20,9 +20,9 @@ def table(root: Path) -> dict[str, dict[str, str]]:
 
 
 def test_sweep_again_does_nothing_and_keeps_table_and_figure(inside, tmp_path: Path):
-    command = ["-m", *SMALL, "callbacks.charts=null", "model.width=8,16", "seed=1"]
+    command = ["-m", *SMALL, "callbacks.pictures=null", "model.width=8,16", "seed=1"]
     code, out, err = inside(*command)
-    name = "sweep_budget.steps=3_callbacks.charts=null_dataset.max_side=16_model.width=8,16_seed=1"
+    name = "sweep_budget.steps=3_callbacks.pictures=null_dataset.max_side=16_model.width=8,16_seed=1"
     root = tmp_path / "outputs" / "smoke_2d" / name
     assert code == 0, err
     names = {f"model.width={width}" for width in (8, 16)}

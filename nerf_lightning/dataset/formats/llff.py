@@ -13,7 +13,7 @@ from nerf_lightning.dataset.posed import Hints, build_scene
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions, Shot
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.parsing import Header, read_npy
+from nerf_lightning.utils.parsing import read_npy
 
 POSES = "poses_bounds.npy"
 PHOTO_FOLDERS = ("images", "images_2", "images_4", "images_8", "")
@@ -34,12 +34,10 @@ def load_llff(folder: Path, name: str | None = None, options: PhotoLoadOptions =
         InputError: a damaged file, or as many photos as poses are not there.
     """
     path = folder / POSES
-
-    def check(header: Header) -> None:
-        if len(header.shape) != 2 or header.shape[1] != 17 or not header.shape[0] or header.dtype.kind not in "iuf":
-            raise InputError(path, "", f"shape {header.shape}, {header.dtype}", "numbers of shape (photos, 17)")
-
-    rows = read_npy(path, check).astype(np.float64)
+    rows = read_npy(path)
+    if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or rows.dtype.kind not in "iuf":
+        raise InputError(path, "", f"shape {rows.shape}, {rows.dtype}", "numbers of shape (photos, 17)")
+    rows = rows.astype(np.float64)
     columns = rows[:, :15].reshape(-1, 3, 5)
     c2w = np.tile(np.eye(4), (len(rows), 1, 1))
     c2w[:, :3] = columns[:, :, [1, 0, 2, 3]] * [1, 1, -1, 1]

@@ -4,7 +4,6 @@ import logging
 import math
 import re
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,13 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.posed import Hints, assemble_scene, split_shots
-from nerf_lightning.dataset.resize import fit_size, resize_views
+from nerf_lightning.dataset.resize import area_resize, choose_resize, fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions
-from nerf_lightning.dataset.size import choose_resize
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic
-from nerf_lightning.utils.parsing import Headers, read_npz
+from nerf_lightning.utils.parsing import read_npz
 
 log = logging.getLogger(__name__)
 
@@ -50,19 +48,21 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     Raises:
         InputError: anything missing, malformed or contradictory.
     """
-    data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS), partial(_check_headers, path))
+    data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS))
+    _check_shapes(path, data)
     count, height, width, channels = data["images_train"].shape
-    longest = choose_resize(path, [(width, height)] * count, channels, options.resize)
+    size = fit_size(width, height, choose_resize(path, [(width, height)] * count, channels, options.resize))
     K = _intrinsics(path, data, width, height)
 
     def read_poses(key: str) -> Cameras:
         c2w = checks.check_poses(path, key + "[{}]", data[key])
         checks.check_split_size(path, key, len(c2w))
-        return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height)
+        return Cameras.of_size(K.repeat(len(c2w), 1, 1), torch.from_numpy(c2w), width, height).resized(size)
 
     def read_views(key: str) -> Views:
-        views = Views.of(torch.from_numpy(_bytes(path, key, data[key])), read_poses(PAIRS[key]))
-        return resize_views(views, longest)
+        images = _bytes(path, key, data[key])
+        images = images if size == (width, height) else np.stack([area_resize(image, *size) for image in images])
+        return Views.of(torch.from_numpy(images), read_poses(PAIRS[key]))
 
     train, *held_out = (read_views(key) for key in PAIRS if key in data)
     if not held_out:
@@ -75,7 +75,7 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     has_path = "c2ws_test" in data and "images_test" not in data
     hints = Hints(
         keep_frame=True,
-        path=read_poses("c2ws_test").resized(fit_size(width, height, longest)) if has_path else None,
+        path=read_poses("c2ws_test") if has_path else None,
         background=_background(path, data["background"]) if "background" in data else None,
         bounds=_bounds(path, data, options),
         to_source=checks.check_similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,
@@ -86,20 +86,19 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     return assemble_scene(path, name, [train, *held_out], options, hints)
 
 
-def _check_headers(path: Path, headers: Headers) -> None:
-    """Compares shapes, before anything is unpacked."""
-    checks.require_keys(path, headers, NEEDED)
-    one = headers["images_train"].shape[1:]
-    for key in (key for key in PAIRS if key in headers):
-        checks.require_keys(path, headers, [PAIRS[key]])
-        (count, *shape), dtype = headers[key].shape or (0,), headers[key].dtype
+def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    checks.require_keys(path, arrays, NEEDED)
+    one = arrays["images_train"].shape[1:]
+    for key in (key for key in PAIRS if key in arrays):
+        checks.require_keys(path, arrays, [PAIRS[key]])
+        (count, *shape), dtype = arrays[key].shape or (0,), arrays[key].dtype
         if len(shape) != 3 or shape[2] not in (3, 4) or 0 in shape or (dtype != np.uint8 and dtype.kind != "f"):
             expected = "images of shape (V, H, W, 3 or 4), uint8 or floats in [0, 1]"
-            raise InputError(path, key, f"shape {headers[key].shape}, {dtype}", expected)
+            raise InputError(path, key, f"shape {arrays[key].shape}, {dtype}", expected)
         if tuple(shape) != one:
-            raise InputError(path, key, f"shape {headers[key].shape}", f"images of shape {one}, as in images_train")
+            raise InputError(path, key, f"shape {arrays[key].shape}", f"images of shape {one}, as in images_train")
         checks.check_split_size(path, key, count)
-        if (poses := headers[PAIRS[key]].shape[:1]) != (count,):
+        if (poses := arrays[PAIRS[key]].shape[:1]) != (count,):
             raise InputError(path, key, f"{count} images for {math.prod(poses)} poses", "one pose for each image")
 
 

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import threading
 from collections.abc import Callable
 
 import numba
@@ -24,18 +25,32 @@ def kernel(function: Callable) -> Callable:
 
     @functools.wraps(function)
     def run(*arguments):
-        given = [x.detach().contiguous().numpy() if isinstance(x, torch.Tensor) else x for x in arguments]
+        # A step makes some forty calls of up to thirty arguments, so each conversion that is not needed shows.
+        given = [
+            (x.detach() if x.requires_grad else x).contiguous().numpy() if isinstance(x, torch.Tensor) else x
+            for x in arguments
+        ]
         pieces = workers()
         compiled(*given, pieces) if takes_workers else compiled(*given)
 
     return run
 
 
+class _Threads(threading.local):
+    """What numba was told last: it keeps a number of threads for each thread, behind a lock."""
+
+    torch = numba = 0
+
+
+_threads = _Threads()
+
+
 def workers() -> int:
-    """Threads to use: as many as torch."""
+    """Sets numba's number of threads to torch's, and returns it."""
     asked = torch.get_num_threads()
-    threads = min(asked, numba.config.NUMBA_NUM_THREADS)
-    numba.set_num_threads(threads)
-    if torch.get_num_threads() != asked:  # both use OpenMP, and numba's start gives torch all cores too
-        torch.set_num_threads(asked)
-    return threads
+    if asked != _threads.torch:
+        _threads.torch, _threads.numba = asked, min(asked, numba.config.NUMBA_NUM_THREADS)
+        numba.set_num_threads(_threads.numba)
+        if torch.get_num_threads() != asked:  # both use OpenMP, and numba's start gives torch all cores too
+            torch.set_num_threads(asked)
+    return _threads.numba
