@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nerf_lightning.api import Run, View, compare, load_run, load_scene, rightsize, train
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["Run", "View", "compare", "load_run", "load_scene", "rightsize", "train"]
 
 

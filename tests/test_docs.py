@@ -1,4 +1,4 @@
-"""Every command in docs/ works: each page is run from top to bottom, with scenes and budgets made small."""
+"""Every code block of README.md and docs/ runs: each page from top to bottom, with small scenes and budgets."""
 
 import logging
 import re
@@ -6,6 +6,7 @@ import shlex
 import shutil
 import signal
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,9 @@ from nerf_lightning.utils.signals import Interrupted
 from tests.helpers.command_line import BARE
 from tests.helpers.tag_views import SIZE
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGES = sorted(DOCS.glob("*.md"))
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+PAGES = [README, *sorted(page for page in (ROOT / "docs").glob("*.md") if page.name != "index.md")]
 
 SCENE = (
     "dataset.download=false dataset.resize=16 dataset.rays=64 callbacks.orbit.frames=2 budget.seconds=null budget.steps=2"
@@ -48,11 +50,20 @@ SMALLER: list[tuple[str, str]] = [
     ("export compact", "--loss-db 100"),
     ("export html", "--loss-db 100 --cells 16"),
     ("export voxels", "--resolution 24"),
+    ("export transforms", ""),
     ("nerf_lightning export", "--threshold 1e-3 --resolution 24"),
 ]
 """What is added to a command that holds some words; the first that fits counts."""
-COMPOSED = ("launcher=joblib", "trainer=ddp", "tune_picture", "nerf_lightning stability", "--psnr 28")
+COMPOSED = (
+    *("launcher=joblib", "trainer=ddp", "tune_picture", "nerf_lightning stability", "--psnr 28"),
+    *("budget.seconds=180", "device=cpu ", "lego_hashgrid", "voxels_small", "dataset=photos", "-m +experiment=lego"),
+)
 """Commands that start processes of their own, are tested as such elsewhere, or take long: only their words are checked."""
+PYTHON = [
+    ("seconds=15", f"steps=2, options={SCENE.replace('dataset.download=false ', '').split()}"),
+    ("output=", "loss_db=100, output="),
+]
+"""Replacements that make the Python block of the README small."""
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -60,7 +71,8 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def commands(page: Path) -> list[str]:
-    return [line for block in blocks(page, "bash") for line in block.splitlines() if line.strip()]
+    lines = [line for block in blocks(page, "bash") for line in block.splitlines()]
+    return [line for line in lines if line.strip() and not line.startswith("pip install -e ")]
 
 
 def place(tmp_path: Path) -> Path:
@@ -127,11 +139,12 @@ def test_docs_page_commands_succeed(
 ):
     tmp_path = place(tmp_path)
     (tmp_path / "ladder.yaml").write_text("rungs: [{finest: 8, coarsest: 8}, {finest: 12, coarsest: 8}]\n")
-    for block in [*blocks(page, "python"), *blocks(page, "yaml")]:
+    files = [block for language in ("python", "yaml") for block in blocks(page, language) if block.startswith("# ")]
+    for block in files:
         file = tmp_path / block.splitlines()[0].removeprefix("# ")
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(block)
-    if "--calibration" in page.read_text(encoding="utf-8"):
+    if "--calibration sheet_photos" in page.read_text(encoding="utf-8"):
         folder, _ = request.getfixturevalue("made")
         shutil.copytree(folder / "calibration", tmp_path / "sheet_photos")
         shutil.copytree(folder / "photos", tmp_path / "object_photos")
@@ -143,13 +156,19 @@ def test_docs_page_commands_succeed(
     for line in commands(page):
         code = shell(smaller(line))
         assert code == 0, f"{line}\n{capfd.readouterr().err}"
+    for block in blocks(page, "python"):
+        if block not in files:
+            for words, small in PYTHON:
+                block = block.replace(words, small)
+            exec(compile(block, page, "exec"), {})
 
 
-def test_docs_links_lead_to_files():
-    readme = (DOCS.parent / "README.md").read_text()
-    for page in PAGES:
-        assert f"docs/{page.name}" in readme, page.name
-        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
-            assert (DOCS / target).exists(), f"{page.name}: {target}"
-    for target in re.findall(r"\]\(([^)#:]+)\)", readme):
-        assert (DOCS.parent / target).exists(), target
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_docs_links_targets_and_extras_exist(page: Path):
+    text = page.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
+        assert (page.parent / target).exists(), target
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = {extra for group in re.findall(r"\.\[([\w,]+)\]", text) for extra in group.split(",")}
+    assert extras <= {*project["optional-dependencies"]}
+    assert page == README or f"docs/{page.name}" in README.read_text(encoding="utf-8")
