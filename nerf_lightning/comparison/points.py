@@ -22,7 +22,7 @@ BACKGROUNDS = {"[0.0, 0.0, 0.0]": "black background", "[1.0, 1.0, 1.0]": "white 
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
 """Published figures, to stand beside one's own: never measured here, and always drawn as such."""
-FORMAT = "publications as in published.yaml: source, hardware, scene, conditions, methods: {NAME: [dB, seconds]}"
+FORMAT = "publications as in published.yaml: source, hardware, conditions, scenes: {SCENE: {METHOD: [dB, seconds]}}"
 
 
 class Conditions(NamedTuple):
@@ -165,10 +165,11 @@ def read_references(file: Path) -> pd.DataFrame:
     try:
         for entry in publications.values():
             origin = f"{entry['conditions']}; {entry['hardware']}; {entry['source']}"
-            for name, (psnr, seconds) in entry["methods"].items():
-                if not (0 < psnr < np.inf and 0 < seconds < np.inf):
-                    raise ValueError(f"{name}: {psnr} dB, {seconds} s")
-                rows.append((str(name), psnr, seconds, str(entry["scene"]), origin))
+            for scene, methods in entry["scenes"].items():
+                for name, (psnr, seconds) in methods.items():
+                    if not (0 < psnr < np.inf and 0 < seconds < np.inf):
+                        raise ValueError(f"{name}: {psnr} dB, {seconds} s")
+                    rows.append((str(name), psnr, seconds, str(scene), origin))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(file, "", f"{type(error).__name__}: {error}", FORMAT) from error
     return pd.DataFrame(rows, columns=["name", "psnr", "seconds", "scene", "origin"])

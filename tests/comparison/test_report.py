@@ -15,8 +15,8 @@ from nerf_lightning.errors import InputError
 from tests.comparison.conftest import run_maker
 from tests.helpers.run_results import MakeRun
 
-ENTRY = "  source: a paper\n  hardware: a cluster\n  scene: Toy\n  conditions: 800x800\n"
-METHODS = "  methods: {theirs: [35.5, 120], slower: [36, 90000.0], later: [36, 3000]}\n"
+ENTRY = "  source: a paper\n  hardware: a cluster\n  conditions: 800x800\n"
+METHODS = "  scenes: {Toy: {theirs: [35.5, 120], slower: [36, 90000.0], later: [36, 3000]}}\n"
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)>"
 
 
@@ -101,7 +101,7 @@ def test_collect_images_truth_comes_first(make_run: MakeRun):
 
 @pytest.mark.parametrize(
     "text",
-    ["one: 35 dB", f"one:\n{METHODS}", f"one:\n{ENTRY}  methods: {{a: [35, 0]}}", f"one:\n{ENTRY}  methods: {{a: 35}}"],
+    ["one: 35 dB", f"one:\n{METHODS}", f"one:\n{ENTRY}  scenes: {{Toy: {{a: [35, 0]}}}}", f"one:\n{ENTRY}  scenes: {{Toy: {{a: 35}}}}"],
 )
 def test_read_references_damaged_file_is_one_error(text: str, tmp_path: Path):
     (tmp_path / "mine.yaml").write_text(text)
@@ -111,4 +111,6 @@ def test_read_references_damaged_file_is_one_error(text: str, tmp_path: Path):
 
 def test_read_references_of_the_package_are_sound():
     found = read_references(PUBLISHED)
-    assert len(found) == 9 and found["psnr"].between(30, 40).all() and (found["scene"] == "lego").all()
+    assert len(found) == 8 * 11 + 2 and found["scene"].nunique() == 8 and found["psnr"].between(13, 40).all()
+    (ngp_pl,) = found[(found["name"] == "ngp_pl") & (found["scene"] == "lego")].itertuples()
+    assert (ngp_pl.psnr, ngp_pl.seconds) == (35.76, 305)
