@@ -4,12 +4,14 @@ import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from nerf_lightning.dataset.formats.decode import DAMAGED, DETAILS, THREADS, read_header, read_pixels
 from nerf_lightning.dataset.intrinsics import Intrinsics
@@ -199,8 +201,10 @@ def lens_tags(photo: Path) -> bytes:
     tags, kept = read_header(photo).tags, Image.Exif()
     try:
         kept.update({tag: str(tags[tag]) for tag in (MAKE, MODEL) if tag in tags})
-        focal = {tag: tags[tag] for tag in (FOCAL, FOCAL_35MM) if float(tags.get(tag, 0)) > 0}
-        kept.get_ifd(DETAILS).update(focal)
+        if float(tags.get(FOCAL, 0)) > 0:
+            kept.get_ifd(DETAILS)[FOCAL] = IFDRational(Fraction(float(tags[FOCAL])).limit_denominator(1000))
+        if float(tags.get(FOCAL_35MM, 0)) > 0:
+            kept.get_ifd(DETAILS)[FOCAL_35MM] = round(float(tags[FOCAL_35MM]))
         return kept.tobytes()
     except DAMAGED:
         return b""
