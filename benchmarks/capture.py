@@ -108,7 +108,7 @@ def count_flips(
     errors = [[angle_between(pose, h.pose) for h in found] for pose, found in zip(truth, options, strict=True)]
     return {
         how: sum(bool(e[i] > min(e) + FLIPPED_RAD) for e, i in zip(errors, chosen, strict=True))
-        for how, chosen in (("alone", [0] * count), ("in_order", resolve_flips(lens, options, seen)))
+        for how, chosen in (("alone", [0] * count), ("in_order", resolve_flips(options, [points] * count)))
     }
 
 

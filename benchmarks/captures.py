@@ -43,7 +43,7 @@ def against_truth(run: nl.Run, scene: Scene, room: Room) -> dict[str, float]:
         few, far = rays[some], distance[some]
         off = (run.system.render(few).depth - far).abs() / far
         errors.append(off)
-        floors.append(off[body[some] == room.floor])
+        floors.append(off[body[some] == len(room.bodies) - 2])
         fog.append(opacity_before(run.system, few, NEARER * far))
         seen, truth = run.render(camera).rgb.view(-1, 3), scene.val.image(view).view(-1, 3) / 255
         squares.append((seen - truth)[body < room.subject] ** 2)

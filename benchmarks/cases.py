@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 from nerf_lightning import kernels
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.model import HashGrid, HashGrid2DField, VectorMatrix, VoxelField
+from nerf_lightning.model.hashgrid import cubic_cells
 
 SAMPLES, RAYS = 1 << 15, 1 << 12
 STEPS, CELLS = 192, 64
@@ -158,7 +159,7 @@ def _cases() -> dict[str, Case]:
     unit = Bounds(aabb).to_unit(kernels.points(origins, directions, ray, t))[:SAMPLES]
     seen_from = directions[ray][:SAMPLES]
     harmonics = kernels.spherical_harmonics(seen_from)
-    grid, picture = HashGrid(), HashGrid2DField((512, 512))
+    grid, picture = HashGrid(cubic_cells(8, 16, 256), 17, 2), HashGrid2DField((512, 512)).grid
     layers = [torch.nn.Linear(i, o) for i, o in ((31, 32), (32, 32), (32, 3))]
     flat = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
     features = torch.rand(15, len(unit)).T
@@ -181,7 +182,7 @@ def _cases() -> dict[str, Case]:
         "mark_cells": Case(mark_cells, (marks, aabb, kernels.points(origins, directions, ray, t))),
         "hash_interpolate": Case(partial(hash_interpolate, grid.cells, grid.sizes), (grid.tables, unit), learns=1),
         "hash_interpolate_2d": Case(
-            partial(hash_interpolate, picture.resolutions, picture.sizes),
+            partial(hash_interpolate, picture.cells, picture.sizes),
             (picture.tables, torch.rand(SAMPLES, 2)),
             learns=1,
         ),

@@ -19,7 +19,7 @@ from nerf_lightning.capture.poses.solve import Solved
 from nerf_lightning.capture.run import capture_scene
 from nerf_lightning.capture.tags.layout import TagLayout
 from nerf_lightning.export.mesh import mesh_file, training_views
-from nerf_lightning.export.volume import volume_of
+from nerf_lightning.export.volume import sample_volume
 from nerf_lightning.runs.open import SceneRun, open_scene_run
 from nerf_lightning.synthetic.solids import bulldozer
 from nerf_lightning.utils.device import the_device
@@ -52,7 +52,7 @@ def distance_to_bricks(points: np.ndarray) -> np.ndarray:
 
 def mesh_of(run: SceneRun, box: torch.Tensor | None = None) -> tuple[trimesh.Trimesh, float]:
     """A run's mesh, read back from its file, and the side of a voxel in the same unit."""
-    volume = volume_of(run, box=box)
+    volume = sample_volume(run, box=box)
     content = mesh_file(run, training_views(run), volume, None, ".ply").content
     mesh: Any = trimesh.load(io.BytesIO(content), file_type="ply")
     return mesh, volume.cell * run.scale

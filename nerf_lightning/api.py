@@ -28,7 +28,7 @@ from nerf_lightning.cli.view import view
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.literal import override_of
 from nerf_lightning.dataset import PhotoLoadOptions, Scene, open_scene
-from nerf_lightning.dataset.size import AUTO, auto_resize
+from nerf_lightning.dataset.resize import AUTO, auto_resize
 from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
 from nerf_lightning.runs.index import read_run
 from nerf_lightning.runs.open import open_scene_run

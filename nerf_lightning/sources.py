@@ -16,10 +16,9 @@ from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PixelDataModule
 from nerf_lightning.dataset.rays import FOCUS, RAYS, SAMPLES, Focused, RayDataModule
-from nerf_lightning.dataset.resize import area_resize, fit_size
+from nerf_lightning.dataset.resize import AUTO, AutoResize, area_resize, fit_size
 from nerf_lightning.dataset.scene import BUILT_IN
 from nerf_lightning.dataset.shots import Masked, Orientation, PhotoLoadOptions
-from nerf_lightning.dataset.size import AUTO, AutoResize
 from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.files import atomic, user_path

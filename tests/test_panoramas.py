@@ -89,7 +89,7 @@ def test_mesh_from_panoramas_sees_all_directions():
     around = orbit_around(CENTRE, UP, 3.0, 0.6, 6)
     away = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # the ball lies on the seam of half of them
     c2w = torch.cat([around, orbit_around(CENTRE, UP, 3.0, -0.6, 6) @ away])
-    shape = mesh_file(run, panoramas(c2w, 160, 80), sample_volume(run.system, 32), None, ".ply")
+    shape = mesh_file(run, panoramas(c2w, 160, 80), sample_volume(run, 32), None, ".ply")
     assert "watertight" in shape.words and "floating" not in shape.words
     vertices = np.frombuffer(
         shape.content.split(b"end_header\n")[1], np.dtype([("v", "<f8", 3), ("rgb", "u1", 3)]), 100

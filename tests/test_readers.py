@@ -45,6 +45,7 @@ READERS: dict[str, tuple[str, str, Reader]] = {
     # name: file to damage, what to read, reader
     "json": ("figures.json", "figures.json", lambda path: read_json(path, "figures")),
     "yaml": ("options.yaml", "options.yaml", lambda path: read_yaml(path, "options")),
+    "npy": ("llff/poses_bounds.npy", "llff/poses_bounds.npy", read_npy),
     "checkpoint": ("run/checkpoints/last.ckpt", "run/checkpoints/last.ckpt", lambda p: read_checkpoint(p, RESUME_KEYS)),
     "run config": ("run/config.yaml", "run", load_config),
     "run scene": ("run/scene.json", "run", load_run),
@@ -162,7 +163,7 @@ def test_no_reader_executes_what_a_file_holds(whole: Path, tmp_path: Path):
     config["model"] = {"_target_": "os.system", "command": f"touch {canary}"}
     (run / "config.yaml").write_text(yaml.safe_dump(config))
     attempts: list[tuple[Reader, str]] = [
-        (lambda path: read_npy(path, lambda header: None), "a.npy"),
+        (read_npy, "a.npy"),
         (load_compact, "a.npz"),
         (read_scene, "a.npz"),
         (read_checkpoint, "a.ckpt"),

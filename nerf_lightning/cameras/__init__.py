@@ -2,7 +2,7 @@
 
 from nerf_lightning.cameras.bounds import Bounds, InBounds
 from nerf_lightning.cameras.cameras import Cameras, Rays, has_panoramas
-from nerf_lightning.cameras.layout import Layout, classify_layout, gaze_point
+from nerf_lightning.cameras.layout import Layout, classify_layout
 from nerf_lightning.cameras.lenses import Distortion, Lenses, Projection
 from nerf_lightning.cameras.paths import orbit_like, pivot_of, resample_path, spiral_like
 from nerf_lightning.cameras.poses import find_up, look_at, orbit_around, turn_upright, typical_view, upward
@@ -19,7 +19,6 @@ __all__ = [
     "Rays",
     "classify_layout",
     "find_up",
-    "gaze_point",
     "has_panoramas",
     "in_other_frame",
     "look_at",

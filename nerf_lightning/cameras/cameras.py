@@ -68,11 +68,6 @@ class Cameras(TensorDataclass):
     def centres(self) -> Float[Tensor, "V 3"]:
         return self.c2w[:, :3, 3]
 
-    @cached_property
-    def one_size(self) -> bool:
-        """Whether all views have the same width and height."""
-        return bool((self.sizes == self.sizes[:1]).all())
-
     def size(self, view: int) -> tuple[int, int]:
         """Width and height of a view."""
         width, height = self.sizes[view].tolist()
@@ -171,15 +166,11 @@ class Cameras(TensorDataclass):
         assert self.lenses is not None  # pinhole cameras need none
         sizes = self.sizes.to(self.K)
         every = torch.cat([self.K.flatten(1), sizes, self.lenses.coefficients], dim=1)
-        _, which = torch.unique(every, dim=0, return_inverse=True)
+        lenses, which = torch.unique(every, dim=0, return_inverse=True)
+        K, size, coefficients = lenses.repeat_interleave(LATTICE**2, dim=0).tensor_split([9, 11], dim=1)
         t = torch.linspace(0, 1, LATTICE, dtype=self.K.dtype, device=self.K.device)
-        lattice = torch.stack(torch.meshgrid(t, t, indexing="xy"), dim=2).view(-1, 2)
-        tables = []
-        for lens in range(int(which.max()) + 1):
-            view = int((which == lens).int().argmax())
-            seen = on_sensor(self.K[view : view + 1], lattice * sizes[view])
-            tables.append(undistort(seen, self.lenses.coefficients[view : view + 1]))
-        return which, torch.cat(tables), (LATTICE - 1) / sizes
+        lattice = torch.stack(torch.meshgrid(t, t, indexing="xy"), dim=2).view(-1, 2).repeat(len(lenses), 1)
+        return which, undistort(on_sensor(K.view(-1, 3, 3), lattice * size), coefficients), (LATTICE - 1) / sizes
 
     def view_rays(self, view: int) -> Rays:
         """All H*W rays of one view, row by row."""

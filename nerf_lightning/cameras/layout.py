@@ -21,9 +21,6 @@ MAX_STRIP = 1.5
 """Largest spread of forward-facing cameras likewise; farther apart, they do not look at one thing."""
 SINGLE_ROUNDING, DOUBLE_ROUNDING = 5e-7, 1e-12
 """Centres that spread by less than this share of their coordinates are the same, by the precision they are given in."""
-MIN_SCATTER = 0.5
-"""Centres are noise where those of neighbours, in order and in direction, differ by at least this share of what any two do."""
-MIN_VIEWS_FOR_NOISE = 6
 DENSITY_SHARPNESS, MAX_DENSITY_WEIGHT = 8.0, 3.0
 """Concentration of the kernel that estimates how densely directions are seen from, and the largest weight of a lone view."""
 MAX_POINTS = 4096
@@ -45,8 +42,7 @@ class Layout(StrEnum):
 def classify_layout(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"] | None = None) -> Layout:
     """Classifies cameras by their poses (OpenCV, camera to world).
 
-    Poses alone do not tell the depth of the scene: a hand-held pan is then recognised by centres that depend neither on the
-    photos' order nor on their direction.
+    Poses alone do not tell the depth of the scene: a pan whose centre moves is a walk then.
 
     Args:
         c2w: at least one pose; any similarity gives the same answer.
@@ -63,11 +59,7 @@ def classify_layout(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"] | 
     if circular_variance(axes) <= MAX_FORWARD_SPREAD:
         too_wide = depth is not None and spread > MAX_STRIP * depth
         return Layout.WALK if too_wide or is_dolly(centres, axes) else Layout.FORWARD
-    if find_convergence(c2w) is not None:
-        return Layout.INWARD
-    if depth is None and len(c2w) >= MIN_VIEWS_FOR_NOISE and is_noise(centres, axes):
-        return Layout.PAN
-    return Layout.WALK
+    return Layout.WALK if find_convergence(c2w) is None else Layout.INWARD
 
 
 def circular_variance(directions: Float[Tensor, "V 3"]) -> float:
@@ -103,15 +95,6 @@ def is_dolly(centres: Float[Tensor, "V 3"], axes: Float[Tensor, "V 3"]) -> bool:
     offset = centres - centres.mean(0)
     along = offset @ normalize(axes.mean(0), dim=0)
     return bool(2 * along.square().sum() > offset.square().sum())
-
-
-def is_noise(centres: Float[Tensor, "V 3"], axes: Float[Tensor, "V 3"]) -> bool:
-    """Whether centres depend neither on the photos' order nor on where they look."""
-    usual = 2 * (centres - centres.mean(0)).square().sum(1).mean()
-    in_order = (centres[1:] - centres[:-1]).square().sum(1).mean()
-    alike = (axes @ axes.T - 3 * torch.eye(len(axes)).to(axes)).argmax(1)
-    in_direction = (centres - centres[alike]).square().sum(1).mean()
-    return bool(torch.minimum(in_order, in_direction) > MIN_SCATTER * usual)
 
 
 def find_convergence(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"] | None:

@@ -11,27 +11,24 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras.cameras import Cameras
-from nerf_lightning.cameras.layout import Layout, centre_spread, classify_layout, find_convergence
+from nerf_lightning.cameras.layout import Layout, centre_spread, find_convergence
 from nerf_lightning.cameras.poses import find_up, level_axes, look_at, typical_view, upward
 
 MAX_STEEPNESS = 1.4
 """Largest angle of a path above or below the horizon, radians."""
 AZIMUTH_SHARPNESS = 4.0
 """Concentration of the kernel (von Mises) that averages cameras by azimuth: a standard deviation of about 29 degrees."""
-MIN_DENSITY = 0.15
-"""An azimuth was photographed where the kernel density is at least this share of its mean: gaps of 90 degrees do."""
+MAX_GAP = math.pi / 2
+"""Widest gap between the azimuths of cameras all around, radians."""
 INSIDE = 0.7
 """Share of the views that lie within a loop before the subject."""
-WALK_SAMPLES = 512
 SPIRAL_TURNS, SPIRAL_CLIMB = 2, 0.75
 """Turns of a spiral, and how much of the way to its axis it climbs."""
 MIN_ONE_SIDED = 0.1
 """Mean of the unit vectors from a subject to a path's views below which they are all around it."""
 
 
-def orbit_like(
-    cameras: Cameras, frames: int = 60, layout: Layout | None = None, centre: Float[Tensor, "3"] | None = None
-) -> Cameras:
+def orbit_like(cameras: Cameras, layout: Layout, centre: Float[Tensor, "3"], frames: int = 60) -> Cameras:
     """A closed path that shows what `cameras` show from where they stood, upright, with the lens of a typical one.
 
     Inward: a full turn at the cameras' distance and height, looking at the subject, or a swing within the arc that they cover.
@@ -40,43 +37,31 @@ def orbit_like(
 
     Args:
         cameras: at least one.
+        layout: of the cameras.
+        centre: the subject, for inward and forward cameras.
         frames: number of views; the last stops one step short of the first, so that a loop is smooth.
-        layout: of the cameras; None classifies them.
-        centre: the subject, for inward and forward cameras; None takes what they gaze at.
     """
     c2w = cameras.c2w.double()
-    layout = classify_layout(c2w) if layout is None else layout
     up = find_up(c2w)
+    centres = c2w[:, :3, 3]
     if layout == Layout.WALK:
         poses = walk_along(c2w, up, frames)
+    elif layout == Layout.FORWARD:
+        poses = loop_before(c2w, centre.double(), up, frames)
     elif layout == Layout.PAN:
-        poses = turn_on_spot(c2w, up, frames)
+        spot = centres.median(0).values.expand(frames, 3)
+        poses = look_at(spot, spot + angular_loop(c2w[:, :3, 2], up, frames)[0], up)
     else:
-        if centre is None:
-            ahead = c2w[:, :3, 3].mean(0) + (4 * centre_spread(c2w) or 1.0) * normalize(c2w[:, :3, 2].mean(0), dim=0)
-            target = find_convergence(c2w)
-            centre = ahead if target is None else target
-        build = turn_around if layout == Layout.INWARD else loop_before
-        poses = build(c2w, centre.double(), up, frames)
+        direction, weights = angular_loop(centres - centre, up, frames)
+        distance = weights @ (centres - centre).norm(dim=1)
+        poses = look_at(centre + distance[:, None] * direction, centre.double(), up)
     lens = cameras[typical_view(cameras)].as_pinholes()  # photos of all directions have no view to repeat
-    return Cameras.of_size(lens.K.repeat(frames, 1, 1), poses.to(cameras.c2w), *lens.size(0))
-
-
-def turn_around(
-    c2w: Float[Tensor, "V 4 4"], centre: Float[Tensor, "3"], up: Float[Tensor, "3"], frames: int
-) -> Float[Tensor, "frames 4 4"]:
-    """Around a subject, or along an arc before it, at the distance and height of the cameras on that side."""
-    offset = c2w[:, :3, 3] - centre
-    direction, weights = angular_loop(offset, up, frames)
-    distance = weights @ offset.norm(dim=1)
-    return look_at(centre + distance[:, None] * direction, centre, up)
-
-
-def turn_on_spot(c2w: Float[Tensor, "V 4 4"], up: Float[Tensor, "3"], frames: int) -> Float[Tensor, "frames 4 4"]:
-    """From the median of the cameras' centres, all around or as far as the photos look."""
-    spot = c2w[:, :3, 3].median(0).values.expand(frames, 3)
-    direction, _ = angular_loop(c2w[:, :3, 2], up, frames)
-    return look_at(spot, spot + direction, up)
+    K, (width, height) = lens.K[0], lens.size(0)
+    right, down = (lens.c2w[0, :3, axis].double() @ up for axis in (0, 1))
+    if abs(right) > abs(down):  # the camera was held on its side, and the photo is stored so
+        K = torch.stack([K[1, [1, 0, 2]], K[0, [1, 0, 2]], K[2]])
+        width, height = height, width
+    return Cameras.of_size(K.repeat(frames, 1, 1), poses.to(cameras.c2w), width, height)
 
 
 def angular_loop(
@@ -102,29 +87,21 @@ def angular_loop(
         return (normalize(around(at), p=1, dim=1) * elevation).sum(1)
 
     turn = torch.arange(frames, dtype=up.dtype, device=up.device) * (2 * math.pi / frames)
-    compass = torch.arange(360, dtype=up.dtype, device=up.device) * (2 * math.pi / 360)
-    density = around(compass).sum(1)
-    seen = density >= MIN_DENSITY * density.mean()
-    if bool(seen.all()):
+    in_order = azimuth.sort().values
+    gaps = torch.cat([in_order[1:], in_order[:1] + 2 * math.pi]) - in_order
+    if float(gaps.max()) < MAX_GAP:
         at = azimuth[0] + turn
         above = mean_elevation(at)
     else:
-        middle = compass[density.argmax()]
-        dark, off = wrap(compass[~seen] - middle), wrap(azimuth - middle)
-        start = max([-math.pi, *dark[dark < 0].tolist()])
-        end = min([math.pi, *dark[dark > 0].tolist()])
-        within = off[(off > start) & (off < end)]
-        low, high = within.min(), within.max()
-        at = middle + (low + high) / 2 + (high - low) / 2 * torch.cos(turn)
+        first = int(gaps.argmax()) + 1
+        in_order = torch.cat([in_order[first:], in_order[:first] + 2 * math.pi])
+        arcs = in_order.tensor_split(((in_order.diff() >= MAX_GAP).nonzero()[:, 0] + 1).tolist())
+        arc = max(arcs, key=len)
+        at = arc[0] + (arc[-1] - arc[0]) / 2 * (1 + torch.cos(turn))
         above = mean_elevation(at) + (elevation - mean_elevation(azimuth)).abs().quantile(INSIDE) * torch.sin(turn)
     above = above.clamp(-MAX_STEEPNESS, MAX_STEEPNESS)
     flat = torch.cos(at)[:, None] * front + torch.sin(at)[:, None] * right
     return torch.cos(above)[:, None] * flat + torch.sin(above)[:, None] * up, normalize(around(at), p=1, dim=1)
-
-
-def wrap(angle: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-    """The same angles from -pi to pi."""
-    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
 def loop_before(
@@ -145,22 +122,17 @@ def loop_before(
 def walk_along(c2w: Float[Tensor, "V 4 4"], up: Float[Tensor, "3"], frames: int) -> Float[Tensor, "frames 4 4"]:
     """Smoothly from photo to photo in their order; round, or there and back."""
     count = len(c2w)
-    at = torch.linspace(0, count - 1, WALK_SAMPLES, dtype=c2w.dtype, device=c2w.device)
+    steps = (c2w[1:, :3, 3] - c2w[:-1, :3, 3]).norm(dim=1)
+    is_round = float((c2w[0, :3, 3] - c2w[-1, :3, 3]).norm()) < 2 * float(steps.mean())
+    share = torch.arange(frames, dtype=c2w.dtype, device=c2w.device) / frames
+    at = (count - 1) * (share if is_round else 1 - (1 - 2 * share).abs())
     width = max(1.0, count / 20)
     weights = torch.exp(-0.5 * ((at[:, None] - torch.arange(count).to(at)) / width).square())
     weights = weights / weights.sum(1, keepdim=True)
     place, ahead = weights @ c2w[:, :3, 3], weights @ c2w[:, :3, 2]
     nearest = c2w[at.round().long(), :3, 2]  # where opposite directions cancel out
     ahead = normalize(torch.where(ahead.norm(dim=1, keepdim=True) > 0.05, ahead, nearest), dim=1)
-    step = (place[1:] - place[:-1]).norm(dim=1)
-    turn = torch.acos((ahead[1:] * ahead[:-1]).sum(1).clamp(-1, 1))
-    passed = torch.cat([step.new_zeros(1), (step / step.sum().clamp_min(1e-12) + turn / 20).cumsum(0)])
-    steps = (c2w[1:, :3, 3] - c2w[:-1, :3, 3]).norm(dim=1)
-    is_round = float((c2w[0, :3, 3] - c2w[-1, :3, 3]).norm()) < 2 * float(steps.mean())
-    share = torch.arange(frames, dtype=at.dtype, device=at.device) / frames
-    share = share if is_round else 1 - (1 - 2 * share).abs()
-    which = torch.searchsorted(passed, share * passed[-1]).clamp_max(WALK_SAMPLES - 1)
-    return look_at(place[which], place[which] + ahead[which], up)
+    return look_at(place, place + ahead, up)
 
 
 def resample_path(cameras: Cameras, frames: int, closed: bool) -> Cameras:
@@ -208,7 +180,7 @@ def spiral_like(orbit: Cameras, frames: int = 60) -> Cameras:
         frames: number of poses; the last stops one step short of the first.
     """
     target = find_convergence(orbit.c2w)
-    if target is None or classify_layout(orbit.c2w) in (Layout.PAN, Layout.WALK):
+    if target is None:
         return resample_path(orbit, frames, closed=True)
     number = torch.arange(frames)
     loop = resample_path(orbit, frames, closed=True)[SPIRAL_TURNS * number % frames]
@@ -218,7 +190,6 @@ def spiral_like(orbit: Cameras, frames: int = 60) -> Cameras:
     middle = direction.mean(0)
     axis = normalize(middle, dim=0) if float(middle.norm()) > MIN_ONE_SIDED else up
     left = 1 - SPIRAL_CLIMB * (1 - torch.cos(number.to(up) * (2 * math.pi / frames)))[:, None] / 2
-    angle = torch.acos((direction @ axis).clamp(-1, 1))[:, None].clamp_min(1e-3)
-    between = torch.sin((1 - left) * angle) * axis + torch.sin(left * angle) * direction
+    between = (1 - left) * axis + left * direction
     eye = centre + normalize(between, dim=1) * (left * distance + (1 - left) * distance.mean())
     return replace(loop, c2w=look_at(eye, centre, up))

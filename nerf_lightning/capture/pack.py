@@ -93,6 +93,6 @@ def pack(
         source=source,
         train=train,
         val=Views.of(images[held], cameras[held]),
-        orbit=orbit_like(train.cameras, layout=region.layout, centre=centre),
+        orbit=orbit_like(train.cameras, region.layout, centre),
         bounds=Bounds(aabb, unbounded=True, near=NEAR * min(region.unit, nearest)),
     )

@@ -1,9 +1,11 @@
-"""What is known of a scene and what is doubted: facts, warnings, checks before training, and each photo's troubles."""
+"""What is known of a scene and what is doubted: facts, warnings, checks before training, troubles of photos; and the page."""
 
 import logging
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from logging.handlers import BufferingHandler
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -12,29 +14,26 @@ from nerf_lightning.cameras import Projection
 from nerf_lightning.check.quality import Photo, judge, look_at
 from nerf_lightning.dataset import Scene
 from nerf_lightning.dataset.plausible import check_scene
+from nerf_lightning.drawing.camera_map import camera_map
+from nerf_lightning.drawing.ink import pixels_of
+from nerf_lightning.drawing.panels import data_url
 from nerf_lightning.errors import InputError
+from nerf_lightning.utils.html import render_page
 
-
-class Recorder(logging.Handler):
-    """Keeps warnings, such as those about photos that were left out."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.lines: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.lines.append(record.getMessage())
+HERE = Path(__file__).parent
+MAX_WARNINGS = 10_000
 
 
 @contextmanager
-def record_warnings() -> Iterator[list[str]]:
-    """Yields the warnings that the package logs within a block."""
-    recorder, log = Recorder(), logging.getLogger("nerf_lightning")
-    log.addHandler(recorder)
+def record_warnings() -> Iterator[list[logging.LogRecord]]:
+    """Yields what the package warns of within a block, such as photos that were left out."""
+    handler, log = BufferingHandler(MAX_WARNINGS), logging.getLogger("nerf_lightning")
+    handler.setLevel(logging.WARNING)
+    log.addHandler(handler)
     try:
-        yield recorder.lines
+        yield handler.buffer
     finally:
-        log.removeHandler(recorder)
+        log.removeHandler(handler)
 
 
 def find_doubts(scene: Scene) -> list[str]:
@@ -79,3 +78,20 @@ def describe_scene(scene: Scene) -> dict[str, str]:
     elif scene.train.channels == 4:
         facts["masked"] = "photos have alpha: what is transparent is empty"
     return facts
+
+
+def check_page(
+    scene: Scene, doubts: Sequence[str], photos: Sequence[Photo], poses: list[tuple[int, Float[np.ndarray, "4 4"]]]
+) -> str:
+    """The page's HTML, with what is wrong in words, and the photos with the most troubles first."""
+    worst_first = sorted(photos, key=lambda photo: (-len(photo.troubles), photo.number))
+    return render_page(
+        HERE / "check.html",
+        [HERE / "check.css"],
+        title=scene.name,
+        facts=describe_scene(scene),
+        doubts=doubts,
+        photos=[(photo, data_url(photo.small, "jpeg")) for photo in worst_first],
+        bad=sum(bool(photo.troubles) for photo in photos),
+        map=data_url(pixels_of(camera_map(poses, scene, {})), "png"),
+    )

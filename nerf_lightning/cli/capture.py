@@ -48,20 +48,15 @@ def capture(
         resize: Longest side of the scene's photos, pixels; 0 keeps their size.
         holdout: Every N-th photo is held out for validation.
 
-    Returns:
-        A `nerf_lightning.capture.run.Capture`: the calibration, the poses and the scene.
-
     Raises:
         InputError: an option or a photo is no good.
     """
     target = output_path(output)
     if target.suffix != ".npz":
         raise InputError("capture", "output", str(output), "a file name that ends in .npz")
-    board = {"board_columns": board_columns, "board_rows": board_rows, "board_square": board_square}
-    missing = [key for key, value in board.items() if value is None]
-    if 0 < len(missing) < len(board):
-        raise InputError("capture", missing[0], "nothing", "a value, as for the rest of the board")
-
+    board = (board_columns, board_rows, board_square)
+    if any(board) and not all(board):
+        raise InputError("capture", "board_columns, board_rows, board_square", str(board), "all three, or none")
     from nerf_lightning.capture.report.write import write_report
     from nerf_lightning.capture.run import capture_scene
     from nerf_lightning.capture.tags.board import Board
@@ -77,8 +72,7 @@ def capture(
         longest=resize or None,
         holdout=holdout,
     )
-    report = target.with_name(f"{target.stem}_report")
-    write_report(found, report)
+    write_report(found, report := target.with_name(f"{target.stem}_report"))
     placed = sum(photo.c2w is not None for photo in found.photos)
     print(f"{placed} of {len(found.photos)} photos placed; wrote {target}, cameras.json and calibration.yaml")
     print(f"look at {report}, then: nerf_lightning train +experiment=capture dataset.path={target}")

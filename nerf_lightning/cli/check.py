@@ -38,16 +38,16 @@ def check(
     Raises:
         InputError: where there is no scene, or a damaged one.
     """
-    from nerf_lightning.check.findings import find_doubts, judge_photos, record_warnings
-    from nerf_lightning.check.page import check_page
+    from nerf_lightning.check.findings import check_page, find_doubts, judge_photos, record_warnings
     from nerf_lightning.dataset import PhotoLoadOptions, open_scene
     from nerf_lightning.utils.files import output_path, write_text
 
     path = output_path(output or "check.html")
-    with record_warnings() as warnings:
+    with record_warnings() as records:
         options = PhotoLoadOptions(resize, holdout, masked, invert_masks, bounded, orientation)
         found = open_scene(str(scene), options=options)
         doubts = find_doubts(found)
+    warnings = [record.getMessage() for record in records]
     photos, poses = judge_photos(found)
     write_text(path, check_page(found, warnings + doubts, photos, poses))
     bad = [f"{photo.name}: {trouble}" for photo in photos for trouble in photo.troubles]

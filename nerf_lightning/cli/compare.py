@@ -12,7 +12,6 @@ def compare(
     *runs: Path,
     seconds: Annotated[float, AtLeast(0)] = 15.0,
     within_db: Annotated[float, AtLeast(0)] = 0.5,
-    smallest_within_db: Annotated[float, AtLeast(0)] = 1.0,
     references: str = "published",
     output: Output = None,
 ) -> Any:
@@ -23,8 +22,7 @@ def compare(
     Args:
         runs: Folders with runs in them or below them; default: outputs/.
         seconds: Name the best after this much training, too.
-        within_db: How near to the best the fastest must be, dB.
-        smallest_within_db: How near to the best the smallest must be, dB.
+        within_db: How near to the best the fastest and the smallest must be, dB.
         references: Published figures of the same scene: published, none, or a YAML file of your own.
         output: Folder for compare.html, compare.png and compare.csv; default: compare/ in the first folder.
 
@@ -46,4 +44,4 @@ def compare(
     published = read_references(file)
     published = published.head(0) if references == "none" else published
     found = {run.folder.resolve(): run for folder in folders for run in find_runs(folder)}
-    return write_comparison(list(found.values()), folder, published, within_db, seconds, smallest_within_db)
+    return write_comparison(list(found.values()), folder, published, within_db, seconds)

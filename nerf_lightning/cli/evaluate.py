@@ -21,7 +21,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Measure a run view by view: PSNR, SSIM and LPIPS on photos that it was not trained on.
 
-    LPIPS needs torchvision and the weights of its AlexNet in torch.hub's folder; nothing is downloaded.
+    LPIPS needs torchvision, the weights of its AlexNet in torch.hub's folder (nothing is downloaded), and views of 64 pixels.
 
     Args:
         split: val, or test where the scene's files have a test split, as published figures are measured.
@@ -36,18 +36,14 @@ def evaluate(
     """
     from dataclasses import replace
 
-    import pandas as pd
-
     from nerf_lightning.drawing.contact_sheet import contact_sheet
     from nerf_lightning.drawing.panels import result_panel, write_png
-    from nerf_lightning.evaluate.metrics import DIGITS, format_table, to_json
-    from nerf_lightning.evaluate.perceptual import SMALLEST, TOO_SMALL, perceptual_distance
+    from nerf_lightning.evaluate.metrics import format_table, measure_views, to_json
     from nerf_lightning.runs.data import data_again
     from nerf_lightning.runs.open import beside, open_run
     from nerf_lightning.utils.device import the_device
     from nerf_lightning.utils.files import output_path, write_json
     from nerf_lightning.utils.machine import device_in_words
-    from nerf_lightning.utils.progress import tracked
 
     where, source = the_device(device), find_run(run)
     found = open_run(source, where)
@@ -57,17 +53,7 @@ def evaluate(
             raise InputError("evaluate", "split", "test", "val: these photos have no test split")
         data.scene = replace(data.scene, val=data.scene.test)
     folder = beside(source) / "evaluation" if output is None else output_path(output)
-    distance, reason = perceptual_distance()
-    rows, results = [], {}
-    views = tracked(range(data.held_out_views), data.held_out_views, "held-out views")
-    for view, result in enumerate(found.system.evaluate_held_out(data, views)):
-        reason = TOO_SMALL if min(result.rgb.shape[:2]) < SMALLEST else reason
-        lpips = None if distance is None else distance(result.rgb, result.comparable)
-        rows.append((result.psnr, result.ssim, lpips, result.seconds))
-        results[view] = result
-        if len(results) > worst:
-            del results[max(results, key=lambda one: results[one].psnr)]
-    metrics = pd.DataFrame(rows, columns=list(DIGITS), dtype=float)
+    metrics, results = measure_views(found.system, data, worst)
     evaluation = to_json(metrics, source, data.scene.describe(), where)
     write_json(folder / "views.json", evaluation)
     order = sorted(results, key=lambda view: results[view].psnr)
@@ -75,8 +61,6 @@ def evaluate(
     panels = [result_panel(results[view], "") for view in order]
     write_png(folder / "worst.png", contact_sheet(panels, captions, columns=1))
     print(format_table(metrics))
-    views_of_split = f"{len(metrics)} {'test' if split == 'test' else 'held-out'} views on {device_in_words(where)}"
-    print(f"{data.scene.name}: {metrics.psnr.mean():.2f} dB over {views_of_split}; {folder}/worst.png, views.json")
-    if reason:
-        print(f"no LPIPS: {reason}")
+    views = f"{len(metrics)} {'test' if split == 'test' else 'held-out'} views on {device_in_words(where)}"
+    print(f"{data.scene.name}: {metrics.psnr.mean():.2f} dB over {views}; {folder}/worst.png, views.json")
     return evaluation

@@ -1,7 +1,7 @@
 """nerf_lightning export: a sub-command for each kind of file."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import App, Parameter
 
@@ -18,10 +18,6 @@ Resolution = Annotated[Side | None, Parameter(help="Cells along the longest side
 Threshold = Annotated[
     Annotated[float, AtLeast(0.001), AtMost(0.999)] | None,
     Parameter(help="Opacity of a cell at the surface; default: found from the histogram of opacities."),
-]
-Precision = Annotated[
-    Literal["half", "byte"] | None,
-    Parameter(help="half (2 bytes a number) or byte (1); default: the smaller one that loses no more than allowed."),
 ]
 LossDb = Annotated[float, AtLeast(0), Parameter(help="dB of held-out PSNR that may be lost.")]
 
@@ -95,7 +91,6 @@ def export_compact(
     run: RunPath = None,
     /,
     *,
-    precision: Precision = None,
     loss_db: LossDb = 0.1,
     output: Output = None,
     photos: Photos = None,
@@ -116,7 +111,7 @@ def export_compact(
     target = _target(source, output, "compact.npz", (".npz",))
     found = open_run(source, where)
     data = data_again(found.cfg, found.scene, photos)
-    compact = smallest(found.system, data, plain_config(found.cfg), loss_db, precision)
+    compact = smallest(found.system, data, plain_config(found.cfg), loss_db)
     size = f"{len(compact.content) / 1000:,.1f} kB, {compact.precision} precision"
     return _write(target, compact.content, f"{size}, held-out PSNR {compact.before:.2f} -> {compact.psnr:.2f} dB")
 
@@ -129,7 +124,6 @@ def export_html(
     *,
     all: bool = False,
     cells: Side | None = None,
-    precision: Precision = None,
     loss_db: LossDb = 0.1,
     output: Output = None,
     photos: Photos = None,
@@ -151,7 +145,7 @@ def export_html(
     from nerf_lightning.utils.device import the_device
 
     where = the_device(device)
-    build = partial(build_page, device=where, cells=cells, precision=precision, loss_db=loss_db, photos=photos)
+    build = partial(build_page, device=where, cells=cells, loss_db=loss_db, photos=photos)
     if all:
         folder = run or OUTPUTS
         target = _target(folder, output, "gallery.html", (".html",))
@@ -234,7 +228,7 @@ def _write_shape(
     import torch
 
     from nerf_lightning.export.mesh import SUFFIXES, mesh_file, points_file, training_views, voxels_file
-    from nerf_lightning.export.volume import volume_of
+    from nerf_lightning.export.volume import sample_volume
     from nerf_lightning.runs.open import open_scene_run
     from nerf_lightning.utils.device import the_device
     from nerf_lightning.utils.libraries import require
@@ -244,7 +238,9 @@ def _write_shape(
     if kind != "voxels":
         require("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
     found = open_scene_run(source, where)
-    volume = volume_of(found, resolution, None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3))
+    volume = sample_volume(
+        found, resolution, None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3)
+    )
     if kind == "voxels":
         content, words = voxels_file(found, volume)
     elif kind == "points":

@@ -1,10 +1,11 @@
 """nerf_lightning render."""
 
+import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from nerf_lightning.cli.command import Device, Output, Photos, RunPath, command
-from nerf_lightning.errors import InputError
 from nerf_lightning.runs.find import find_run
 from nerf_lightning.utils.options import AtLeast, AtMost, FramesPerSecond
 
@@ -40,57 +41,29 @@ def render(
 
     Returns:
         The video, or the folder.
-
-    Raises:
-        InputError: for an option, device, run or output that is no good.
     """
-    import time
-
-    from nerf_lightning.drawing.frame import Style, depth_range
-    from nerf_lightning.render.camera_path import SPLITS, CameraPath, build_path, check_path
-    from nerf_lightning.render.frames import (
-        check_photos_background,
-        describe_frames,
-        draw_frame,
-        parse_background,
-        parse_channels,
-    )
+    from nerf_lightning.render.camera_path import SPLITS, build_path
+    from nerf_lightning.render.frames import choose_style, describe_frames, draw_frame
     from nerf_lightning.render.video import check_output, write_video
     from nerf_lightning.runs.data import data_again
     from nerf_lightning.runs.open import beside, open_scene_run
-    from nerf_lightning.utils.device import synchronize, the_device
+    from nerf_lightning.utils.device import the_device
     from nerf_lightning.utils.files import output_path
     from nerf_lightning.utils.machine import device_in_words
 
     began = time.perf_counter()
-    names, colour = parse_channels(channels), parse_background(background)
-    check_path(path, path_frame)
-    if path in SPLITS and (scale != 1 or background == "transparent"):
-        key, value = ("scale", f"{scale:g}") if scale != 1 else ("background", background)
-        raise InputError("render", key, value, f"scale 1 and a colour beside photos (path {path})")
     if output is not None:
         check_output(output_path(output), background == "transparent")
     where, source = the_device(device), find_run(run)
     target = beside(source) / f"render_{Path(path).stem}.webp" if output is None else output_path(output)
     found = open_scene_run(source, where)
-    scene: Any = None
-    if path in SPLITS:
-        scene = data_again(found.cfg, found.scene, photos).scene
-    route = build_path(path, frames, found.orbit, scene, found.to_source, path_frame)
-    if scale != 1:
-        route = CameraPath(route.cameras.scaled(scale), route.views)
-    check_photos_background(colour, found.system, route)
-    if background == "scene":
-        red, green, blue = found.system.renderer.background.color.tolist()
-        colour = red, green, blue
-    depths = depth_range(found.system, route.cameras) if "depth" in names else (0.0, 1.0)
-    style = Style(names, colour, depths)
-    plan = describe_frames(path, found.system, route, style)
-    count = len(route.cameras)
-    there = write_video(plan, lambda index: draw_frame(found.system, route, index, style), count, target, fps)
-    synchronize(where)
+    scene: Any = data_again(found.cfg, found.scene, photos).scene if path in SPLITS else None
+    route = build_path(path, frames, found.orbit, scene, found.to_source, path_frame, scale)
+    style = choose_style(found.system, route, channels, background)
+    plan, count = describe_frames(path, found.system, route, style), len(route.cameras)
+    there = write_video(plan, partial(draw_frame, found.system, route, style), count, target, fps)
     width, height = route.cameras.sizes.amax(0).tolist()
     seconds = f"{time.perf_counter() - began:.1f} s on {device_in_words(where)}"
-    before = f", {there} of them there already" if there else ""
-    print(f"{target}: {count} frames of {width} x {height} pixels in {seconds}{before}")
+    seconds += f", {there} of them there already" if there else ""
+    print(f"{target}: {count} frames of {width} x {height} pixels in {seconds}")
     return target

@@ -92,10 +92,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
             fail(known)  # here, as Hydra would print a line of its own
 
     def refuse(message: str) -> None:
-        unknown = re.search(r"--([\w.]+)(=\S+)?", message)
-        plus = "+" if unknown and unknown[1] == "experiment" else ""
-        todo = f"did you mean {plus}{unknown[1]}{unknown[2] or '=...'}?" if unknown else ""
-        raise InputError("command line", "", message, "KEY=VALUE, or flags that --hydra-help lists", todo)
+        raise InputError("command line", "", message, "KEY=VALUE, or flags that --hydra-help lists")
 
     parser = get_args_parser()
     parser.allow_abbrev = False  # --experiment is not --experimental-rerun

@@ -52,7 +52,10 @@ def view(
     require_viser()
     resolve_host(host)
     if path is not None and not has_run(path):
-        page = _open_scene(path, resize, holdout, host, port)
+        from nerf_lightning.dataset import PhotoLoadOptions, open_scene
+        from nerf_lightning.view.scene_page import ScenePage
+
+        page: Page = ScenePage(open_scene(str(path), options=PhotoLoadOptions(resize, holdout)), host, port)
     else:
         page = _open_run(find_run(path), device, side, host, port)
     try:
@@ -79,13 +82,6 @@ def has_run(path: Path) -> bool:
             return "header.npy" in file.namelist()
     except (OSError, zipfile.BadZipFile):  # whatever reads it says what is wrong
         return False
-
-
-def _open_scene(path: Path, resize: int | str | None, holdout: int, host: str, port: int) -> "Page":
-    from nerf_lightning.dataset import PhotoLoadOptions, open_scene
-    from nerf_lightning.view.scene_page import ScenePage
-
-    return ScenePage(open_scene(str(path), options=PhotoLoadOptions(resize, holdout)), host, port)
 
 
 def _open_run(source: Path, device: str, side: int, host: str, port: int) -> "Page":

@@ -12,14 +12,13 @@ MIN_SEEDS = 3
 """Runs below which a point on a frontier may be luck."""
 
 
-def recommend(points: pd.DataFrame, within_db: float, seconds: float, smallest_within_db: float) -> list[str]:
+def recommend(points: pd.DataFrame, within_db: float, seconds: float) -> list[str]:
     """Sentences about the points of one comparison, one for each point that is best at something.
 
     Args:
         points: of `compute_points`, the best first.
-        within_db: how far below the best the fastest may be, dB.
+        within_db: how far below the best the fastest and the smallest may be, dB.
         seconds: a budget of training time.
-        smallest_within_db: how far below the best the smallest may be, dB.
     """
     best, costs = points["psnr"].max(), points["train_seconds"].map(round_cost)
     choices = {
@@ -29,9 +28,9 @@ def recommend(points: pd.DataFrame, within_db: float, seconds: float, smallest_w
     quick = points[costs <= seconds]
     if len(quick):
         choices[f"best after at most {seconds:g} s of training"] = quick.index[0]
-    sizes = points.loc[points["psnr"] >= best - smallest_within_db, "bytes"].dropna()
+    sizes = points.loc[points["psnr"] >= best - within_db, "bytes"].dropna()
     if len(sizes):
-        choices[f"smallest within {smallest_within_db:g} dB of the best"] = sizes.idxmin()
+        choices[f"smallest within {within_db:g} dB of the best"] = sizes.idxmin()
     sentences = []
     for chosen in dict.fromkeys(choices.values()):
         *first, last = [words for words, number in choices.items() if number == chosen]

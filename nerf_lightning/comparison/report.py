@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,18 @@ from jaxtyping import UInt8
 
 from nerf_lightning.comparison.advice import list_caveats, recommend
 from nerf_lightning.comparison.charts import draw_panels
-from nerf_lightning.comparison.images import collect_images
 from nerf_lightning.comparison.points import COSTS, Conditions, compute_points, format_bytes, has_figures, typical_run
-from nerf_lightning.drawing.contact_sheet import contact_sheet
+from nerf_lightning.dataset.formats.decode import read_pixels
+from nerf_lightning.drawing.contact_sheet import contact_sheet, fit_into
 from nerf_lightning.drawing.panels import data_url, write_png
+from nerf_lightning.errors import InputError
 from nerf_lightning.runs.index import FIELD_PAGE, Run
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import atomic, write_text
 from nerf_lightning.utils.html import address_from, render_page
 
-SHEET_PX = 1720
-"""Width of compare.png."""
+SHEET_PX, IMAGE_PX = 1720, 480
+"""Width of compare.png, and longest side of an image."""
+MAX_IMAGES = 11
 MAX_COMPARISONS, MAX_FAILURES = 4, 24
 """In compare.png; the page and the table have all."""
 HEADINGS = ("dB", "worst", "train s", "view s", "size", "runs", "frontier")
@@ -56,7 +59,6 @@ def write_comparison(
     references: pd.DataFrame,
     within_db: float = 0.5,
     seconds: float = 15.0,
-    smallest_within_db: float = 1.0,
 ) -> pd.DataFrame:
     """Compares runs, writes compare.html, compare.png and compare.csv into a folder, and prints table and advice.
 
@@ -66,7 +68,7 @@ def write_comparison(
     comparisons = []
     for conditions, points in compute_points(runs):
         published = references[references["scene"].str.lower() == conditions.scene.lower()]
-        advice = recommend(points, within_db, seconds, smallest_within_db)
+        advice = recommend(points, within_db, seconds)
         origins = [f"Published, other hardware: {origin}." for origin in published["origin"].unique()]
         panels, images = draw_panels(points, published), collect_images(points)
         comparisons.append(Comparison(conditions, points, advice, [*list_caveats(points), *origins], panels, images))
@@ -74,8 +76,7 @@ def write_comparison(
     with atomic(output / "compare.csv") as temporary:
         table.to_csv(temporary, index=False)
     write_png(output / "compare.png", draw_figure(comparisons, failures))
-    with atomic(output / "compare.html") as temporary:
-        temporary.write_text(fill_page(comparisons, failures, output), encoding="utf-8")
+    write_text(output / "compare.html", fill_page(comparisons, failures, output))
     print_comparisons(comparisons, failures)
     print(f"{output}: compare.html, compare.png, compare.csv")
     return table
@@ -102,28 +103,31 @@ def tabulate(comparisons: Sequence[Comparison], runs: Sequence[Run]) -> pd.DataF
     return table.replace([np.inf, -np.inf], np.nan)
 
 
+def collect_images(points: pd.DataFrame) -> list[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
+    """Captions and images of a held-out view, the truth first, then of the best points as far as they have one."""
+    found: list[tuple[str, UInt8[np.ndarray, "H W 3"]]] = []
+    for point in points.head(MAX_IMAGES).itertuples():
+        run = typical_run(point)
+        for name, caption in (("truth", "truth"), ("final", f"{point.label}\n{run.psnr:.2f} dB")):
+            with suppress(InputError):  # there is none, or it cannot be read
+                if name == "final" or not found:
+                    image = read_pixels(run.folder / f"{name}.png")[..., :3]
+                    found.append((caption, fit_into(image, IMAGE_PX, IMAGE_PX)))
+    return found
+
+
 def draw_figure(comparisons: Sequence[Comparison], failures: Sequence[str]) -> UInt8[np.ndarray, "H W 3"]:
     """Panels, images and words of all comparisons, one below the other."""
-
-    def write(*lines: str, text_px: int = 12) -> UInt8[np.ndarray, "H W 3"]:
-        return contact_sheet([], [], 1, SHEET_PX, heading="\n".join(lines), text_px=text_px)
-
     parts = []
     for one in comparisons[:MAX_COMPARISONS]:
-        parts += [write(one.title, text_px=20), write(one.details, *one.advice, *one.remarks)]
-        for captioned, most in ([("", panel) for panel in one.panels], 3), (one.images, 6):
-            captions, images = [caption for caption, _ in captioned], [image for _, image in captioned]
-            parts.append(contact_sheet(images, captions, choose_columns(len(images), most), SHEET_PX, text_px=18))
-    if len(comparisons) > MAX_COMPARISONS:
-        parts.append(write(f"{len(comparisons) - MAX_COMPARISONS} more comparisons are in compare.html"))
+        words = "\n".join([one.title, one.details, *one.advice, *one.remarks])
+        captions, images = [caption for caption, _ in one.images], [image for _, image in one.images]
+        parts.append(contact_sheet(one.panels, [""] * len(one.panels), 2, SHEET_PX, heading=words, text_px=12))
+        parts.append(contact_sheet(images, captions, 6, SHEET_PX, text_px=18))
     if failures:
-        parts.append(write(f"Failed, collapsed or cut short ({len(failures)}):", *failures[:MAX_FAILURES]))
+        words = "\n".join([f"Failed, collapsed or cut short ({len(failures)}):", *failures[:MAX_FAILURES]])
+        parts.append(contact_sheet([], [], 1, SHEET_PX, heading=words, text_px=12))
     return np.concatenate(parts)
-
-
-def choose_columns(count: int, most: int) -> int:
-    """How many columns leave the fewest cells empty; of several the most, but not one alone."""
-    return min(range(max(1, min(count, most)), 0, -1), key=lambda columns: -count % columns + (columns == 1) * most)
 
 
 def fill_page(comparisons: Sequence[Comparison], failures: Sequence[str], folder: Path) -> str:

@@ -21,7 +21,7 @@ from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.config.literal import escape
 from nerf_lightning.dataset import DataModule, PixelDataModule, RayDataModule
-from nerf_lightning.dataset.size import AUTO, auto_resize
+from nerf_lightning.dataset.resize import AUTO, auto_resize
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.refine import Corrections

@@ -6,7 +6,7 @@ from nerf_lightning.dataset.formats.transforms import load_blender, load_transfo
 from nerf_lightning.dataset.open import open_scene
 from nerf_lightning.dataset.picture import builtin_picture, load_picture
 from nerf_lightning.dataset.pixels import Picture, PictureBatch, PixelBatch, PixelDataModule, pixel_grid
-from nerf_lightning.dataset.rays import RayBatch, RayDataModule, ViewBatch, draw_rays
+from nerf_lightning.dataset.rays import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.shots import PhotoLoadOptions
 from nerf_lightning.dataset.views import Views
@@ -28,7 +28,6 @@ __all__ = [
     "Scene",
     "Views",
     "builtin_picture",
-    "draw_rays",
     "estimate_bounds",
     "load_blender",
     "load_transforms",

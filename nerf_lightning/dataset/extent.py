@@ -1,13 +1,12 @@
 """The box to sample in, estimated from cameras and silhouettes."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset.region import find_region
@@ -26,6 +25,18 @@ AGREEMENT = 0.95
 """Share of the views seeing a voxel that must find it in the silhouette; the rest forgives dark-on-dark pixels."""
 
 
+class VoxelView(NamedTuple):
+    """The N voxels of a grid as one view sees them."""
+
+    inside: Bool[np.ndarray, "N"]
+    """Which are in the picture."""
+    row: Int[np.ndarray, "N"]
+    column: Int[np.ndarray, "N"]
+    """The pixel of each voxel's centre; 0 where it is not in the picture."""
+    footprint: UInt8[np.ndarray, "F F"]
+    """Ones as far as half a voxel's diagonal reaches: any part of a voxel may be content, or show some."""
+
+
 def estimate_bounds(
     views: Views,
     background: tuple[float, float, float],
@@ -39,14 +50,13 @@ def estimate_bounds(
     """
     aabb = visible_cube(views.cameras)
     views = views.spread(MAX_VIEWS)
-    masks = silhouettes(views, background)
-    if masks is not None:
-        # The second pass sees finer voxels, so the box loses the slack of the first.
-        for _ in range(2):
-            kept = _carve(aabb, masks, views.cameras)
-            if kept is None:
-                break
-            aabb = kept
+    masks = silhouettes(views, background) or []
+    # The second pass sees finer voxels, so the box loses the slack of the first.
+    for _ in range(2 if masks else 0):
+        hull = visual_hull(masks, view_voxels(aabb, GRID, views.cameras), least=0.5 * len(masks))
+        if hull.any():
+            kept, voxel = make_grid(aabb, GRID)[hull], (aabb[1] - aabb[0]) / GRID
+            aabb = np.stack([kept.min(0) - 1.5 * voxel, kept.max(0) + 1.5 * voxel])
     return Bounds(torch.from_numpy(aabb).float(), unbounded=False, near=near, far=far)
 
 
@@ -99,24 +109,6 @@ def visible_cube(cameras: Cameras) -> Float[np.ndarray, "2 3"]:
     return np.stack([centre - half, centre + half])
 
 
-@dataclass(frozen=True)
-class VoxelView:
-    """The voxels of a grid, N in all, as one view sees them."""
-
-    inside: Bool[np.ndarray, "N"]
-    """Which are in the picture."""
-    column: Int[np.ndarray, "N"]
-    row: Int[np.ndarray, "N"]
-    """The pixel of each voxel's centre; 0 where it is not in the picture."""
-    reach: int
-    """Half a voxel's diagonal, pixels: any part of a voxel may be content, or show some."""
-
-    def dilate(self, mask: Shaped[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-        """A mask wider by the reach."""
-        kernel = np.ones((2 * self.reach + 1, 2 * self.reach + 1), np.uint8)
-        return cv2.dilate(mask.astype(np.uint8), kernel) > 0
-
-
 def make_grid(aabb: Float[np.ndarray, "2 3"], count: int) -> Float[np.ndarray, "N 3"]:
     """The centres of count^3 voxels in a box."""
     steps = aabb[0][:, None] + (np.arange(count) + 0.5) * ((aabb[1] - aabb[0]) / count)[:, None]
@@ -133,16 +125,17 @@ def view_voxels(aabb: Float[np.ndarray, "2 3"], count: int, cameras: Cameras) ->
         column, row = np.where(inside, pixels.T.numpy(), 0).astype(np.int32)
         nearness = float(depth[seen].median()) if inside.any() else np.inf
         focal = float(cameras.K[view, 0, 0])
-        yield VoxelView(inside, column, row, int(min(np.ceil(0.5 * diagonal * focal / nearness), cameras.longest)))
+        reach = int(min(np.ceil(0.5 * diagonal * focal / nearness), cameras.longest))
+        yield VoxelView(inside, row, column, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
 
 
 def visual_hull(masks: Masks, voxels: Iterable[VoxelView], least: float) -> Bool[np.ndarray, "N"]:
     """Which voxels at least `least` views see, and nearly all of these find in their silhouettes."""
     seen: Any = 0
     found: Any = 0
-    for mask, view in zip(masks, voxels, strict=True):
-        seen = seen + view.inside
-        found = found + (view.inside & view.dilate(mask)[view.row, view.column])
+    for mask, (inside, row, column, footprint) in zip(masks, voxels, strict=True):
+        seen = seen + inside
+        found = found + (inside & (cv2.dilate(mask.astype(np.uint8), footprint)[row, column] > 0))
     return (seen >= least) & (found >= AGREEMENT * seen)
 
 
@@ -151,17 +144,9 @@ def hull_coverage(masks: Masks, cameras: Cameras, bounds: Bounds) -> float:
     voxels = list(view_voxels(bounds.aabb.double().numpy(), COARSE_GRID, cameras))
     hull = visual_hull(masks, voxels, least=1)
     covered = []
-    for mask, view in zip(masks, voxels, strict=True):
+    for mask, (inside, row, column, footprint) in zip(masks, voxels, strict=True):
         shown = np.zeros(mask.shape, np.uint8)
-        kept = hull & view.inside
-        shown[view.row[kept], view.column[kept]] = 1
+        shown[row[hull & inside], column[hull & inside]] = 1
         if mask.any():
-            covered.append(float(view.dilate(shown)[mask].mean()))
+            covered.append(cv2.dilate(shown, footprint)[mask].mean())
     return float(np.mean(covered)) if covered else 1.0
-
-
-def _carve(aabb: Float[np.ndarray, "2 3"], masks: Masks, cameras: Cameras) -> Float[np.ndarray, "2 3"] | None:
-    """The box of the voxels inside (nearly) all silhouettes, one voxel wider; None when there are none."""
-    voxel = (aabb[1] - aabb[0]) / GRID
-    kept = make_grid(aabb, GRID)[visual_hull(masks, view_voxels(aabb, GRID, cameras), least=0.5 * len(masks))]
-    return np.stack([kept.min(0) - 1.5 * voxel, kept.max(0) + 1.5 * voxel]) if len(kept) else None

@@ -46,11 +46,11 @@ class Intrinsics:
     def sees_every_pixel(self) -> bool:
         """Whether each pixel has a direction of its own, as with a real lens: rays through pixels all over the photo appear
         where they were cast, unfolded, in the single precision of training, which a distortion may be too strong for."""
-        return not self.bent or (all(map(math.isfinite, self.distortion)) and leads_back(self))
+        return not self.bent or sees_every_pixel(self)
 
 
 @lru_cache(maxsize=1)  # a lens is mostly that of all photos
-def leads_back(optics: Intrinsics) -> bool:
+def sees_every_pixel(optics: Intrinsics) -> bool:
     """See `Intrinsics.sees_every_pixel`."""
     lenses = Lenses(torch.tensor([optics.distortion]).float(), torch.tensor([optics.projection]))
     K = torch.from_numpy(optics.K).float()[None]

@@ -10,7 +10,8 @@ from torch import Tensor
 from nerf_lightning.dataset.matching.judge import Doubt
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.utils.device import CPU, fits
+from nerf_lightning.utils.device import CPU
+from nerf_lightning.utils.memory import fits
 
 Batch = TypeVar("Batch")
 Photos = TypeVar("Photos", Views, Tensor)

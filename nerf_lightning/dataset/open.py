@@ -15,14 +15,11 @@ from nerf_lightning.dataset.sfm.photos import place_photos
 from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import user_path
-from nerf_lightning.utils.text import join_truncated
 
 SUPPORTED = (
     "photos or a video, an .npz file, a COLMAP folder (sparse/0), poses_bounds.npy beside images, a Blender folder"
     " (transforms_train.json), or transforms.json or its folder"
 )
-SHOWN = 5
-"""Names of what else is in a folder."""
 
 
 def open_scene(
@@ -70,20 +67,15 @@ def _open(place: Path, name: str | None, options: PhotoLoadOptions) -> Scene:
         return load_colmap(place, name, options)
     if (place / POSES).is_file():
         return load_llff(place, name, options)
+    photos = None
     if place.suffix.lower() in VIDEOS and place.is_file():
-        return _placed(extract_frames(place), name or place.stem, options)
-    placed_already = any((place / below).is_dir() for below in MODEL_FOLDERS if below)
-    for below in () if placed_already else ("", *PHOTO_FOLDERS):  # a damaged model is not made again in silence
-        if (place / below).is_dir() and list_images(place / below):
-            return _placed(place / below, name or place.resolve().name, options)
-    if place.is_dir():
-        names = sorted(item.name for item in place.iterdir())
-        found = f"a folder with {join_truncated(names, SHOWN)}" if names else "an empty folder"
-    else:
-        found = f"a {place.suffix or 'plain'} file" if place.exists() else "nothing there"
+        photos = extract_frames(place)
+    elif not any((place / below).is_dir() for below in MODEL_FOLDERS if below):  # a damaged model is not made again
+        folders = (place / below for below in ("", *PHOTO_FOLDERS))
+        photos = next((folder for folder in folders if folder.is_dir() and list_images(folder)), None)
+    if photos is not None:
+        name = name or (place.stem if place.is_file() else place.resolve().name)
+        return load_colmap(place_photos(photos), name, replace(options, orientation="exif"), photos)
+    kind = "folder" if place.is_dir() else f"{place.suffix or 'plain'} file"
+    found = f"a {kind} without a scene" if place.exists() else "nothing there"
     raise InputError(place, "", found, SUPPORTED)
-
-
-def _placed(photos: Path, name: str, options: PhotoLoadOptions) -> Scene:
-    """Photos whose cameras COLMAP finds, unless it has found them before."""
-    return load_colmap(place_photos(photos), name, replace(options, orientation="exif"), photos)

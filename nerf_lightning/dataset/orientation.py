@@ -27,27 +27,22 @@ def choose_orientations(
         photos: their files.
         stated: sizes of their cameras, of this size or another.
         orientation: "auto", "stored" or "exif"."""
-    turned, ambiguous = [], []
+    chosen: list[bool] = []
+    others = 0
     for photo, size in zip(photos, stated, strict=True):
-        stored, upright = (image_header(photo, turn)[:2] for turn in (False, True))
-        if read_header(photo).orientation == 1 or orientation == "stored":
-            continue
-        fits_stored, fits_upright = (size is None or has_shape(shape, size) for shape in (stored, upright))
-        if orientation == "exif" or (fits_upright and not fits_stored):
-            turned.append(photo)
-        elif fits_upright:
-            ambiguous.append(photo)
-    if turned:
-        text = "%s: %d photos are turned as their EXIF orientation says, %s first: so they fit their cameras"
-        log.warning(text, where, len(turned), turned[0].name)
-    if ambiguous:
-        text = (
-            "%s: %d photos have an EXIF orientation, %s first; their cameras are taken to be about the pixels as stored"
-            " (dataset.orientation=exif: about the turned photos)"
-        )
-        log.warning(text, where, len(ambiguous), ambiguous[0].name)
-    chosen = set(turned)
-    return [photo in chosen for photo in photos]
+        shapes = [image_header(photo, turn)[:2] for turn in (False, True)]
+        has_turn = read_header(photo).orientation != 1
+        fits_stored, fits_upright = (size is None or has_shape(shape, size) for shape in shapes)
+        chosen.append(has_turn and (orientation == "exif" or (orientation == "auto" and fits_upright > fits_stored)))
+        others += has_turn and orientation == "auto" and fits_upright and fits_stored
+    turned = "%s: %d photos are turned as their EXIF orientation says, so that they fit their cameras"
+    stored = (
+        "%s: %d photos have an EXIF orientation, and are taken as they are stored (dataset.orientation=exif turns them)"
+    )
+    for count, text in ((sum(chosen), turned), (others, stored)):
+        if count:
+            log.warning(text, where, count)
+    return chosen
 
 
 def has_shape(size: tuple[float, float], stated: tuple[float, float]) -> bool:

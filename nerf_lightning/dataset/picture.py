@@ -8,12 +8,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.dataset.formats.decode import read_pixels
-from nerf_lightning.utils.memory import check_memory
 
 Plane = Float[np.ndarray, "H W"]
 Colours = Float[np.ndarray, "H W 3"]
-DRAWN = 4 * 3 * 8 * 2
-"""Bytes of a pixel of the built-in picture while it is drawn: two copies of four places in double precision."""
 SUN = (0.66, 0.30)
 """Where the built-in picture's sun stands, as a share of its width and height."""
 
@@ -36,7 +33,6 @@ def builtin_picture(size: int = 256) -> UInt8[Tensor, "size size 3"]:
 
     Deterministic; it has detail at all scales, so that what a field cannot represent shows.
     """
-    check_memory("config", "dataset.max_side", "pixels to draw", DRAWN * size**2)
     fine = 2 * size  # two samples a pixel side, averaged below, keep the edges from jagging
     grid = (np.arange(fine) + 0.5) / fine
     x, y = np.meshgrid(grid, grid)

@@ -1,6 +1,5 @@
 """From posed photos to a scene: one frame and one unit, split, bounds and an orbit, the same for every format."""
 
-import itertools
 import logging
 import math
 from collections.abc import Sequence
@@ -110,16 +109,18 @@ def build_scene(
     checks.check_split_size(source, "train split", len(split.train))
     checks.check_split_size(source, "val split", len(split.val))
     # Part after part, so that none of them needs a copy of its pixels.
-    shots = [shots[i] for part in (split.train, split.val, split.test) for i in part]
-    ends = np.cumsum([0, len(split.train), len(split.val), len(split.test)]).tolist()
-    train, val, test = (list(range(*pair)) for pair in itertools.pairwise(ends))
-    views = read_shots(source, shots, options)
-    if views.known is not None and (masked := [view for view in val if not views.mask_of(view).any()]):
-        log.warning("%d held-out photos are masked entirely, %s first: left out", len(masked), shots[masked[0]].name)
-        val = [view for view in val if view not in masked]
-        checks.check_split_size(source, "val split", len(val))
-    parts = [views[torch.tensor(part)] for part in (train, val, test) if part]
-    return assemble_scene(source, name, parts, options, hints)
+    views = read_shots(source, [shots[i] for part in (split.train, split.val, split.test) for i in part], options)
+    parts = []
+    for part in torch.arange(len(views)).split([len(split.train), len(split.val), len(split.test)]):
+        if views.known is not None:
+            shown = torch.tensor([bool(views.mask_of(view).any()) for view in part.tolist()], dtype=torch.bool)
+            if not shown.all():
+                log.warning("%s: %d photos are masked entirely: left out", source, int((~shown).sum()))
+            part = part[shown]
+        parts.append(views[part])
+    train, val, test = parts
+    checks.check_split_size(source, "val split", len(val))
+    return assemble_scene(source, name, [train, val, *([test] if len(test) else [])], options, hints)
 
 
 def assemble_scene(
@@ -145,16 +146,14 @@ def assemble_scene(
         kind = replace(kind, bounded=not hints.bounds.unbounded, reason="the file states a box")
     if hints.background is not None:
         kind = replace(kind, background=hints.background)
-    points = None if hints.points is None else torch.from_numpy(hints.points)
-    region = find_region(viewing_poses(train.cameras), points, lambda: match_points(train, train.cameras.c2w.numpy()))
-    if not checks.NEAREST <= region.unit <= checks.FARTHEST:
-        expected = f"a distance of {checks.NEAREST:g} to {checks.FARTHEST:g}"
-        found = f"cameras {region.unit:.3g} from what they look at"
-        raise InputError(source, "poses", found, expected, "take another unit")
+    region = locate_region(source, train, hints)
     text = "%s: taken as %s, since %s (dataset.bounded overrides); %s cameras"
     log.info(text, name, "bounded" if kind.bounded else "unbounded", kind.reason, region.layout)
     if not region.known and not kind.bounded:
-        log.warning("%s: %s", source, region.doubt)
+        text = (
+            "%s: %s cameras, and neither poses nor points tell how far away what they see is: %.3g, in the file's unit?"
+        )
+        log.warning(text, source, region.layout, region.unit)
     keeps_frame = hints.keep_frame and kind.bounded and is_precise(train.cameras, region)
     to_source = torch.eye(4, dtype=torch.float64)
     if hints.bounds is None and not keeps_frame:
@@ -164,11 +163,9 @@ def assemble_scene(
     def move(cameras: Cameras) -> Cameras:
         return replace(cameras, c2w=in_other_frame(cameras.c2w, from_source).float())
 
-    placed = [replace(apply_alpha(part, kind.alpha), cameras=move(part.cameras)) for part in parts]
+    placed = [replace(apply_alpha(part, kind.cuts_out), cameras=move(part.cameras)) for part in parts]
     centre = transform(from_source, region.centre.double()).float()
-    orbit = (
-        orbit_like(placed[0].cameras, layout=region.layout, centre=centre) if hints.path is None else move(hints.path)
-    )
+    orbit = orbit_like(placed[0].cameras, region.layout, centre) if hints.path is None else move(hints.path)
     return Scene(
         name=name.lower(),
         source=str(source),
@@ -182,6 +179,17 @@ def assemble_scene(
         kind=f"{kind.reason}; {region.layout} cameras",
         points=None if region.points is None else transform(from_source, region.points).float(),
     )
+
+
+def locate_region(source: Path, views: Views, hints: Hints) -> Region:
+    """The region that training photos show, see `find_region`."""
+    points = None if hints.points is None else torch.from_numpy(hints.points)
+    region = find_region(viewing_poses(views.cameras), points, lambda: match_points(views, views.cameras.c2w.numpy()))
+    if not checks.NEAREST <= region.unit <= checks.FARTHEST:
+        expected = f"a distance of {checks.NEAREST:g} to {checks.FARTHEST:g}"
+        found = f"cameras {region.unit:.3g} from what they look at"
+        raise InputError(source, "poses", found, expected, "take another unit")
+    return region
 
 
 def is_precise(cameras: Cameras, region: Region) -> bool:

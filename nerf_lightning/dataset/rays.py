@@ -97,18 +97,13 @@ def measure_texturelessness(views: Views, places: Int[Tensor, "R"], view: Int[Te
     return torch.exp(-contrast / (255 * CONTRAST))
 
 
-def draw_rays(views: Views, count: int, generator: torch.Generator, with_texture: bool = False) -> RayBatch:
-    """Draws pixels uniformly from all views, masked ones excepted, with replacement.
-
-    Photos stay bytes, and rays are made only for the drawn pixels: the cost does not depend on the number of photos.
-    """
-    return batch_of(views, views.draw(count, generator), with_texture)
-
-
-def batch_of(
+def make_batch(
     views: Views, places: Int[Tensor, "R"], with_texture: bool = False, weights: Float[Tensor, "R"] | None = None
 ) -> RayBatch:
-    """Rays and pixels at these places in `Views.pixels`; `weights` and, if asked for, `texturelessness` as in `RayBatch`."""
+    """Rays and pixels at these places in `Views.pixels`; `weights` and, if asked for, `texturelessness` as in `RayBatch`.
+
+    Photos stay bytes, and rays are made only for these pixels: the cost does not depend on the number of photos.
+    """
     rays, view = rays_through(views, places)
     textureless = measure_texturelessness(views, places, view) if with_texture else None
     return RayBatch(rays, views.pixels[places], views=view, texturelessness=textureless, weights=weights)
@@ -135,7 +130,6 @@ class RayDataModule(StepDataModule[Views]):
         self.scene = scene
         self.rays = self.first_rays = rays
         self.samples = samples
-        self.batch = 1
         self.focus = focus
         self._focus: Focus | None = None
         self._focus_state: dict[str, Tensor] = {}
@@ -145,7 +139,6 @@ class RayDataModule(StepDataModule[Views]):
 
     def enlarge(self, batch: int) -> None:
         """Takes that many times the rays and samples a step, for a device that takes more at once. Before training."""
-        self.batch *= batch
         self.rays = self.first_rays = self.first_rays * batch
         self.samples = None if self.samples is None else self.samples * batch
 
@@ -181,22 +174,24 @@ class RayDataModule(StepDataModule[Views]):
     def draw_from(self, photos: Views, step: int, part: slice) -> RayBatch:
         generator = step_generator(self.seed, Stream.BATCH, step, photos.pixels.device)
         if self.focus == 0:
-            return batch_of(photos, photos.draw(self.rays, generator)[part], self._with_texture)
+            return make_batch(photos, photos.draw(self.rays, generator)[part], self._with_texture)
         if self._focus is None or self._focus.views is not photos:
             self._focus_state = self._focus_state if self._focus is None else self._focus.state_dict()
             self._focus = Focus(photos, self.focus)
             if len(self._focus_state.get("sums", ())) == len(self._focus.sums):  # else of other photos, or of none
                 self._focus.load_state_dict(self._focus_state)
         places, weights = self._focus.draw(self.rays, generator)
-        return batch_of(photos, places[part], self._with_texture, weights[part])
+        return make_batch(photos, places[part], self._with_texture, weights[part])
 
     def some_pixels(self) -> RayBatch:
         """Training pixels to measure the error of one plain colour on."""
-        return draw_rays(self.scene.train, SOME_PIXELS, step_generator(self.seed, Stream.PLAIN, 0))
+        generator = step_generator(self.seed, Stream.PLAIN, 0)
+        return make_batch(self.scene.train, self.scene.train.draw(SOME_PIXELS, generator))
 
     def small_batch(self) -> RayBatch:
         """A few rays, to compile kernels with."""
-        return draw_rays(self.scene.train, 64, step_generator(0, Stream.BATCH, 0), with_texture=True)
+        generator = step_generator(0, Stream.BATCH, 0)
+        return make_batch(self.scene.train, self.scene.train.draw(64, generator), with_texture=True)
 
     def find_doubts(self, corrected: bool) -> list[Doubt]:
         return check_scene(self.scene, corrected)
@@ -214,10 +209,9 @@ class RayDataModule(StepDataModule[Views]):
 
     def state_dict(self) -> dict[str, Any]:
         focus = self._focus_state if self._focus is None else self._focus.state_dict()
-        return {"rays": self.rays, "batch": self.batch, "focus": focus}
+        return {"rays": self.rays, "focus": focus}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._focus, self._focus_state = None, dict(state_dict["focus"])
-        before = state_dict["batch"]  # perhaps of another device
-        rays = state_dict["rays"] * self.batch // before
-        self.rays = max(1, min(self.first_rays * self.MOST_RAYS, rays))
+        if self.samples is not None:
+            self.rays = min(self.first_rays * self.MOST_RAYS, state_dict["rays"])

@@ -45,14 +45,6 @@ class Region:
     """On surfaces, given or found by matching."""
 
     @property
-    def doubt(self) -> str:
-        """What to say where the depth is not known."""
-        return (
-            f"{self.layout} cameras, and neither poses nor points tell how far away what they see is: the box of full detail"
-            f" reaches {self.unit:.3g} around ({', '.join(f'{x:.3g}' for x in self.centre.tolist())}), in the file's unit"
-        )
-
-    @property
     def has_subject(self) -> bool:
         """Whether all cameras look at the centre from outside."""
         return self.known and self.layout in (Layout.INWARD, Layout.FORWARD)
@@ -78,23 +70,16 @@ def find_region(
     moves = centre_spread(c2w) > 0
     local = c2w.double().clone()
     local[:, :3, 3] = (local[:, :3, 3] - origin) * moves  # what is left of one place is rounding
-    known = _enough(None if points is None else points.double() - origin)
-    layout = classify_layout(local, known)
     target = find_convergence(local)
-    if known is None and moves and target is None and match is not None:
-        matched = match()
-        known = _enough(None if matched is None else matched.double() - origin)
-        layout = classify_layout(local, known)
+    if (points is None or len(points) < MIN_POINTS) and moves and target is None and match is not None:
+        points = match()
+    known = None if points is None or len(points) < MIN_POINTS else points.double() - origin
+    layout = classify_layout(local, known)
     if layout in (Layout.INWARD, Layout.FORWARD):
         region = _subject(local, layout, target, known)
     else:
         region = _surroundings(local, layout, known)
-    found = None if known is None else known + origin
-    return replace(region, centre=region.centre + origin, points=found)
-
-
-def _enough(points: Float[Tensor, "P 3"] | None) -> Float[Tensor, "P 3"] | None:
-    return None if points is None or len(points) < MIN_POINTS else points
+    return replace(region, centre=region.centre + origin, points=None if known is None else known + origin)
 
 
 def _subject(

@@ -1,7 +1,6 @@
 """Posed photos on disk become a Scene, whatever format named them."""
 
 import logging
-import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,31 +10,25 @@ from typing import Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from nerf_lightning.cameras import Cameras, Lenses
 from nerf_lightning.dataset.formats.decode import THREADS, image_header, read_pixels, stated_exposure
 from nerf_lightning.dataset.intrinsics import Intrinsics
-from nerf_lightning.dataset.masks import KEPT, SURE, cut_out, read_mask, seem_inverted
+from nerf_lightning.dataset.masks import read_mask
 from nerf_lightning.dataset.orientation import has_shape
-from nerf_lightning.dataset.resize import area_resize, fit_size
-from nerf_lightning.dataset.size import AutoResize, choose_resize, find_reduced
+from nerf_lightning.dataset.resize import AutoResize, area_resize, choose_resize, find_reduced, fit_size
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.memory import free_memory
+from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.progress import tracked
-from nerf_lightning.utils.text import subsample
 
 log = logging.getLogger(__name__)
 
 Masked = Literal["auto", "unknown", "empty"]
 Orientation = Literal["auto", "stored", "exif"]
-MEMORY_SHARE = 0.8
-"""Of the free memory that photos may take."""
-MAX_REDUCTION = 16
-"""Of a photo against its camera's size."""
-MASKS_LOOKED_AT, LOOK_SIDE_PX = 8, 1000
-"""Photos, evenly chosen, that tell what their masks mean, and the size at which that shows."""
+MIN_KNOWN = 250
+"""Share of a pixel, in 1/255, that must be known after averaging for the pixel to be known."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +40,7 @@ class PhotoLoadOptions:
             keeps their size.
         holdout: every N-th photo is held out, in the order of their names, where the format has no split of its own.
         masked: what masks and alpha leave out is "unknown" (a passer-by: not drawn, not scored) or "empty" (the subject is
-            cut out); "auto" takes alpha as empty, and masks as empty where what they leave out is of one colour.
+            cut out); "auto" takes alpha as empty and masks as unknown.
         invert_masks: masks are black where the photo is kept.
         bounded: "true", "false", or "auto", which decides by what the photos show, see `dataset.kind`.
         orientation: "stored", "exif", or "auto", see `dataset.orientation`.
@@ -90,33 +83,34 @@ def read_shots(source: Path, shots: Sequence[Shot], options: PhotoLoadOptions) -
     for shot, (width, height, _) in zip(shots, headers, strict=True):
         check_shape(source, shot, width, height)
     has_alpha = any(alpha for _, _, alpha in headers)
-    masked = interpret_masks(shots, options)
-    channels = 4 if masked == "empty" or (has_alpha and options.masked != "unknown") else 3
+    has_masks = any(shot.mask is not None for shot in shots)
+    cuts_out = has_masks and options.masked == "empty"
+    channels = 4 if cuts_out or (has_alpha and options.masked != "unknown") else 3
     sizes = [(width, height) for width, height, _ in headers]
     longest = choose_resize(source, sizes, channels, options.resize)
     sizes = [fit_size(*size, longest) for size in sizes]
     starts = np.cumsum([0] + [width * height for width, height in sizes])
-    _check_memory(source, shots, int(starts[-1]) * channels, sizes)
+    check_memory(source, "", f"{len(shots)} photos", float(starts[-1]) * channels, "give a smaller dataset.resize")
     pixels = np.empty((starts[-1], channels), np.uint8)
-    known = np.ones(starts[-1] if masked or has_alpha else 0, bool)
+    known = np.ones(starts[-1] if has_masks or has_alpha else 0, bool)
 
     def read(i: int) -> None:
         file = shots[i].photo if longest is None else find_reduced(shots[i].photo, sizes[i], shots[i].upright)
         image = read_pixels(file, shots[i].upright, sizes[i])
-        if not has_shape((image.shape[1], image.shape[0]), headers[i][:2]):
-            expected = f"{headers[i][0]}x{headers[i][1]}, as its header says"
-            raise InputError(file, "", f"{image.shape[1]}x{image.shape[0]} pixels", expected, "save it again")
         mask_file, (height, width) = shots[i].mask, image.shape[:2]
         mask = None if mask_file is None else read_mask(mask_file, width, height, options.invert_masks)
-        image, mask = merge_mask(image, mask, channels, masked == "empty")
+        image, mask = merge_mask(image, mask, channels, cuts_out)
         part = slice(starts[i], starts[i + 1])
         pixels[part] = area_resize(image, *sizes[i]).reshape(-1, channels)
         if mask is not None:
-            known[part] = cv2.resize(mask, sizes[i], interpolation=cv2.INTER_AREA).ravel() >= SURE
+            known[part] = cv2.resize(mask, sizes[i], interpolation=cv2.INTER_AREA).ravel() >= MIN_KNOWN
 
     with ThreadPoolExecutor(THREADS) as pool:
         for _ in tracked(pool.map(read, range(len(shots))), len(shots), "reading photos"):
             pass
+    if not known.all():
+        text = "%s: %.0f %% of the pixels are masked; dataset.masked and dataset.invert_masks say how masks are read"
+        log.info(text, source, 100 * (1 - known.mean()))
     exposures = [exposure for shot in shots if (exposure := stated_exposure(shot.photo)) is not None]
     return Views(
         torch.from_numpy(pixels),
@@ -130,7 +124,7 @@ def read_shots(source: Path, shots: Sequence[Shot], options: PhotoLoadOptions) -
 def check_shape(source: Path, shot: Shot, width: int, height: int) -> None:
     """Refuses a photo that cannot be of its camera."""
     stated = shot.optics.width, shot.optics.height
-    if min(width, height) < 2 or MAX_REDUCTION * width < stated[0] or not has_shape((width, height), stated):
+    if not has_shape((width, height), stated):
         expected = f"{stated[0]}x{stated[1]}, the size of its camera, or the same reduced"
         raise InputError(shot.photo, "", f"{width}x{height} pixels", expected, f"are these the photos of {source}?")
 
@@ -159,36 +153,3 @@ def make_cameras(shots: Sequence[Shot]) -> Cameras:
         lenses = Lenses(coefficients.float(), torch.tensor([one.projection for one in optics]))
     K, c2w = (torch.from_numpy(np.stack(x)) for x in ([one.K for one in optics], [shot.c2w for shot in shots]))
     return Cameras(K.float(), c2w, torch.tensor([(one.width, one.height) for one in optics]), lenses)
-
-
-def interpret_masks(shots: Sequence[Shot], options: PhotoLoadOptions) -> str | None:
-    """What masks in files of their own leave out, see `PhotoLoadOptions`; None where there are none. A few are looked at."""
-    masks = [(shot, shot.mask) for shot in shots if shot.mask is not None]
-    if not masks:
-        return None
-    kept: list[Bool[np.ndarray, "_ _"]] = []
-    cut = []
-    for shot, mask in (masks[i] for i in subsample(len(masks), MASKS_LOOKED_AT)):
-        size = image_header(shot.photo, shot.upright)[:2]
-        image = read_pixels(shot.photo, shot.upright, fit_size(*size, LOOK_SIDE_PX))
-        kept.append(read_mask(mask, image.shape[1], image.shape[0], options.invert_masks) >= KEPT)
-        cut.append(cut_out(image, kept[-1]))
-    if seem_inverted(kept):
-        text = "most masks leave out one spot in the middle: are they inverted? dataset.invert_masks=%s takes them so"
-        log.warning(text, str(not options.invert_masks).lower())
-    meaning = options.masked
-    if meaning == "auto":
-        meaning = "empty" if np.mean(cut) > 0.5 else "unknown"
-    share = 1 - float(np.mean([one.mean() for one in kept]))
-    log.info("masks leave out about %.0f %% of the pixels: taken as %s", 100 * share, meaning)
-    return meaning
-
-
-def _check_memory(source: Path, shots: Sequence[Shot], size: int, sides: Sequence[tuple[int, int]]) -> None:
-    """Photos must fit into the free memory."""
-    free = MEMORY_SHARE * free_memory()
-    if size > free:
-        longest = max(max(side) for side in sides)
-        fits = max(1, int(longest * math.sqrt(max(free, 0) / size)))
-        found = f"{len(shots)} photos that take {size / 2**30:.1f} GiB"
-        raise InputError(source, "", found, f"at most {free / 2**30:.1f} GiB", f"dataset.resize={fits} would fit")

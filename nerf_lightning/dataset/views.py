@@ -10,9 +10,6 @@ from torch import Tensor
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.utils.tensors import TensorDataclass
 
-BLOCK = 32
-"""Pixels whose known ones are counted together, to find one by its number."""
-
 
 @dataclass(frozen=True)
 class Views(TensorDataclass):
@@ -88,26 +85,13 @@ class Views(TensorDataclass):
             return self.known
         return torch.ones(len(self.pixels), dtype=torch.bool, device=self.pixels.device)
 
-    @cached_property
-    def _known_before(self) -> Int[Tensor, "B1"]:
-        """How many known pixels there are before each `BLOCK` of them, and in all."""
-        padded = torch.nn.functional.pad(self.mask, (0, -len(self.mask) % BLOCK))
-        counts = padded.view(-1, BLOCK).sum(1)
-        return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-
     def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
         """Places in `pixels`, drawn uniformly from those that count, with replacement."""
         device = self.pixels.device
-        if self.known is None:
-            return torch.randint(len(self.pixels), (count,), generator=generator, device=device)
-        before = self._known_before
-        number = torch.randint(int(before[-1]), (count,), generator=generator, device=device)
-        block = torch.searchsorted(before, number, right=True) - 1
-        places = block[:, None] * BLOCK + torch.arange(BLOCK, device=device)
-        found = (self.known[places.clamp_max(len(self.known) - 1)].cumsum(1) <= (number - before[block])[:, None]).sum(
-            1
-        )
-        return block * BLOCK + found
+        places = torch.randint(len(self.pixels), (count,), generator=generator, device=device)
+        while self.known is not None and len(masked := (~self.known[places]).nonzero()[:, 0]):
+            places[masked] = torch.randint(len(self.pixels), (len(masked),), generator=generator, device=device)
+        return places
 
     def mask_of(self, view: int) -> Bool[Tensor, "H W"]:
         """Which pixels of a photo count."""

@@ -1,20 +1,20 @@
 """A map of a scene: the cameras, the tags, known points, and its box and orbit."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.drawing.ink import BLUE, DPI, GREY, ORANGE, VERMILLION
 
 FRUSTUM = 0.06
 """Height of a camera's pyramid as a share of the map's width."""
-EDGES = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
+STROKE = [0, 1, 2, 0, 3, 2, 3, 4, 0, 4, 1]
+"""Corners of a pyramid in an order that draws all of its edges."""
+CENTRED: dict[str, Any] = {"ha": "center", "va": "center", "annotation_clip": True}
 NUMBERS = 120
 """Most cameras that are numbered; of more, every N-th is."""
 MAX_POINTS = 5000
@@ -43,13 +43,12 @@ def camera_map(
         unit: of lengths, in words.
     """
     camera = scene.train.cameras[0].as_pinholes()
-    orbit = scene.orbit.centres.double().numpy()
-    box = scene.bounds.aabb.double().numpy()
+    orbit, box = scene.orbit.centres.double().numpy(), scene.bounds.aabb.double().numpy()
     solid = np.concatenate([np.stack([c2w[:3, 3] for _, c2w in numbered]), orbit, box, *tags.values()])
     depth = FRUSTUM * float(np.ptp(solid[:, :2], axis=0).max())
     shape = frustum(camera.K[0].double().numpy(), *camera.size(0), depth)
-    frusta = [(number, shape @ c2w[:3, :3].T + c2w[:3, 3]) for number, c2w in numbered]
-    everything = np.concatenate([solid, *[points for _, points in frusta]])
+    frusta = np.stack([shape @ c2w[:3, :3].T + c2w[:3, 3] for _, c2w in numbered])
+    everything = np.concatenate([solid, frusta.reshape(-1, 3)])
     low, high = everything.min(0) - depth / 2, everything.max(0) + depth / 2
 
     span = high - low
@@ -62,47 +61,23 @@ def camera_map(
         axes.set_title(name, loc="left")
         axes.grid(color="0.92")
         axes.set_axisbelow(True)
+        broken = np.pad(frusta[:, STROKE][..., [0, up]], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+        axes.plot(*broken.reshape(-1, 2).T, color=BLUE, linewidth=0.8, label="cameras, numbered as the photos are")
+        for tag, corners in tags.items():
+            label = "" if tag != next(iter(tags)) else "tags, with their ids"
+            axes.fill(corners[:, 0], corners[:, up], facecolor="0.8", edgecolor="black", label=label)
+        x, y = box[[0, 1, 1, 0, 0], 0], box[[0, 0, 1, 1, 0], up]
+        axes.plot(x, y, "--", color=GREY, linewidth=1.5, label="box of the scene")
+        closed = np.concatenate([orbit, orbit[:1]])
+        axes.plot(closed[:, 0], closed[:, up], color=ORANGE, linewidth=2, label="orbit")
         if scene.points is not None:
             some = scene.points[:: -(-len(scene.points) // MAX_POINTS)].numpy()
-            axes.plot(some[:, 0], some[:, up], ".", color="0.6", markersize=1.5, zorder=0.5)
-        _draw(axes, [0, up], frusta, tags, orbit, box)
+            axes.plot(some[:, 0], some[:, up], ".", color="0.6", markersize=1.5, zorder=0.5, label="known points")
+        for (number, _), points in list(zip(numbered, frusta, strict=True))[:: -(-len(frusta) // NUMBERS)]:
+            behind = points[0] - 0.35 * (points[1:].mean(0) - points[0])  # where there are no lines
+            axes.annotate(str(number), behind[[0, up]], fontsize=8, **CENTRED)
     beside.set_xlabel(f"x, {unit}")
     for tag, corners in tags.items():
-        x, y = corners[:, :2].mean(0)
-        above.annotate(str(tag), (x, y), ha="center", va="center", fontsize=9, color=VERMILLION, annotation_clip=True)
-    key = [
-        Line2D([], [], color=BLUE, label="cameras, numbered as the photos are"),
-        Line2D([], [], color=GREY, linestyle="--", label="box of the scene"),
-        Line2D([], [], color=ORANGE, linewidth=2, label="orbit"),
-    ]
-    if scene.points is not None:
-        key.append(Line2D([], [], color="0.6", marker=".", linestyle="", label="known points"))
-    if tags:
-        label = "tags, with their ids"
-        key[1:1] = [Line2D([], [], color="black", marker="s", markerfacecolor="0.8", linestyle="", label=label)]
-    figure.legend(handles=key, loc="outside upper center", ncols=4, frameon=False)
+        above.annotate(str(tag), corners[:, :2].mean(0), fontsize=9, color=VERMILLION, **CENTRED)
+    figure.legend(*above.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
     return figure
-
-
-def _draw(
-    axes: Axes,
-    plane: list[int],
-    frusta: Sequence[tuple[int, Float[np.ndarray, "5 3"]]],
-    tags: dict[int, Float[np.ndarray, "M 3"]],
-    orbit: Float[np.ndarray, "F 3"],
-    box: Float[np.ndarray, "2 3"],
-) -> None:
-    axes.add_collection(
-        PolyCollection([c[:, plane] for c in tags.values()], facecolors="0.8", edgecolors="black", linewidths=1.0)
-    )
-    closed = np.concatenate([orbit, orbit[:1]])[:, plane]
-    axes.plot(*closed.T, color=ORANGE, linewidth=2)
-    (left, bottom), (right, top) = box[:, plane]
-    axes.plot([left, right, right, left, left], [bottom, bottom, top, top, bottom], "--", color=GREY, linewidth=1.5)
-    lines = [points[edge][:, plane] for _, points in frusta for edge in map(list, EDGES)]
-    axes.add_collection(LineCollection(lines, colors=BLUE, linewidths=0.8, alpha=0.8))
-    step = -(-len(frusta) // NUMBERS)
-    for number, points in frusta[::step]:
-        # Behind the camera, where there are no lines.
-        behind = points[0] - 0.35 * points[1:].mean(0) + 0.35 * points[0]
-        axes.annotate(str(number), behind[plane], ha="center", va="center", fontsize=8, annotation_clip=True)

@@ -1,15 +1,66 @@
-"""Quality of each view, as a table and as plain values."""
+"""Quality of each view, as a table and as plain values. LPIPS needs weights that are on this machine: nothing is downloaded."""
 
+import importlib
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
 import torch
+from jaxtyping import Float
+from torch import Tensor
+from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
 
+from nerf_lightning.dataset import PixelDataModule, RayDataModule
+from nerf_lightning.system import System, ViewResult
 from nerf_lightning.utils.files import known
 from nerf_lightning.utils.machine import describe_machine
+from nerf_lightning.utils.progress import tracked
 
 DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "seconds": 3}
 """Decimals of a view's figures. SSIM is nan for views smaller than its window, LPIPS where it cannot be computed."""
+ALEXNET_WEIGHTS = "alexnet-owt-7be5be79.pth"
+"""As torchvision names them in torch.hub's folder."""
+MIN_LPIPS_SIDE = 64
+"""Pixels along a side that AlexNet needs."""
+
+
+def measure_views(
+    system: System, data: RayDataModule | PixelDataModule, worst: int
+) -> tuple[pd.DataFrame, dict[int, ViewResult]]:
+    """The figures of all held-out views, and the results of the worst ones by their number."""
+    lpips, rows = load_lpips(), []
+    results: dict[int, ViewResult] = {}
+    views = tracked(range(data.held_out_views), data.held_out_views, "held-out views")
+    for view, result in enumerate(system.evaluate_held_out(data, views)):
+        rows.append((result.psnr, result.ssim, lpips(result.rgb, result.comparable), result.seconds))
+        results[view] = result
+        if len(results) > worst:
+            del results[max(results, key=lambda one: results[one].psnr)]
+    return pd.DataFrame(rows, columns=list(DIGITS), dtype=float), results
+
+
+def load_lpips() -> Callable[[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]], float]:
+    """LPIPS (Zhang et al. 2018) with AlexNet of two images in [0, 1], smaller is better; nan for images that are too small.
+
+    Without torchvision or the weights it is nan for all, and a line says why.
+    """
+    weights, reason = Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET_WEIGHTS, ""
+    try:
+        importlib.import_module("torchvision")
+        reason = "" if weights.exists() else f"{weights} is not there"
+    except ImportError:
+        reason = "torchvision is not installed: pip install 'nerf_lightning[lpips]'"
+    if reason:
+        print(f"no LPIPS: {reason}")
+
+    def lpips(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
+        if reason or min(image.shape[:2]) < MIN_LPIPS_SIDE:
+            return math.nan
+        first, second = (one.permute(2, 0, 1)[None] for one in (image, truth))
+        return float(learned_perceptual_image_patch_similarity(first, second, net_type="alex", normalize=True))
+
+    return lpips
 
 
 def format_table(views: pd.DataFrame) -> str:

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays
-from nerf_lightning.export.reach import NOTHING, Cells, visible_cells
+from nerf_lightning.export.smallest import NOTHING, Cells, visible_cells
 from nerf_lightning.export.volume import COARSEST, FINEST
 from nerf_lightning.model import TensoRFField, VoxelField
+from nerf_lightning.model.layers.encoding import encode_directions
 from nerf_lightning.model.layers.pruning import vertices_in, widened
-from nerf_lightning.model.layers.view_dependence import encode_directions
 from nerf_lightning.model.voxels import EMPTY
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D
@@ -83,7 +83,7 @@ def drawable(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: in
         changes.append(f"{STEPS} steps between {CELLS} cells a side in place of its own samples")
     steps = OccupancySampler(field.bounds, STEPS, CELLS, chunk=system.chunk)
     made.sampler = copy.deepcopy(sampler) if keeps_sampler else steps
-    made.sampler.import_state({"occupied": seen.flatten()})
+    made.sampler.import_state({"grid.occupied": seen.flatten()})
     made.sampler.to(system.device)
     if not keeps_field:
         teach(made, system, cameras)

@@ -1,6 +1,7 @@
 """Meshes, point clouds and voxel grids for other programs, in the place and at the scale of the photos' own file."""
 
 import io
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,22 +14,26 @@ from torch import Tensor
 from nerf_lightning.cameras import Cameras, spiral_like
 from nerf_lightning.drawing.panels import to_bytes
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.shapes import encode_mesh, encode_ply, format_offset
 from nerf_lightning.export.smallest import MOST_VIEWS, some_cameras
 from nerf_lightning.export.surface import Surface, find_surface, lit_cells
 from nerf_lightning.export.volume import PLACES, Volume
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.open import SceneRun
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.utils.text import subsample
 
 if TYPE_CHECKING:
     import trimesh
 
 SUFFIXES = {"mesh": (".ply", ".glb", ".obj", ".stl"), "points": (".ply",), "voxels": (".npz",)}
 """Of files, by what they hold; the default first."""
-OFFSETS = {".stl": "offset {} subtracted, see the header", ".glb": "offset {} in the node's transform"}
-"""How messages state it, by format: single precision does not hold coordinates that are large for the mesh's size."""
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""From z up, as scenes have it, to y up, as glTF wants it: written as the node's transform."""
+SINGLE = 2.0**-24
+"""Largest relative error of a number rounded to single precision."""
+MAX_ERROR = 1e-4
+"""Largest rounding error of a vertex, as a share of a mesh's longest side: a fortieth of the finest cell's."""
+DIGITS, COLOUR_DIGITS = 9, 4
+"""Significant digits of an OBJ file's coordinates, relative to the mesh's longest side, and decimals of colours."""
 
 
 class Shape(NamedTuple):
@@ -39,17 +44,14 @@ class Shape(NamedTuple):
 
 
 def training_views(run: SceneRun, photos: Path | None = None) -> Cameras:
-    """Some of the views that a field was trained from; without photos, its orbit and a spiral above it."""
+    """Some of the views that a field was trained from; without photos, a spiral that begins on its orbit."""
     try:
         data = data_again(run.cfg, run.scene, photos)
     except InputError as error:
         if photos is not None:
             raise
-        print(f"without the photos' cameras, from the orbit: {error}")
-        spiral, count = spiral_like(run.orbit, MOST_VIEWS // 2), MOST_VIEWS // 2
-        orbit = run.orbit[torch.tensor(subsample(len(run.orbit), count))]
-        K, c2w, sizes = (torch.cat([getattr(x, name) for x in (orbit, spiral)]) for name in ("K", "c2w", "sizes"))
-        return Cameras(K, c2w, sizes)
+        print(f"without the photos' cameras, from a spiral: {error}")
+        return spiral_like(run.orbit, MOST_VIEWS)
     return some_cameras(data)
 
 
@@ -83,14 +85,13 @@ def coloured_mesh(
 def mesh_file(run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None, suffix: str) -> Shape:
     """A coloured mesh as .ply, .obj or .glb; its triangles alone as .stl."""
     mesh, surface = coloured_mesh(run, cameras, volume, threshold)
-    content, offset = encode_mesh(mesh, suffix, run.to_source[:3, :3].T.numpy() / run.scale)
+    content = encode_mesh(mesh, suffix, run.to_source[:3, :3].T.numpy() / run.scale)
     words = [
         f"{len(mesh.faces):,} triangles",
         "watertight" if mesh.is_watertight else "with open edges",
         " x ".join(f"{side:.4g}" for side in mesh.extents) + " in the photos' unit",
         f"surface at opacity {surface.threshold:.2f}",
         *([f"{surface.floaters} floating pieces left out"] if surface.floaters else []),
-        *([OFFSETS[suffix].format(format_offset(offset))] if offset.any() else []),
     ]
     return Shape(content, ", ".join(words))
 
@@ -127,3 +128,62 @@ def voxels_file(run: SceneRun, volume: Volume) -> Shape:
     np.savez_compressed(file, **arrays)
     shape = " x ".join(map(str, solid.shape))
     return Shape(file.getvalue(), f"{shape} cells, {len(index):,} of them not empty")
+
+
+def encode_ply(vertices: Float[ndarray, "V 3"], rgb: UInt8[ndarray, "V 3"], faces: ndarray | None = None) -> bytes:
+    """A binary PLY file with vertices in double precision (Turk 1994); trimesh writes single.
+
+    Args:
+        vertices: in the file's frame.
+        rgb: of the vertices.
+        faces: [F, 3] indices of vertices; None for points alone.
+    """
+    colours = ("red", "green", "blue")
+    kinds = [(name, "<f8") for name in "xyz"] + [(name, "u1") for name in colours]
+    body = np.rec.fromarrays([*vertices.T, *rgb.T], dtype=kinds).tobytes()
+    lines = ["ply", "format binary_little_endian 1.0", "comment nerf_lightning", f"element vertex {len(vertices)}"]
+    lines += [*(f"property double {name}" for name in "xyz"), *(f"property uchar {name}" for name in colours)]
+    if faces is not None:
+        kinds = [("count", "u1"), ("a", "<i4"), ("b", "<i4"), ("c", "<i4")]
+        body += np.rec.fromarrays([np.full(len(faces), 3), *faces.T], dtype=kinds).tobytes()
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    return "\n".join([*lines, "end_header", ""]).encode() + body
+
+
+def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, turn: Float[ndarray, "3 3"]) -> bytes:
+    """A coloured mesh as .ply, .obj, .stl or .glb.
+
+    GLB has single precision: its coordinates are those about the mesh's middle, to which its node moves them.
+
+    Args:
+        mesh: with a colour at each vertex.
+        suffix: of the file.
+        turn: the rotation of a GLB file's node to z up, about the middle.
+
+    Raises:
+        InputError: for STL, which has single precision, where that does not suffice.
+    """
+    colours: Any = mesh.visual
+    content: Any
+    if suffix == ".ply":
+        return encode_ply(mesh.vertices, colours.vertex_colors[:, :3], mesh.faces)
+    if suffix == ".obj":
+        digits = max(COLOUR_DIGITS, DIGITS - math.floor(math.log10(float(mesh.extents.max()))))
+        content = mesh.export(file_type="obj", digits=digits, header="nerf_lightning", include_normals=False)
+        return content.encode()
+    if suffix == ".stl":
+        farthest = float(np.abs(mesh.vertices).max())
+        if farthest * SINGLE > MAX_ERROR * mesh.extents.max():
+            found = f".stl for coordinates up to {farthest:.6g}, too large for its single precision"
+            raise InputError("export", "output", found, ".obj, .ply or .glb")
+        content = mesh.export(file_type="stl")
+        return content
+    import trimesh
+
+    middle, moved = mesh.vertices.mean(0), mesh.copy()
+    moved.vertices = mesh.vertices - middle
+    scene, node = trimesh.Scene(), np.eye(4)
+    node[:3, :3], node[:3, 3] = Y_UP @ turn, Y_UP @ middle
+    scene.add_geometry(moved, transform=node)
+    content = scene.export(file_type="glb")
+    return content

@@ -37,7 +37,7 @@ def activation_of(field: TensoRFField | VoxelField) -> int:
     """The map from raw output to density, by its number in march.glsl: exp, relu, softplus."""
     made = field.activation if isinstance(field, TensoRFField) else torch.exp
     if isinstance(made, SoftenableReLU):
-        return 2 if bool(made.soft) else 1
+        return 2 if made.is_soft else 1
     return 2 if made is shifted_softplus else 0
 
 

@@ -12,8 +12,7 @@ from nerf_lightning.drawing.panels import to_bytes
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.drawable import drawable, is_drawable
 from nerf_lightning.export.page import field_page, gallery_page, picture_page
-from nerf_lightning.export.reach import occupied_cells
-from nerf_lightning.export.smallest import held_out_psnr, smallest, some_cameras
+from nerf_lightning.export.smallest import held_out_psnr, occupied_cells, smallest, some_cameras
 from nerf_lightning.runs.compact import without_folders
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import RunFolder, plain_config
@@ -31,7 +30,6 @@ def build_page(
     source: Path,
     device: torch.device,
     cells: int | None = None,
-    precision: str | None = None,
     loss_db: float = 0.1,
     photos: Path | None = None,
 ) -> tuple[str, str]:
@@ -51,7 +49,7 @@ def build_page(
         return picture_page(to_bytes(rgb.cpu()), data.scene.name, facts), quality
     drawn = drawable(system, some_cameras(data), plain_config(found.cfg), cells)
     seen = occupied_cells(drawn.system) if drawn.changes else None
-    compact = smallest(drawn.system, data, drawn.config, loss_db, precision, seen)
+    compact = smallest(drawn.system, data, drawn.config, loss_db, seen)
     before = held_out_psnr(system, data) if drawn.changes else compact.before
     content, changes = without_folders(compact.content), "; ".join(drawn.changes)
     measured = [

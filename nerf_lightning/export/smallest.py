@@ -1,5 +1,6 @@
-"""The smallest compact file of a run that still shows what the run shows."""
+"""The smallest compact file of a run that still shows what the run shows: all that its photos' cameras see."""
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,14 +8,17 @@ from statistics import fmean
 from typing import Any
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import DataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.reach import Cells, confined_to, occupied_cells, seen_cells
+from nerf_lightning.model.layers.pruning import widened
 from nerf_lightning.runs.compact import decode, encode
 from nerf_lightning.runs.scene_file import scene_content
-from nerf_lightning.system import System
+from nerf_lightning.sampler import OccupancySampler
+from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.utils.progress import tracked
 from nerf_lightning.utils.text import subsample
 
@@ -22,6 +26,60 @@ MOST_VIEWS = 60
 """Training views whose rays show which cells matter."""
 PRECISIONS = ("byte", "half")
 """Smallest first."""
+NOTHING = 1e-3
+"""Opacity below which a step is empty."""
+FINEST = 8
+"""Most rays along a pixel's side."""
+
+Cells = Bool[Tensor, "G G G"]
+"""A mask over the cells of a sampler's grid."""
+
+
+def occupied_cells(system: System) -> Cells | None:
+    """Cells in which the sampler looks for something; None for a sampler without a grid."""
+    sampler = system.parts.get("sampler")
+    return sampler.grid.occupied.view(*[sampler.grid.resolution] * 3) if isinstance(sampler, OccupancySampler) else None
+
+
+def seen_cells(system: NeRF3D, cameras: Cameras) -> Cells | None:
+    """The occupied cells that are visible to the cameras, and their neighbours."""
+    occupied = occupied_cells(system)
+    if occupied is None:
+        return None
+    return widened(visible_cells(system, cameras, len(occupied))) & occupied
+
+
+@torch.no_grad()
+def visible_cells(system: NeRF3D, cameras: Cameras, n: int) -> Cells:
+    """The cells of a grid of n^3 over the bounds in which some camera sees something.
+
+    Rays are as close to each other at the content as cells are.
+    """
+    bounds = system.field.bounds
+    cell = (4 if bounds.unbounded else 2) * bounds.longest / n
+    times = min(FINEST, math.ceil(cameras.pixel_width(bounds.centre.cpu()) / cell))
+    fine = cameras.scaled(times)
+    seen = torch.zeros(n**3, dtype=torch.bool, device=system.device)
+    for view in tracked(range(len(fine)), len(fine), "views"):
+        rays = fine.view_rays(view)
+        for start in range(0, len(rays), system.chunk_rays):
+            chunk = rays[start : start + system.chunk_rays].to(system.device)
+            samples = system.sampler(chunk, system.field.density)
+            positions = samples.positions(chunk)
+            opacity = 1 - torch.exp(-system.field.density(positions) * samples.dt)
+            x, y, z = (bounds.to_unit(positions[opacity > NOTHING]) * n).long().clamp(0, n - 1).unbind(1)
+            seen[(x * n + y) * n + z] = True
+    return seen.view(n, n, n)
+
+
+def confined_to(system: System, cells: Cells | None) -> System:
+    """A copy of a system with only what some cells need, on the CPU, to be encoded; the system itself for None."""
+    if cells is None:
+        return system
+    part: Any = copy.deepcopy(system).cpu()
+    part.field.prune(cells.cpu())
+    part.sampler.import_state({"grid.occupied": cells.cpu().flatten()})
+    return part
 
 
 @dataclass(frozen=True)
@@ -60,7 +118,6 @@ def smallest(
     data: DataModule,
     config: dict[str, Any],
     most_loss: float,
-    precision: str | None = None,
     seen: Cells | None = None,
 ) -> Compact:
     """Encodes a system in the fewest bytes within the allowed loss: what its photos' cameras see, or everything.
@@ -70,11 +127,10 @@ def smallest(
         data: of its run.
         config: of its run, as plain values.
         most_loss: dB on held-out views.
-        precision: "byte" or "half"; None takes the smaller one that is allowed.
         seen: the occupied cells that its photos' cameras see, where they are known.
 
     Raises:
-        InputError: where every precision asked for loses more.
+        InputError: where every precision loses more.
     """
     before = held_out_psnr(system, data)
     if seen is None and data.has_cameras:
@@ -84,7 +140,7 @@ def smallest(
     confined = [confined_to(system, cells) for cells in ([seen] if alike else [seen, occupied])]
     scene = scene_content(data)
     tried: list[Compact] = []
-    for one in PRECISIONS if precision is None else (precision,):
+    for one in PRECISIONS:
         for part in confined:  # few photos do not see all that held-out views do
             content = encode(part, one, config, scene)
             small = decode(content, "compact", system.device).system
@@ -92,8 +148,5 @@ def smallest(
             if tried[-1].loss <= most_loss:
                 return tried[-1]
     best = min(tried, key=lambda compact: compact.loss)
-    found = f"{best.loss:.2f} dB lost with --precision {best.precision}"
-    advice = f"allow it with --loss-db {best.loss + 0.005:.2f}" + (
-        ", or --precision half" if precision == "byte" else ""
-    )
-    raise InputError("export", "loss_db", found, f"at most {most_loss:g} dB", advice)
+    advice = f"allow it with --loss-db {best.loss + 0.005:.2f}"
+    raise InputError("export", "loss_db", f"{best.loss:.2f} dB lost", f"at most {most_loss:g} dB", advice)

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, transform
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.reach import occupied_cells
+from nerf_lightning.export.smallest import occupied_cells
 from nerf_lightning.runs.open import SceneRun
-from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.progress import tracked
 
@@ -60,7 +59,7 @@ class Volume:
         return self.places(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1))
 
 
-def region_of(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tensor, "4 4"]) -> Float[Tensor, "2 3"]:
+def find_region(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tensor, "4 4"]) -> Float[Tensor, "2 3"]:
     """Lower and upper corner of the part of some bounds, world frame, that holds a box of another frame.
 
     Args:
@@ -82,39 +81,40 @@ def region_of(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tensor
     return region
 
 
-def cells_across(system: NeRF3D, region: Float[Tensor, "2 3"] | None = None) -> int:
-    """Cells along a region's longest side: somewhat larger than a pixel of the photos, within limits."""
-    bounds = system.field.bounds
-    low, high = bounds.aabb if region is None else region
-    across = float((high - low).max()) / (PIXELS * bounds.pixel) if bounds.pixel else math.inf
-    return round(min(max(across, COARSEST), FINEST))
-
-
 @torch.no_grad()
-def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] | None = None) -> Volume:
-    """Samples a field's density over a region, in the cells its sampler marks as occupied; it is zero elsewhere.
+def sample_volume(run: SceneRun, resolution: int | None = None, box: Float[Tensor, "2 3"] | None = None) -> Volume:
+    """Samples a field's density in the cells that its sampler marks as occupied; it is zero elsewhere.
 
     Args:
-        resolution: cells along the region's longest side.
-        region: lower and upper corner, world frame; None takes the field's box.
+        run: of a scene.
+        resolution: cells along the longest side; None takes somewhat larger ones than a pixel of the photos, within limits.
+        box: lower and upper corner of the part to sample, in the frame of the photos' own file; None takes all.
+
+    Raises:
+        InputError: where the box lies outside the scene's.
     """
-    bounds = system.field.bounds
-    corners = bounds.aabb if region is None else region.to(system.device)
-    sides = corners[1] - corners[0]
+    system, bounds = run.system, run.system.field.bounds
+    region = bounds.aabb.cpu() if box is None else find_region(bounds, box, run.to_source)
+    sides = region[1] - region[0]
+    if resolution is None:
+        across = float(sides.max()) / (PIXELS * bounds.pixel) if bounds.pixel else math.inf
+        resolution = round(min(max(across, COARSEST), FINEST))
     cell = float(sides.max()) / resolution
     shape = [max(1, math.ceil(float(side) / cell - 1e-6)) for side in sides]
-    cells = math.prod(shape)
-    check_memory("export", "resolution", f"{cells:,} cells", CELL * cells)
+    count = math.prod(shape)
+    check_memory("export", "resolution", f"{count:,} cells", CELL * count)
     # Cubic cells may reach beyond the region: equally on both sides.
-    low = corners.mean(0) - torch.tensor(shape, device=system.device) * (cell / 2)
-    volume = Volume(torch.zeros(shape), low.cpu(), cell)
+    volume = Volume(torch.zeros(shape), region.mean(0) - torch.tensor(shape) * (cell / 2), cell)
     occupied = occupied_cells(system)
     together = PLACES * system.chunk
     density = []
-    for part in tracked(volume.centres.view(-1, 3).split(together), math.ceil(cells / together), "cells"):
+    for part in tracked(volume.centres.view(-1, 3).split(together), math.ceil(count / together), "cells"):
         places = part.to(system.device)
         unit = bounds.to_unit(places)
         asked = ((unit >= 0) & (unit <= 1)).all(1)
+        if box is not None:  # the region may be larger, as its axes are others
+            in_file = transform(run.to_source, part.double())
+            asked &= ((in_file >= box[0]) & (in_file <= box[1])).all(1).to(system.device)
         if occupied is not None:
             n = len(occupied)
             x, y, z = (unit * n).long().clamp(0, n - 1).unbind(1)
@@ -123,35 +123,3 @@ def sample_volume(system: NeRF3D, resolution: int, region: Float[Tensor, "2 3"] 
         found[asked] = system.field.density(places[asked])
         density.append(found.cpu())
     return replace(volume, density=torch.cat(density).view(shape).nan_to_num(0.0).clamp_min(0.0))
-
-
-def cropped(volume: Volume, box: Float[Tensor, "2 3"], to_source: Float[Tensor, "4 4"]) -> Volume:
-    """Empty wherever a cell's centre lies outside a box.
-
-    Args:
-        box: lower and upper corner in the frame of the photos' own file.
-        to_source: similarity from the world frame to that one.
-    """
-    matrix = to_source @ volume.to_world
-    i, j, k = (torch.arange(count, dtype=torch.float64) for count in volume.density.shape)
-    i, j = i[:, None, None], j[:, None]
-    inside = torch.ones(volume.density.shape, dtype=torch.bool)
-    for (x, y, z, shift), low, high in zip(matrix[:3].tolist(), *box.tolist(), strict=True):
-        place = x * i + y * j + z * k + shift
-        inside &= (place >= low) & (place <= high)
-    return replace(volume, density=volume.density * inside)
-
-
-def volume_of(run: SceneRun, resolution: int | None = None, box: Float[Tensor, "2 3"] | None = None) -> Volume:
-    """A run's field, or the part in a box, as cells.
-
-    Args:
-        resolution: cells along the longest side of what is asked; None takes `cells_across`.
-        box: lower and upper corner in the frame of the photos' own file.
-
-    Raises:
-        InputError: where the box lies outside the scene's.
-    """
-    region = None if box is None else region_of(run.system.field.bounds, box, run.to_source)
-    volume = sample_volume(run.system, resolution or cells_across(run.system, region), region)
-    return volume if box is None else cropped(volume, box, run.to_source)

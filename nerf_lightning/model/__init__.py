@@ -6,7 +6,7 @@ from nerf_lightning.model.hashgrid import HashGrid, HashGridField
 from nerf_lightning.model.hashgrid2d import HashGrid2DField
 from nerf_lightning.model.layers.activation import SoftenableReLU, density_activation, truncated_exp
 from nerf_lightning.model.layers.encoding import sinusoidal
-from nerf_lightning.model.layers.widening import as_wide
+from nerf_lightning.model.layers.networks import as_wide
 from nerf_lightning.model.mlp import MLPField
 from nerf_lightning.model.picture import FourierField, PictureMLP, SirenField
 from nerf_lightning.model.tensorf import TensoRFField, VectorMatrix

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, InBounds
-from nerf_lightning.errors import InputError
 from nerf_lightning.model.growth import ResolutionSchedule
 
 BYTES_PER_PARAMETER = 16
@@ -39,14 +38,9 @@ class AnyField(torch.nn.Module):
     sizing: str = ""
     """One line on how the field's size follows from the data; "" if it does not."""
 
-    @property
-    def values(self) -> int:
-        """How many numbers it learns at its present size."""
-        return sum(parameter.numel() for parameter in self.parameters())
-
     def values_grown(self) -> int:
-        """How many it will learn at its full size, as far as that is known beforehand."""
-        return self.values
+        """How many numbers it will learn at its full size, as far as that is known beforehand."""
+        return sum(parameter.numel() for parameter in self.parameters())
 
     @property
     def training_bytes(self) -> int:
@@ -93,13 +87,7 @@ class Field(InBounds, AnyField):
         self.unit_length = bounds.longest
 
     def grid_sizes(self, coarsest: int, finest: int, size: Size) -> tuple[int, int]:
-        """Cells along a side of the coarsest and the finest grid: as given, or with "auto" no more than the photos can show.
-
-        Raises:
-            InputError: where coarsest > finest.
-        """
-        if coarsest > finest:
-            raise InputError("model.coarsest", "", f"{coarsest} with model.finest={finest}", "0 < coarsest <= finest")
+        """Cells along a side of the coarsest and the finest grid: as given, or with "auto" no more than the photos can show."""
         across = self.bounds.pixels_across
         if size == "fixed" or across == math.inf:
             return coarsest, finest

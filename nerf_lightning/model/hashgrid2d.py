@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.kernels import hash_interpolate, mlp
+from nerf_lightning.kernels import mlp
 from nerf_lightning.model.field import PictureField
-from nerf_lightning.model.hashgrid import layers, level_resolutions, table_sizes, weights
-from nerf_lightning.model.layers.widening import widen_all
+from nerf_lightning.model.hashgrid import HashGrid, level_resolutions, table_sizes
+from nerf_lightning.model.layers.networks import layers, linears, weights, widen
 from nerf_lightning.utils.options import AtLeast, AtMost, Count, Layers, Positive, Side
 
 STEP = 2.4
@@ -55,39 +55,22 @@ class HashGrid2DField(PictureField):
         first = finest if levels == 1 else min(coarsest, finest)
         levels = levels or 1 + round(math.log(finest / first) / math.log(STEP))
         scaled = [[max(1, round(c * r / pixels)) for c in cells] for r in level_resolutions(levels, first, finest)]
-        self.resolutions = list(dict.fromkeys((across, down) for across, down in scaled))  # a small picture has fewer
+        resolutions = list(dict.fromkeys((across, down) for across, down in scaled))  # a small picture has fewer
         if log2_entries is None:
             numbers = share * 3 * size[0] * size[1]
-            fitting = [e for e in range(4, 25) if sum(table_sizes(self.resolutions, 2**e)) * features <= numbers]
+            fitting = [e for e in range(4, 25) if sum(table_sizes(resolutions, 2**e)) * features <= numbers]
             log2_entries = max(fitting, default=4)
-            held = sum(table_sizes(self.resolutions, 2**log2_entries)) * features / (3 * size[0] * size[1])
-            self.sizing = (
-                f"{len(self.resolutions)} grids up to the picture's {size[0]} x {size[1]} pixels: together {held:.2f} times as"
-                " many numbers as the picture"
-            )
-        self.sizes = table_sizes(self.resolutions, 2**log2_entries)
-        self.tables = torch.nn.Parameter(torch.empty(sum(self.sizes), features).uniform_(-1e-4, 1e-4))
-        self.net = layers(len(self.sizes) * features, width, 3)
+        self.grid = HashGrid(resolutions, log2_entries, features)
+        self.net = layers(self.grid.width, width, 3)
 
-    @torch.no_grad()
     def warm_start_from(self, smaller: PictureField) -> None:
-        """Copies the levels and the network if every level has the same grid and table size here."""
+        """Copies a field that has no other levels."""
         assert isinstance(smaller, HashGrid2DField)
-        features, places = self.tables.shape[1], []
-        for theirs, resolution in enumerate(smaller.resolutions):
-            mine = self.resolutions.index(resolution) if resolution in self.resolutions else -1
-            if mine < 0 or self.sizes[mine] != smaller.sizes[theirs]:
-                return
-            rows, others = (
-                slice(sum(s[:i]), sum(s[: i + 1])) for s, i in ((self.sizes, mine), (smaller.sizes, theirs))
-            )
-            self.tables[rows] = smaller.tables[others]
-            places += [mine * features + one for one in range(features)]
-        widen_all(self.net, smaller.net, torch.tensor(places))
+        if (columns := self.grid.warm_start_from(smaller.grid)) is not None:
+            widen(linears(self.net), linears(smaller.net), columns)
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         width, height = self.size
         pixels = uv * uv.new_tensor([width, height]) - 0.5
         unit = pixels / uv.new_tensor([max(width - 1, 1), max(height - 1, 1)])
-        features = hash_interpolate(self.tables, unit, self.resolutions, self.sizes)
-        return torch.sigmoid(mlp(features, weights(self.net)))
+        return torch.sigmoid(mlp(self.grid(unit), weights(self.net)))

@@ -9,7 +9,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model.field import Field
 from nerf_lightning.model.layers.activation import Activation, density_activation
 from nerf_lightning.model.layers.encoding import sinusoidal
-from nerf_lightning.model.layers.widening import widen, widen_all
+from nerf_lightning.model.layers.networks import linears, widen
 from nerf_lightning.utils.options import Count, Layers, Octaves
 
 
@@ -61,31 +61,22 @@ class MLPField(Field):
 
     @torch.no_grad()
     def warm_start_from(self, smaller: Field) -> None:
-        """Copies a network with the same encodings and skip; further layers of the trunk pass on their input."""
+        """Copies a network with the same encodings, both without a skip; further layers of the trunk pass on their input."""
         assert isinstance(smaller, MLPField)
-        like = ("skip", "position_frequencies", "direction_frequencies")
-        if any(getattr(self, key) != getattr(smaller, key) for key in like) or len(smaller.trunk) > len(self.trunk):
+        mine, its = ((f.skip, f.position_frequencies, f.direction_frequencies) for f in (self, smaller))
+        trunk, known = linears(self.trunk), linears(smaller.trunk)
+        if self.skip is not None or mine != its or len(known) > len(trunk):
             return
-        wide, narrow = self.bottleneck.in_features, smaller.bottleneck.in_features
-        encoded = torch.arange(3 * (1 + 2 * self.position_frequencies))
-        directions = torch.arange(3 * (1 + 2 * self.direction_frequencies))
-        hidden = torch.arange(narrow)
-        for layer, mine in enumerate(self.trunk):
-            assert isinstance(mine, torch.nn.Linear)
-            if layer >= len(smaller.trunk):  # its input has been through a ReLU, which a second one leaves alone
-                mine.weight[:narrow] = torch.eye(mine.in_features)[:narrow]
-                mine.bias[:narrow] = 0
-                continue
-            its = smaller.trunk[layer]
-            assert isinstance(its, torch.nn.Linear)
-            again = torch.cat([hidden, wide + encoded]) if layer == self.skip else hidden
-            widen(mine, its, encoded if layer == 0 else again)
-        widen(self.density_head, smaller.density_head, hidden)
-        widen(self.bottleneck, smaller.bottleneck, hidden)
-        head, its_head = (
-            torch.nn.ModuleList([field.colour_head[0], field.colour_head[2]]) for field in (self, smaller)
-        )
-        widen_all(head, its_head, torch.cat([hidden, wide + directions]))
+        narrow = smaller.bottleneck.out_features
+        widen(trunk[: len(known)], known)
+        for layer in trunk[len(known) :]:  # its input has been through a ReLU, which a second one leaves alone
+            layer.weight[:narrow] = torch.eye(layer.in_features)[:narrow]
+            layer.bias[:narrow] = 0
+        widen([self.density_head], [smaller.density_head])
+        widen([self.bottleneck], [smaller.bottleneck])
+        head, its_head = linears(self.colour_head), linears(smaller.colour_head)
+        directions = torch.arange(self.bottleneck.out_features, head[0].in_features)
+        widen(head, its_head, torch.cat([torch.arange(narrow), directions]))
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         x = sinusoidal(self.bounds.to_unit(positions) * 2 - 1, self.position_frequencies)

@@ -7,9 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.model.field import PictureField
-from nerf_lightning.model.hashgrid import layers
 from nerf_lightning.model.layers.encoding import sinusoidal
-from nerf_lightning.model.layers.widening import widen_all
+from nerf_lightning.model.layers.networks import layers, linears, widen
 from nerf_lightning.utils.options import Count, Layers, Octaves, Positive
 
 
@@ -40,16 +39,14 @@ class PictureMLP(PictureField):
             # The last octave has 2^(L-1) / 2 cycles over the picture. At the Nyquist frequency itself a sine would have the
             # same value at all pixels, up to its sign, and anything between them.
             frequencies = 1 + max(0, round(math.log2(self.nyquist)))
-            self.sizing = f"{frequencies} octaves, up to about half of what {max(size)} pixels can show"
         self.frequencies = frequencies
         self.net = relu_layers([2 * (1 + 2 * frequencies), *[width] * depth, 3])
 
     def warm_start_from(self, smaller: PictureField) -> None:
         """Copies a network with as many layers and at most as many octaves, which come first here."""
         assert isinstance(smaller, PictureMLP)
-        mine, its = ([layer for layer in net if isinstance(layer, torch.nn.Linear)] for net in (self.net, smaller.net))
-        if len(mine) == len(its) and smaller.frequencies <= self.frequencies:
-            widen_all(torch.nn.ModuleList(mine), torch.nn.ModuleList(its), torch.arange(its[0].in_features))
+        if len(self.net) == len(smaller.net) and smaller.frequencies <= self.frequencies:
+            widen(linears(self.net), linears(smaller.net))
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         places = 0.5 + 0.5 * self.centred(uv)  # pixels stay square: octaves that suit the longer side suit the shorter

@@ -13,11 +13,11 @@ from nerf_lightning.kernels import mlp, plane_line_sum, plane_line_sum_and_produ
 from nerf_lightning.kernels.planes import PLANE_AXES
 from nerf_lightning.model.field import Field, Size
 from nerf_lightning.model.growth import ResolutionSchedule, replace_data
-from nerf_lightning.model.hashgrid import layers, level_resolutions, weights
+from nerf_lightning.model.hashgrid import level_resolutions
 from nerf_lightning.model.layers.activation import Activation, density_activation
+from nerf_lightning.model.layers.encoding import encode_directions, num_sh_bases
+from nerf_lightning.model.layers.networks import layers, linears, weights, widen
 from nerf_lightning.model.layers.pruning import vertices_in
-from nerf_lightning.model.layers.view_dependence import encode_directions, num_sh_bases
-from nerf_lightning.model.layers.widening import widen_all
 from nerf_lightning.utils.options import Count, Fraction, Layers, SHDegree, Side
 
 FINEST = 160
@@ -193,12 +193,12 @@ class TensoRFField(Field):
         has, had = (volume.lines.shape[2] for volume in (self.colour_volume, smaller.colour_volume))
         products = [mode * has + one for mode in range(3) for one in range(had)]
         columns = torch.tensor([*products, *range(3 * has, 3 * has + smaller.terms)])
-        widen_all(self.colour_net, smaller.colour_net, columns)
+        widen(linears(self.colour_net), linears(smaller.colour_net), columns)
 
     def values_grown(self) -> int:
         components = self.density_volume.lines.shape[2] + self.colour_volume.lines.shape[2]
         now, last = self.density_volume.cells + 1, self.resolutions[-1] + 1
-        return self.values + 3 * components * (last * last + last - now * now - now)
+        return super().values_grown() + 3 * components * (last * last + last - now * now - now)
 
     @property
     def stage(self) -> int:

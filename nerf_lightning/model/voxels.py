@@ -21,8 +21,8 @@ from nerf_lightning.model.field import Field, FieldOutput, Size
 from nerf_lightning.model.growth import ResolutionSchedule, replace_data
 from nerf_lightning.model.hashgrid import level_resolutions
 from nerf_lightning.model.layers.activation import truncated_exp
+from nerf_lightning.model.layers.encoding import encode_directions, num_sh_bases
 from nerf_lightning.model.layers.pruning import vertices_in, widened
-from nerf_lightning.model.layers.view_dependence import encode_directions, num_sh_bases
 from nerf_lightning.utils.options import Above, AtMost, Layers, Positive, SHDegree, Side, Weight
 
 EMPTY = -8.0
@@ -61,8 +61,6 @@ class VoxelField(Field):
         InputError: where coarsest > finest.
     """
 
-    kept: Tensor
-    """Which vertices of the grid hold values."""
     index: Tensor
     """Row of every vertex; 0 for those that are not kept."""
     vertex: Tensor
@@ -92,17 +90,16 @@ class VoxelField(Field):
         # Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog in front of cameras.
         self.max_lr = 1 / density_rate
         self.smoothness = smoothness
-        rows = (self.growth.resolutions[0] + 1) ** 3 + 1
-        self.register_buffer("kept", torch.ones(rows - 1, dtype=torch.bool))
-        self.register_buffer("index", torch.arange(1, rows, dtype=torch.int32), persistent=False)
-        self.register_buffer("vertex", torch.arange(-1, rows - 1, dtype=torch.int32), persistent=False)
-        self.register_buffer("seen", torch.zeros(rows, dtype=torch.int32))
+        for name, persistent in (("index", True), ("vertex", False), ("seen", True)):
+            self.register_buffer(name, None, persistent)
         self.stage, self.steps, self.started = 0, 1, 1
         """Of `growth`, steps so far, and the first one of the stage; on the host, as a step must not ask a device for them."""
-        self.log_density = torch.nn.Parameter(torch.zeros(rows))  # divided by density_rate
+        vertices = (self.growth.resolutions[0] + 1) ** 3
+        self.log_density = torch.nn.Parameter(torch.zeros(1 + vertices))  # divided by density_rate
         self.log_density.data[0] = EMPTY / density_rate
-        self.colours = torch.nn.Parameter(torch.zeros(rows, 3))
-        self.views = torch.nn.Parameter(torch.zeros(rows, 3 * self.terms))
+        self.colours = torch.nn.Parameter(torch.zeros(1 + vertices, 3))
+        self.views = torch.nn.Parameter(torch.zeros(1 + vertices, 3 * self.terms))
+        self.set_vertices(torch.ones(vertices, dtype=torch.bool), [table.data for table in self.tables])
 
     @property
     def tables(self) -> tuple[torch.nn.Parameter, torch.nn.Parameter, torch.nn.Parameter]:
@@ -112,6 +109,11 @@ class VoxelField(Field):
     @property
     def training_bytes(self) -> int:
         return max(super().training_bytes, BYTES_PER_VERTEX * (self.growth.resolutions[-1] + 1) ** 3)
+
+    @property
+    def kept(self) -> Bool[Tensor, "V"]:
+        """Which vertices of the grid hold values."""
+        return self.index > 0
 
     @property
     def side(self) -> int:
@@ -162,7 +164,7 @@ class VoxelField(Field):
         """Replaces the tables: row 0 for all other vertices, then those of the kept vertices in order."""
         for table, columns in zip(self.tables, tables, strict=True):
             replace_data(table, columns.reshape(len(columns), *table.shape[1:]).contiguous())
-        self.kept, self.index = keep, torch.where(keep, keep.cumsum(0), 0).int()
+        self.index = torch.where(keep, keep.cumsum(0), 0).int()
         rows = self.index.nonzero()[:, 0]  # in the order of their vertices
         self.vertex = torch.cat([rows.new_tensor([-1]), rows]).int()
         self.seen = torch.zeros(len(self.vertex), dtype=torch.int32, device=keep.device)
@@ -193,7 +195,8 @@ class VoxelField(Field):
         return {"kept": self.kept, **{name: table.detach() for name, table in tables}}
 
     def import_state(self, state: dict[str, Tensor]) -> None:
-        self.load_state_dict({name: state[name] for name in ("kept", *TABLES)}, strict=False)
+        tables = {name: state[name] for name in TABLES}
+        self.load_state_dict({"index": state["kept"].int(), **tables}, strict=False)
 
     def surroundings(self, side: int) -> Bool[Tensor, "S S S"]:
         """Which vertices of a grid of side^3 lie among current vertices that were read lately, or next to those."""
@@ -219,16 +222,11 @@ class VoxelField(Field):
         Raises:
             RuntimeError: where vertices are none of a cubic grid.
         """
-        if (kept := state_dict.get(f"{prefix}kept")) is not None:
-            if (
-                kept.dtype != torch.bool
-                or kept.ndim != 1
-                or round(len(kept) ** (1 / 3)) ** 3 != len(kept)
-                or not len(kept)
-            ):
-                raise RuntimeError("vertices that are none of a cubic grid")
-            rows = int(kept.sum()) + 1
-            self.set_vertices(
-                kept.to(self.bounds.aabb.device), [table.new_empty(rows, table[0].numel()) for table in self.tables]
-            )
+        index = state_dict.get(f"{prefix}index", self.index)
+        if index.ndim != 1 or round(len(index) ** (1 / 3)) ** 3 != len(index) or not len(index):
+            raise RuntimeError("vertices that are none of a cubic grid")
+        keep = index.to(self.bounds.aabb.device) > 0
+        rows = int(keep.sum()) + 1
+        self.set_vertices(keep, [table.new_empty(rows, table[0].numel()) for table in self.tables])
+        state_dict = {**state_dict, f"{prefix}index": self.index}
         super()._load_from_state_dict(state_dict, prefix, *rest)

@@ -1,4 +1,4 @@
-"""Corrections of the training photos' cameras and colours, and when in training each begins."""
+"""Corrections of the training photos' cameras and colours, and how fast each is learned."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,20 +15,13 @@ START = 0.02
 """Share of the training before which nothing is corrected: photos cannot fit a field that shows nothing yet."""
 LR_FINAL_FACTOR = 0.1
 """Factor on the learning rates at the end."""
-FIRST_TRIAL_STEP, TRIAL_GROWTH, LAST_TRIAL = 24, 2, 0.4
-"""Of the trials of `auto`: the step of the first, the factor from one to the next, and the share of the training that they end
-with. Large faults show while the field is smooth, as later it has explained them by fog; small ones when it is sharp."""
-EARLY_STEPS, EARLY_FACTOR = 64, 2
-"""Steps before which gains are not tried, as a field that is still too dark everywhere wants gains; and how many times as much
-poses have to explain before: a field that is still blurred follows any motion a little."""
 FAST_SHARE, FAR_PX, FAST_FACTOR = 0.1, 4.0, 3.0
 """Poses move `FAST_FACTOR` times as fast for a first share of the training, and then where they have moved far: with the root
 mean square of how far the content has moved in the photos, above `FAR_PX`. What is far off would else not arrive."""
-MIN_GAIN = {"poses": 0.01, "light": 0.05}
-"""Share by which most photos' squared error has to fall. Exact poses raise it; gains explain a little of all that is wrong, and
-make the neutral look another than that of the photos."""
 GROWTH_DELAY = 0.4
 """Share of the training that it takes, once poses are corrected, until the field has grown."""
+NEEDS = {"focal": "poses", "affine": "light", "vignetting": "light"}
+"""What is a part of what."""
 
 
 class Corrections(torch.nn.Module):
@@ -68,23 +61,19 @@ class Corrections(torch.nn.Module):
         fixed_gauge: bool = True,
     ):
         super().__init__()
-        if not (poses or light):
-            raise InputError("refine.poses", "", "false, with refine.light=false", "one of them", "or give refine=null")
-        parts = {"focal": (focal, poses, "poses"), "affine": (affine, light, "light")}
-        parts["vignetting"] = vignetting, light, "light"
-        for name, (is_asked, is_possible, needed) in parts.items():
-            if is_asked and not is_possible:
-                found, todo = f"true, with refine.{needed}=false", f"or give refine.{needed}=true"
-                raise InputError(f"refine.{name}", "", found, "false", todo)
-        self.poses = PoseRefinement(cameras, bounds, focal, fixed_gauge)
-        self.color = ColorCorrection(cameras, exposures, affine, vignetting, fixed_gauge)
         self.rates = {"poses": pose_rate} if poses else {}
         self.rates |= {"light": light_rate} if light else {}
+        if not self.rates:
+            raise InputError("refine.poses", "", "false, with refine.light=false", "one of them", "or give refine=null")
+        for part, is_asked in {"focal": focal, "affine": affine, "vignetting": vignetting}.items():
+            if is_asked and (whole := NEEDS[part]) not in self.rates:
+                found, todo = f"true, with refine.{whole}=false", f"or give refine.{whole}=true"
+                raise InputError(f"refine.{part}", "", found, "false", todo)
+        self.poses = PoseRefinement(cameras, bounds, focal, fixed_gauge)
+        self.color = ColorCorrection(cameras, exposures, affine, vignetting, fixed_gauge)
         self.auto = auto
-        self.num_trials = 0
-        """So far, or that were missed."""
         self.last_gain: dict[str, float] = {}
-        """What the last of them said, see `decide`."""
+        """Share of the squared error that the last trial of `auto` explained, by what it was about."""
         self.enabled_at: dict[str, float] = {}
         """What is corrected, and from which progress on."""
         if not auto:
@@ -109,44 +98,29 @@ class Corrections(torch.nn.Module):
         if "poses" in self.rates and "poses" not in self.enabled_at:
             self.enable(0.0, "poses")
 
-    # Trials of `auto`
+    def decide(self, progress: float, chosen: Sequence[str], gains: dict[str, float], use_stated: bool) -> None:
+        """Takes in a trial of `auto`.
 
-    def is_trial_due(self, step: int, progress: float) -> bool:
-        """Whether to try what is not corrected yet."""
-        is_time = progress <= LAST_TRIAL and step >= FIRST_TRIAL_STEP * TRIAL_GROWTH**self.num_trials
-        return self.auto and is_time and bool(self.list_candidates(step))
-
-    def list_candidates(self, step: int) -> list[str]:
-        """What a trial at this step decides on."""
-        return [name for name in self.rates if name not in self.enabled_at and (name != "light" or step >= EARLY_STEPS)]
-
-    def choose(self, step: int, gains: dict[str, float], share: float = 1.0) -> list[str]:
-        """What helps by trials at this step that said this; or might, as it explains this share of what it has to."""
-        factor = share * (EARLY_FACTOR if step < EARLY_STEPS else 1)
-        return [name for name in self.list_candidates(step) if gains[name] > factor * MIN_GAIN[name]]
-
-    def decide(self, step: int, progress: float, gains: dict[str, float]) -> None:
-        """Takes in what a trial said: by what share the squared error would fall if poses, or light, were corrected, or the
-        stated exposures were taken for gains."""
-        while step >= FIRST_TRIAL_STEP * TRIAL_GROWTH**self.num_trials:
-            self.num_trials += 1
-        chosen = self.choose(step, gains)
-        self.last_gain |= {name: gains[name] for name in self.list_candidates(step)}
+        Args:
+            progress: of the training.
+            chosen: what helps, to be corrected from now on.
+            gains: see `last_gain`.
+            use_stated: whether gains, if they help, start from the stated exposures.
+        """
+        self.last_gain |= gains
         self.enable(progress, *chosen)
-        if "light" in chosen and gains["stated"] > 0:
+        if "light" in chosen and use_stated:
             self.color.use_stated()
 
     def trial_state(self) -> dict[str, Any]:
         """What the parameters do not say, for `load_trial_state`."""
-        return {"num_trials": self.num_trials, "last_gain": self.last_gain, "enabled_at": self.enabled_at}
+        return {"last_gain": self.last_gain, "enabled_at": self.enabled_at}
 
     def load_trial_state(self, state: dict[str, Any]) -> None:
         """Goes on as decided before."""
-        self.num_trials, self.last_gain = state["num_trials"], dict(state["last_gain"])
+        self.last_gain = dict(state["last_gain"])
         for name, progress in state["enabled_at"].items():
             self.enable(progress, name)
-
-    # Training
 
     @property
     def is_finite(self) -> bool:
@@ -159,14 +133,11 @@ class Corrections(torch.nn.Module):
 
     def lr_factors(self, progress: float) -> dict[str, float]:
         """Factors on the rates of these groups, by progress in training: nothing at first, then from 1 down."""
-        factors = {}
-        for name in self.rates:
-            start = self.enabled_at.get(name, 1.0)
-            if name not in self.enabled_at or progress < start:
-                factors[name] = 0.0
-                continue
-            pace = self._pose_pace(progress - start) if name == "poses" else 1.0
-            factors[name] = pace * LR_FINAL_FACTOR ** ((progress - start) / (1 - start))
+        factors = dict.fromkeys(self.rates, 0.0)
+        for name, start in self.enabled_at.items():
+            if progress >= start:
+                pace = self._pose_pace(progress - start) if name == "poses" else 1.0
+                factors[name] = pace * LR_FINAL_FACTOR ** ((progress - start) / (1 - start))
         return factors
 
     def _pose_pace(self, passed: float) -> float:

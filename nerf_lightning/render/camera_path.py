@@ -29,16 +29,6 @@ class CameraPath:
     """What the views should show, where that is known."""
 
 
-def check_path(path: str, path_frame: str) -> None:
-    """Raises InputError for a path that is neither a known word nor a file, before the run is opened."""
-    words = ("orbit", "spiral", *SPLITS)
-    if path not in words and not path.endswith(".json"):
-        raise InputError("render", "path", repr(path), f"one of {', '.join(words)}, or a .json file")
-    if path_frame != "auto" and not path.endswith(".json"):
-        found = f"{path_frame!r} with path={path}"
-        raise InputError("render", "path_frame", found, "auto; it is for a .json file of your own")
-
-
 def build_path(
     path: str,
     frames: int | None,
@@ -46,6 +36,7 @@ def build_path(
     scene: Scene | None,
     to_source: Float[Tensor, "4 4"],
     path_frame: str = "auto",
+    scale: float = 1.0,
 ) -> CameraPath:
     """The views that a name or a file stands for.
 
@@ -56,12 +47,14 @@ def build_path(
         scene: with photos, for "test" and "train".
         to_source: similarity from the run's frame to that of the photos' own file.
         path_frame: of a file, see `read_path`.
+        scale: times as many pixels along each side; not beside photos.
 
     Raises:
         InputError: for a file that is no camera path.
     """
-    if path in SPLITS:
-        assert scene is not None  # the caller opens it for these words
+    if scene is not None:
+        if scale != 1:
+            raise InputError("render", "scale", f"{scale:g}", f"1 beside photos (path {path})")
         photos: Views = getattr(scene, SPLITS[path])
         chosen = subsample(len(photos), frames)
         index = torch.tensor(chosen)
@@ -70,7 +63,10 @@ def build_path(
         cameras = resample_path(orbit, frames or len(orbit), closed=True)
     elif path == "spiral":
         cameras = spiral_like(orbit, frames or SPIRAL_FRAMES)
-    else:
+    elif path.endswith(".json"):
         cameras = read_path(user_path(path), orbit, to_source, path_frame)
         cameras = resample_path(cameras, frames or len(cameras), closed=False)
-    return CameraPath(cameras, list(range(len(cameras))))
+    else:
+        expected = f"one of orbit, spiral, {', '.join(SPLITS)}, or a .json file"
+        raise InputError("render", "path", repr(path), expected)
+    return CameraPath(cameras if scale == 1 else cameras.scaled(scale), list(range(len(cameras))))

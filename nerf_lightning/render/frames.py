@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerf_lightning.drawing.frame import CHANNELS, ERROR_TIMES, Style, draw, error_picture
+from nerf_lightning.drawing.frame import CHANNELS, ERROR_TIMES, Style, depth_range, draw, error_picture
 from nerf_lightning.drawing.panels import panel, to_bytes
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.camera_path import CameraPath
@@ -16,45 +16,34 @@ from nerf_lightning.renderer import over
 from nerf_lightning.renderer.background import COLORS
 from nerf_lightning.system import NeRF3D
 
-Colour = tuple[float, float, float]
 
-
-def parse_channels(text: str) -> tuple[str, ...]:
-    """The channels' names.
+def choose_style(system: NeRF3D, path: CameraPath, channels: str, background: str) -> Style:
+    """How the frames of a path are drawn, from the options `channels` and `background`.
 
     Raises:
-        InputError: for another name, or one that is there twice.
+        InputError: for another channel or colour, and for a background that photos cannot have.
     """
-    names = tuple(name.strip() for name in text.split(","))
+    names = tuple(name.strip() for name in channels.split(","))
     if any(name not in CHANNELS for name in names) or len(set(names)) < len(names):
-        raise InputError("render", "channels", repr(text), f"one or more of {', '.join(CHANNELS)}, separated by commas")
-    return names
-
-
-def parse_background(text: str) -> Colour | None:
-    """A colour in [0, 1]; None for "scene" and "transparent".
-
-    Raises:
-        InputError: for anything else.
-    """
-    if text in ("scene", "transparent"):
-        return None
-    try:
-        red, green, blue = COLORS.get(text) or map(float, text.split(","))
-    except ValueError:
-        red = green = blue = -1.0
-    if not all(0 <= part <= 1 for part in (red, green, blue)):
-        expected = "scene, black, white, transparent, or R,G,B in 0..1"
-        raise InputError("render", "background", repr(text), expected)
-    return red, green, blue
-
-
-def check_photos_background(colour: Colour | None, system: NeRF3D, path: CameraPath) -> None:
-    """Raises InputError where photos have a background that cannot be taken off."""
-    own = system.renderer.background.color.tolist()
-    if path.photos is not None and path.photos.channels == 3 and not np.allclose(colour or own, own, atol=1e-3):
-        expected = f"scene: these photos have no alpha, and their background is {[round(part, 3) for part in own]}"
-        raise InputError("render", "background", str(colour), expected)
+        expected = f"one or more of {', '.join(CHANNELS)}, separated by commas"
+        raise InputError("render", "channels", repr(channels), expected)
+    red, green, blue = own = system.renderer.background.color.tolist()
+    if background not in ("scene", "transparent"):
+        try:
+            red, green, blue = COLORS.get(background) or map(float, background.split(","))
+        except ValueError:
+            red = green = blue = -1.0
+        if not all(0 <= part <= 1 for part in (red, green, blue)):
+            expected = "scene, black, white, transparent, or R,G,B in 0..1"
+            raise InputError("render", "background", repr(background), expected)
+    if path.photos is not None:
+        if background == "transparent":
+            raise InputError("render", "background", background, "a colour beside photos")
+        if path.photos.channels == 3 and not np.allclose((red, green, blue), own, atol=1e-3):
+            expected = f"scene: these photos have no alpha, and their background is {[round(part, 3) for part in own]}"
+            raise InputError("render", "background", background, expected)
+    depths = depth_range(system, path.cameras) if "depth" in names else (0.0, 1.0)
+    return Style(names, None if background == "transparent" else (red, green, blue), depths)
 
 
 def describe_frames(path: str, system: NeRF3D, cameras: CameraPath, style: Style) -> dict[str, Any]:
@@ -72,11 +61,11 @@ def describe_frames(path: str, system: NeRF3D, cameras: CameraPath, style: Style
     }
 
 
-def draw_frame(system: NeRF3D, path: CameraPath, index: int, style: Style) -> Image:
+def draw_frame(system: NeRF3D, path: CameraPath, style: Style, index: int) -> Image:
     """The channels of a view side by side; where there is a photo: photo, render, their difference, and other channels."""
     if path.photos is None:
         return np.concatenate(list(draw(system, path.cameras, index, style).values()), axis=1)
-    assert style.background is not None  # the command sees to it
+    assert style.background is not None  # `choose_style` sees to it
     pixels = path.photos.image(index)
     background = torch.tensor(style.background).expand(pixels[..., 0].numel(), 3)
     photo = to_bytes(over(pixels.flatten(0, 1), background).view(*pixels.shape[:2], 3))

@@ -33,12 +33,8 @@ CRF = 18
 def check_output(output: Path, transparent: bool) -> None:
     """Raises InputError where no video can be written to a place, before any work is done."""
     if output.suffix not in ("", *SUFFIXES):
-        raise InputError(
-            "render", "output", output.name, f"a name ending in {', '.join(SUFFIXES)}, or a folder of PNGs"
-        )
-    if output.exists() and output.is_dir() == bool(output.suffix):
-        found, expected = ("a folder", "a file to write") if output.suffix else ("a file", "a folder for PNGs")
-        raise InputError(output, "", found, expected, "give --output another name")
+        expected = f"a name ending in {', '.join(SUFFIXES)}, or a folder of PNGs"
+        raise InputError("render", "output", output.name, expected)
     if transparent and output.suffix in OPAQUE:
         raise InputError("render", "background", f"transparent for {output.suffix}", "a colour", "or -o FILE.webp")
     if output.suffix == ".mp4":

@@ -56,11 +56,6 @@ def near_loss(weight: Float[Tensor, "N"], samples: Samples, scale: float) -> Flo
     return (weight * nearness**NEAR_POWER).sum() / (len(samples.offsets) - 1)
 
 
-def near_schedule(progress: float) -> float:
-    """Factor on the near loss after this share of the training: from 1 down to 0."""
-    return max(0.0, 1 - progress / NEAR_END)
-
-
 def view_loss(
     weight: Float[Tensor, "N"],
     view_residual: Float[Tensor, "N 3"],

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Rays
 from nerf_lightning.kernels import composite, volume_weights
+from nerf_lightning.kernels.sums import before
 from nerf_lightning.model import FieldOutput
 from nerf_lightning.renderer.background import Background
-from nerf_lightning.renderer.depth import median_depth
-from nerf_lightning.renderer.losses import AUTO_VIEW_LOSS_WEIGHT, distortion_loss, near_loss, near_schedule, view_loss
+from nerf_lightning.renderer.losses import AUTO_VIEW_LOSS_WEIGHT, NEAR_END, distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
 from nerf_lightning.utils.options import Weight
 
@@ -49,6 +49,25 @@ def over(pixels: UInt8[Tensor, "R C"], backgrounds: Float[Tensor, "R 3"]) -> Flo
     if colours.shape[1] == 3:
         return colours
     return torch.lerp(backgrounds, colours[:, :3], colours[:, 3:])
+
+
+def median_depth(density: Float[Tensor, "N"], opacity: Float[Tensor, "R"], samples: Samples) -> Float[Tensor, "R"]:
+    """The distance along each ray where half of its opacity is reached, in the scene's unit; 0 where it has none.
+
+    Density (1 / world unit) is constant within an interval, so that this is exact: the thickness passed is then
+    -log(1 - opacity / 2).
+    """
+    if not len(samples):
+        return torch.zeros_like(opacity)
+    thickness = density * samples.dt
+    passed = before(thickness, samples.ray, samples.offsets)
+    goal = -torch.log1p(-opacity / 2)
+    short = torch.nn.functional.pad((passed + thickness < goal[samples.ray]).cumsum(0), (1, 0))
+    first, last = samples.offsets[:-1], samples.offsets[1:] - 1
+    # A sum that falls short by rounding ends at the last sample; a ray without samples reads any, and is told apart below.
+    place = torch.minimum(first + short[samples.offsets[1:]] - short[first], last).clamp_min(0)
+    share = ((goal - passed[place]) / thickness[place].clamp_min(1e-12)).clamp(0, 1)
+    return torch.where(opacity > 0, samples.t[place] + (share - 0.5) * samples.dt[place], 0.0)
 
 
 class VolumeRenderer(torch.nn.Module):
@@ -136,7 +155,7 @@ class VolumeRenderer(torch.nn.Module):
             losses["distortion"] = self.distortion_loss_weight * distortion_loss(
                 output.weights, samples, self.half_size
             )
-        if near_weight := self.near_loss_weight * near_schedule(progress):
+        if near_weight := self.near_loss_weight * max(0.0, 1 - progress / NEAR_END):
             losses["near"] = near_weight * near_loss(output.weights, samples, self.half_size)
         if self.view_loss_weight and output.view_residual is not None:
             price = view_loss(output.weights, output.view_residual, samples, texturelessness)

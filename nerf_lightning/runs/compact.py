@@ -128,7 +128,8 @@ def _unpacked(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]
         InputError: as `decode`.
     """
     expected = "a compact file of this package"
-    arrays = read_npz(content, None, lambda headers: require_keys(path, headers, ["header"]), path, expected)
+    arrays = read_npz(content, None, path, expected)
+    require_keys(path, arrays, ["header"])
     text = arrays.pop("header").tobytes()
     if len(text) > MAX_HEADER_BYTES:
         raise InputError(path, "header", f"{len(text)} bytes", f"{expected}: at most {MAX_HEADER_BYTES}")

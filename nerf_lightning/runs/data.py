@@ -15,7 +15,7 @@ from nerf_lightning.config.build import SceneFrame, build_data
 from nerf_lightning.config.literal import escape
 from nerf_lightning.dataset import BUILT_IN, DataModule
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.size import AUTO
+from nerf_lightning.dataset.resize import AUTO
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.scene_file import frame_from
 

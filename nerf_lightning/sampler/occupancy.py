@@ -24,8 +24,29 @@ DENSITY_CHUNKS, MARCH_CHUNKS = 4, 32
 INVISIBLE_DEPTH = 0.5 / 255
 """Optical depth that rays of a picture may lose to steps that hold less, and transmittance at which they end: half of what
 8 bits tell."""
-CAPACITY_FACTOR = 1.25
-"""Capacity for steps that are not counted, as a multiple of the last count."""
+
+
+class SampleCapacity:
+    """How many steps along rays there is room for where they are not counted, as counting waits for the device.
+
+    On a CPU, where nothing waits, all are counted; elsewhere once after the cells have changed.
+    """
+
+    FACTOR = 1.25  # of the last count
+    per_ray: tuple[float, float] | None = None
+    """Steps in occupied cells, and how many of those were kept, at the last count; None if the next training step counts."""
+
+    def sizes(self, num_rays: int) -> tuple[int, int] | tuple[None, None]:
+        """Room for steps, and for those that are kept; None to count them."""
+        if self.per_ray is None:
+            return None, None
+        steps, kept = (math.ceil(self.FACTOR * count * num_rays) for count in self.per_ray)
+        return steps, kept
+
+    def note(self, rays: Rays, steps: int, kept: int) -> None:
+        """Takes in a count."""
+        if rays.origins.device.type != "cpu":
+            self.per_ray = max(steps, 1) / len(rays), max(kept, 1) / len(rays)
 
 
 class OccupancySampler(Sampler):
@@ -50,6 +71,8 @@ class OccupancySampler(Sampler):
         alpha_thre: alpha threshold: training drops steps of lower opacity; at most half the mean, so that fog trains too.
         chunk: see `Sampler`.
     """
+
+    render_state = ("grid.occupied",)
 
     def __init__(
         self,
@@ -84,9 +107,7 @@ class OccupancySampler(Sampler):
         """Whether the next training step looks at all occupied cells."""
         self.min_depth: Tensor | None = None
         """Optical depth below which training drops steps; None where the cells have changed since it was computed."""
-        self.counts_per_ray: tuple[float, float] | None = None
-        """Steps per ray in occupied cells, and how many of those were kept, at the last count; None if the next training step
-        must count. Counting waits for the device, so except on a CPU the steps between two updates assume the last count."""
+        self.capacity = SampleCapacity()
 
     @property
     def samples(self) -> int:
@@ -114,7 +135,7 @@ class OccupancySampler(Sampler):
         samples = self.samples
         self.grid.resize(resolution)
         self.grid.optical_depth *= samples / self.samples
-        self.counts_per_ray = self.min_depth = None
+        self.capacity.per_ray = self.min_depth = None
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
@@ -128,21 +149,17 @@ class OccupancySampler(Sampler):
             return Samples(*packed, thickness=found)
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.grid.occupied if self.full_pass else self.grid.active
-        counts = self.counts_per_ray
-        capacity, kept_capacity = (
-            (None, None) if counts is None else (math.ceil(CAPACITY_FACTOR * count * len(rays)) for count in counts)
-        )
-        found, packed = self._march(rays, density, near, far, shift, cells, self.samples, self.early_stop_eps, capacity)
+        room, kept_room = self.capacity.sizes(len(rays))
+        found, packed = self._march(rays, density, near, far, shift, cells, self.samples, self.early_stop_eps, room)
         if self.min_depth is None:
             self.min_depth = self.grid.mean_active_depth().mul(0.5).clamp_max(-math.log1p(-self.alpha_thre))
-        _, kept = keep_visible(found, packed, self.early_stop_eps, self.min_depth, kept_capacity)
+        _, kept = keep_visible(found, packed, self.early_stop_eps, self.min_depth, kept_room)
         positions = Samples(*kept).positions(rays)
         self.grid.mark_visible(positions, self.updates)
-        if capacity is not None and kept_capacity is not None:
-            whole = (packed[3][1:] <= capacity) & (kept[3][1:] <= kept_capacity)
+        if room is not None and kept_room is not None:
+            whole = (packed[3][1:] <= room) & (kept[3][1:] <= kept_room)
             return Samples(*kept, whole, positions)
-        if rays.origins.device.type != "cpu":
-            self.counts_per_ray = max(len(found), 1) / len(rays), max(len(kept[0]), 1) / len(rays)
+        self.capacity.note(rays, len(found), len(kept[0]))
         return Samples(*kept, places=positions)
 
     @torch.no_grad()
@@ -156,28 +173,23 @@ class OccupancySampler(Sampler):
         cells: Bool[Tensor, "cells"],
         samples: int,
         stop: float,
-        capacity: int | None = None,
+        room: int | None = None,
     ) -> tuple[Float[Tensor, "N"], Packed]:
         """Steps in some cells and the optical depth of each, as far as light reaches."""
 
         def optical_depth(packed: Packed) -> Float[Tensor, "N"]:
-            """From the density at the steps' middle, which mixed precision gives in half precision."""
-            found = [
-                density(part).float() for part in Samples(*packed).positions(rays).split(DENSITY_CHUNKS * self.chunk)
-            ]
-            return (found[0].detach() if len(found) == 1 else torch.cat(found)) * packed[1]
+            return self._query(density, Samples(*packed).positions(rays)) * packed[1]
 
         given = rays, self.bounds, near, far, shift, cells, samples, self.step_size(samples)
-        return front_first(*given, optical_depth, stop, capacity, MARCH_CHUNKS * self.chunk)
+        return front_first(*given, optical_depth, stop, room, MARCH_CHUNKS * self.chunk)
+
+    def _query(self, density: DensityFn, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        """Densities, some positions at a time; mixed precision gives them in half precision."""
+        found = [density(part).float() for part in positions.split(DENSITY_CHUNKS * self.chunk)]
+        return found[0].detach() if len(found) == 1 else torch.cat(found)
 
     def mark_invisible_cells(self, cameras: Cameras) -> None:
         self.grid.mark_invisible_cells(cameras, self.seen_by)
-
-    def export_state(self) -> dict[str, Tensor]:
-        return {"occupied": self.grid.occupied}
-
-    def import_state(self, state: dict[str, Tensor]) -> None:
-        self.grid.load_state_dict({"occupied": state["occupied"]}, strict=False)
 
     def _load_from_state_dict(self, *given: Any) -> None:
         self.min_depth = None
@@ -185,20 +197,19 @@ class OccupancySampler(Sampler):
 
     def restart(self, step: int) -> None:
         self.first_step = step
-        self.counts_per_ray = None
+        self.capacity.per_ray = None
 
     @torch.no_grad()
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         self.updates, phase = divmod(step, self.update_every)
         self.full_pass = not phase
         if phase <= 1:  # the cells differ from those of the step before
-            self.counts_per_ray = None
+            self.capacity.per_ray = None
         if phase:
             return
 
         def optical_depth(positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-            found = torch.cat([density(part) for part in positions.split(DENSITY_CHUNKS * self.chunk)])
-            return found * self.step_size(self.samples)
+            return self._query(density, positions) * self.step_size(self.samples)
 
         self.grid.update(self.updates, optical_depth, step - self.first_step < self.warmup, generator)
         self.min_depth = None

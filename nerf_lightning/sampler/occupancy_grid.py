@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, InBounds
@@ -16,12 +16,6 @@ LATTICE_SIZE = 1 << 24
 """Positions along an axis of a cell: as many as single precision tells apart."""
 R3_BASE = 1.2207440846057596
 """The root above 1 of x^4 = x + 1."""
-GRIDS = ("optical_depth", "occupied", "in_view", "last_visible", "active")
-
-
-def sees(camera: Cameras, points: Float[Tensor, "N 3"], near: float) -> Bool[Tensor, "N"]:
-    """Which world points one camera sees, farther from it than `near`."""
-    return camera.project(points, 0)[2] & ((points - camera.centres).norm(dim=1) > near)
 
 
 def r3_sequence(numbers: Int[Tensor, "N"], generator: Generator) -> Float[Tensor, "3 N"]:
@@ -95,7 +89,8 @@ class OccupancyGrid(InBounds):
         wanted = min(min_cameras, len(chosen))
         for camera in chosen:
             open_ones = (count < wanted).nonzero()[:, 0]  # the others have enough views already
-            count[open_ones] += sees(cameras[camera : camera + 1].to("cpu"), middles[open_ones], near).int()
+            points, one = middles[open_ones], cameras[camera : camera + 1].to("cpu")
+            count[open_ones] += (one.project(points, 0)[2] & ((points - one.centres).norm(dim=1) > near)).int()
         in_view = count >= wanted
         self.in_view.copy_(in_view if in_view.any() else torch.ones_like(in_view))
         self.occupied &= self.in_view
@@ -140,8 +135,8 @@ class OccupancyGrid(InBounds):
         old, self.resolution = self.resolution, resolution
         edges = torch.arange(resolution + 1, device=self.device) * old
         first, last = edges[:-1] // resolution, (edges[1:] - 1) // resolution
-        for name in GRIDS:
-            grid = getattr(self, name).view(old, old, old)
+        for name, cells in list(self.named_buffers()):
+            grid = cells.view(old, old, old)
             for axis in range(3):
                 grid = torch.maximum(grid.index_select(axis, first), grid.index_select(axis, last))
             setattr(self, name, grid.flatten())

@@ -8,7 +8,8 @@ from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import along, resample
-from nerf_lightning.model.hashgrid import HashGrid
+from nerf_lightning.model.hashgrid import HashGrid, cubic_cells
+from nerf_lightning.sampler.occupancy import OccupancySampler
 from nerf_lightning.sampler.samples import CHUNK, DensityFn, Histogram, Proposals, Sampler, Samples, interval_weights
 from nerf_lightning.utils.options import Above, AtMost, Below, Count, Entries, Layers, Side
 
@@ -32,11 +33,13 @@ class ProposalSampler(Sampler):
         first, second: intervals of the cuts before.
         anneal: steps until proposals count in full; before, samples are spread more evenly.
         padding: share of the samples that are spread evenly all the same.
-        levels, coarsest, finest, log2_entries: of the small field, see `HashGrid`.
+        levels, coarsest, finest, log2_entries: of the small field, see `HashGridField`.
         final: what its learning rate has fallen to in the end, besides the schedule. A small field that goes on learning
             quickly follows every flicker of the large one, which then has no samples where plain surfaces really are.
         chunk: see `Sampler`.
     """
+
+    render_state = ("grid.tables",)
 
     def __init__(
         self,
@@ -59,7 +62,7 @@ class ProposalSampler(Sampler):
         self.anneal = anneal
         self.padding = padding
         self.final = final
-        self.grid = HashGrid(levels, log2_entries, 1, coarsest, finest)
+        self.grid = HashGrid(cubic_cells(levels, coarsest, finest), log2_entries, 1)
         self.unit_length = bounds.longest
         self.first_step = 0
         """The step at which training began."""
@@ -119,14 +122,6 @@ class ProposalSampler(Sampler):
         terms = [interlevel_loss(edges, found, histogram) for histogram in histograms]
         return {"interlevel": torch.stack(terms).sum()}
 
-    def export_state(self) -> dict[str, Tensor]:
-        return {"tables": self.grid.tables.detach()}
-
-    def import_state(self, state: dict[str, Tensor]) -> None:
-        if state["tables"].shape != self.grid.tables.shape:
-            raise RuntimeError(f"a proposal of {len(state['tables'])} entries, not {len(self.grid.tables)}")
-        self.grid.tables.data.copy_(state["tables"])
-
     @torch.no_grad()
     def restart(self, step: int) -> None:
         self.first_step = step
@@ -152,3 +147,9 @@ def interlevel_loss(
     high = torch.searchsorted(before, edges[:, 1:].contiguous()).clamp(0, last)
     bound = sums.gather(1, high) - sums.gather(1, low)
     return ((weights - bound).clamp_min(0) ** 2 / (weights + 1e-5)).sum(1).mean()
+
+
+def suited_sampler(bounds: Bounds, chunk: int = CHUNK) -> Sampler:
+    """Proposals where every ray meets something, as before a background; where most of the space is empty, an occupancy grid,
+    which skips it."""
+    return ProposalSampler(bounds, chunk=chunk) if bounds.unbounded else OccupancySampler(bounds, chunk=chunk)

@@ -81,8 +81,12 @@ class Samples:
         keep = (self.t >= near) & (self.t <= far)
         before = torch.cat([keep.new_zeros(1, dtype=torch.int64), keep.cumsum(0)])
         offsets = before[self.offsets].to(self.offsets.dtype)
-        thickness = None if self.thickness is None else self.thickness[keep]
-        return Samples(self.t[keep], self.dt[keep], self.ray[keep], offsets, thickness=thickness)
+        return self._take(keep, self.ray[keep], offsets)
+
+    def _take(self, index: Tensor | slice, ray: Int[Tensor, "M"], offsets: Int[Tensor, "Q"]) -> "Samples":
+        """Some of the samples of a picture, which belong to these rays."""
+        thickness = None if self.thickness is None else self.thickness[index]
+        return Samples(self.t[index], self.dt[index], ray, offsets, thickness=thickness)
 
     def merged(self) -> "Samples":
         """For pictures: fewer samples, as one that is `FAINT` needs no colour of its own; the same where thickness is not
@@ -115,11 +119,7 @@ def split(samples: Samples, most: int) -> Iterator[tuple[slice, Samples]]:
         last = max(first + 1, bisect.bisect_right(offsets, offsets[first] + most, lo=first) - 1)
         part = slice(offsets[first], offsets[last])
         local = samples.offsets[first : last + 1] - offsets[first]
-        thickness = None if samples.thickness is None else samples.thickness[part]
-        yield (
-            slice(first, last),
-            Samples(samples.t[part], samples.dt[part], samples.ray[part] - first, local, thickness=thickness),
-        )
+        yield slice(first, last), samples._take(part, samples.ray[part] - first, local)
         first = last
 
 
@@ -130,6 +130,9 @@ class Sampler(InBounds):
         bounds: where the content is.
         chunk: samples that a device renders at a time; samplers work on multiples of it.
     """
+
+    render_state: tuple[str, ...] = ()
+    """Names of what rendering needs of its state, for compact files."""
 
     def __init__(self, bounds: Bounds, chunk: int = CHUNK):
         super().__init__(bounds)
@@ -153,7 +156,8 @@ class Sampler(InBounds):
 
     def export_state(self) -> dict[str, Tensor]:
         """What rendering needs, for `import_state`."""
-        return {}
+        state = self.state_dict()
+        return {name: state[name] for name in self.render_state}
 
     def import_state(self, state: dict[str, Tensor]) -> None:
         """Restores what `export_state` returned.
@@ -161,6 +165,7 @@ class Sampler(InBounds):
         Raises:
             RuntimeError, KeyError: if it came from another kind or size of sampler.
         """
+        self.load_state_dict({name: state[name] for name in self.render_state}, strict=False)
 
     def warm_start_from(self, other: "Sampler") -> None:
         """Copies what another sampler of the same kind and size has learned."""

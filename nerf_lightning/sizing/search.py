@@ -17,8 +17,7 @@ from nerf_lightning.config import build
 from nerf_lightning.config.limits import limits_of
 from nerf_lightning.dataset import DataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.reach import confined_to, seen_cells
-from nerf_lightning.export.smallest import held_out_psnr, smallest, some_cameras
+from nerf_lightning.export.smallest import confined_to, held_out_psnr, seen_cells, smallest, some_cameras
 from nerf_lightning.model import as_wide
 from nerf_lightning.runs.compact import encode
 from nerf_lightning.runs.folder import load_run, plain_config

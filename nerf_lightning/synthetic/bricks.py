@@ -28,8 +28,6 @@ RADIUS = 4.0311
 """Distance of every camera from the origin, as in the NeRF paper's Lego scene."""
 FIELD_OF_VIEW_RAD = 0.6911112
 """Horizontal; from the same scene."""
-BYTES_PER_POSE = 116
-"""With its intrinsics and size."""
 UP = (0.0, 0.0, 1.0)
 
 
@@ -42,10 +40,8 @@ def bricks(size: int = 200, train_views: int = 100, val_views: int = 10, orbit_v
         val_views: how many views to hold out, spread likewise, at other directions.
         orbit_views: how many frames the circle around it has.
     """
-    views = train_views + val_views
-    what = f"{views:,} pictures of {size:,}x{size:,} pixels, with a pose each,"
-    needed = views * (4 * size**2 + BYTES_PER_POSE) + BYTES_PER_POSE * orbit_views
-    check_memory("bricks", "size, train_views, val_views", what, needed)
+    what = f"{train_views + val_views:,} pictures of {size:,}x{size:,} pixels"
+    check_memory("bricks", "size, train_views, val_views", what, 4.0 * size**2 * (train_views + val_views))
     aabb = torch.from_numpy(bulldozer().aabb).float()
     centre = aabb.mean(0)
     orbit = orbit_around(torch.zeros(3), torch.tensor(UP), RADIUS, math.radians(30), orbit_views)
@@ -65,7 +61,7 @@ def _render_views(c2w: Float[Tensor, "V 4 4"], size: int, split: str) -> Views:
     cameras = make_cameras(c2w, size, size, FIELD_OF_VIEW_RAD)
     path = cache_folder() / f"bricks-v{VERSION}-{size}px-{len(cameras)}-{split}.npz"
     with suppress(InputError, KeyError):  # missing, or damaged: traced again
-        images = read_npz(path, ["images"], lambda headers: None)["images"]
+        images = read_npz(path, ["images"])["images"]
         if images.shape == (len(cameras), size, size, 4) and images.dtype == np.uint8:
             return Views.of(torch.from_numpy(images), cameras)
     images = np.stack([render_view(cameras, view) for view in range(len(cameras))])

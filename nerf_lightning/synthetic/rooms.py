@@ -27,14 +27,9 @@ class Room:
     subject: int
     """How many bodies, the first ones, are the subject."""
 
-    @property
-    def floor(self) -> int:
-        """Index of the floor: `make_walls` come last, four sides, then the floor and the ceiling."""
-        return len(self.bodies) - 2
-
 
 def make_walls(reach: float, floor: float, height: float, grain: float, floor_grain: float) -> list[Body]:
-    """Four walls, a floor and a ceiling: the inner faces of six slabs."""
+    """Four walls, a floor and a ceiling, in this order: the inner faces of six slabs."""
     low, high = (-reach, -reach, floor), (reach, reach, floor + height)
     slabs: list[Body] = []
     for axis in range(3):

@@ -15,21 +15,18 @@ if TYPE_CHECKING:
     from nerf_lightning.system.nerf3d import NeRF3D
 
 
-def growth_progress(system: "NeRF3D", step: int) -> float:
-    """The share of the training that the field's stage is taken from: `progress`, but for few or many steps (see
-    `ResolutionSchedule.clamp_progress`), and slower while corrected cameras find their places."""
-    growth, progress = system.field.growth, system.state.progress
-    if growth is None:
-        return progress
-    if system.corrections is not None:
-        progress = system.corrections.delay_growth(progress, growth.end)
-    return growth.clamp_progress(progress, step, may_hurry=system.corrections is None)
-
-
 def next_stage(system: "NeRF3D", step: int) -> int | None:
-    """The stage that the field is to take at this step; None if it keeps the one it has."""
-    growth = system.field.growth
-    stage = 0 if growth is None else growth.stage_at(growth_progress(system, step))
+    """The stage that the field is to take at this step; None if it keeps the one it has.
+
+    It follows the progress, but for few or many steps (see `ResolutionSchedule.clamp_progress`), and is slower while corrected
+    cameras find their places.
+    """
+    growth, progress, corrections = system.field.growth, system.state.progress, system.corrections
+    if growth is None:
+        return None
+    if corrections is not None:
+        progress = corrections.delay_growth(progress, growth.end)
+    stage = growth.stage_at(growth.clamp_progress(progress, step, may_hurry=corrections is None))
     return stage if stage > system.field.stage else None
 
 

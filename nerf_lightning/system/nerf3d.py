@@ -52,8 +52,7 @@ class NeRF3D(System):
         backend: str | None = None,
         state: TrainingState | None = None,
     ):
-        super().__init__(optimizer, schedule, seed, chunk, backend, state)
-        self.field = field
+        super().__init__(field, optimizer, schedule, seed, chunk, backend, state)
         self.sampler = sampler
         self.renderer = renderer
         self.corrections = corrections

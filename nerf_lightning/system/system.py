@@ -16,6 +16,7 @@ from nerf_lightning.dataset.loader import StepDataModule
 from nerf_lightning.dataset.subset import WHOLE, PixelSubset
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.refine import Corrections
+from nerf_lightning.sampler import CHUNK
 from nerf_lightning.system.metrics import psnr, ssim
 from nerf_lightning.system.state import TrainingState
 from nerf_lightning.utils.device import synchronize
@@ -98,6 +99,7 @@ class System(L.LightningModule):
     """Base of the two systems.
 
     Args:
+        field: place -> rgb, or position, direction -> density, rgb.
         optimizer: makes the optimiser from the parameters.
         schedule: factor on its learning rate by progress and step.
         seed: of all randomness in training steps.
@@ -106,18 +108,18 @@ class System(L.LightningModule):
         state: of the training, shared with the callbacks that steer it; None makes one.
     """
 
-    field: Field | PictureField
-
     def __init__(
         self,
+        field: Field | PictureField,
         optimizer: MakeOptimizer,
         schedule: Schedule,
-        seed: int,
-        chunk: int,
+        seed: int = 0,
+        chunk: int = CHUNK,
         backend: str | None = None,
         state: TrainingState | None = None,
     ):
         super().__init__()
+        self.field = field
         self.make_optimizer = optimizer
         self.schedule = schedule
         self.seed = seed

@@ -26,7 +26,7 @@ def report_photos(system: System, data: DataModule, results: dict[str, Any], fol
             save_scene(data, folder, cameras, summarize_corrections(system.corrections)["focal_factor"])
         found = results["psnr_aligned"]
         aligned = "" if found is None else f"; {found:.2f} dB held out with held-out photos corrected too"
-        print(format_report(system.corrections, data.scene.train.name) + aligned)
+        print(format_report(system.corrections) + aligned)
     if results["misfits"]:
         named = join_truncated(
             [f"{one['photo']} ({one['psnr']:.1f} dB)" for one in results["misfits"]], MAX_NAMED_PHOTOS

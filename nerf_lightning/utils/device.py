@@ -30,18 +30,7 @@ def the_device(name: str) -> torch.device:
         return torch.device(found[0])
     if name in found:
         return torch.device(name)
-    missing = name == "cuda" and not torch.backends.cuda.is_built()
-    todo = f"{'install PyTorch for CUDA, or ' if missing else ''}give device=auto"
-    raise InputError("config", "device", repr(name), f"auto, or what is there: {', '.join(found)}", todo)
-
-
-def fits(size: int, device: torch.device) -> bool:
-    """Whether `size` bytes take at most half of a device's free memory."""
-    if device.type == "cuda":
-        return size <= torch.cuda.mem_get_info(device)[0] // 2
-    if device.type == "mps":
-        return size <= (torch.mps.recommended_max_memory() - torch.mps.driver_allocated_memory()) // 2
-    return True
+    raise InputError("config", "device", repr(name), f"auto, or what is there: {', '.join(found)}")
 
 
 def synchronize(device: torch.device) -> None:

@@ -113,22 +113,15 @@ def known(value: Any) -> Any:
 
 
 def user_path(text: str | os.PathLike[str]) -> Path:
-    """A path as a user writes it, with ~ expanded.
-
-    Raises:
-        InputError: for the home of an unknown user.
-    """
-    try:
-        return Path(text).expanduser()
-    except RuntimeError as error:
-        raise InputError(str(text), "", "the home of an unknown user", "a path") from error
+    """A path as a user writes it, with ~ expanded."""
+    return Path(os.path.expanduser(text))
 
 
 def output_path(text: str | os.PathLike[str]) -> Path:
     """As `user_path`, for something to write, checked before any work is done.
 
     Raises:
-        InputError: as there, and where no file can be written.
+        InputError: where no file can be written.
     """
     path = user_path(text)
     folder = path.absolute() if path.is_dir() else next(p for p in path.absolute().parents if os.path.lexists(p))

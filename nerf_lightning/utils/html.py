@@ -31,7 +31,8 @@ def render_page(template: Path, styles: Sequence[Path] = (), scripts: Sequence[P
     texts = {"style": (HOME / "page.css", *styles), "script": scripts}
     for name, files in texts.items():
         text = "\n".join(map(read_source, files))
-        values |= {name: Markup(text), f"{name}_hash": hash_source(text)}
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        values |= {name: Markup(text), f"{name}_hash": f"sha256-{digest}"}  # for the content security policy
     return environment.get_template(template.name).render(values)
 
 
@@ -39,11 +40,6 @@ def read_source(file: Path) -> str:
     """A script, shader or style without the comments and indents that only its readers need."""
     lines = (re.sub(r"(^|\s\s+)//.*$", "", line).strip() for line in file.read_text(encoding="utf-8").splitlines())
     return "\n".join(filter(None, lines))
-
-
-def hash_source(text: str) -> str:
-    """The name of a style or script in a content security policy."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
 def script_data(content: object) -> Markup:

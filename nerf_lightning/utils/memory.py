@@ -33,6 +33,11 @@ def free_memory(device: torch.device = CPU) -> float:
     return max(min(free, float(limit) - float(used) + float(cached[1] if cached else 0)), 0.0)
 
 
+def fits(size: int, device: torch.device) -> bool:
+    """Whether `size` bytes take at most half of an accelerator's free memory; always on a CPU, which holds them already."""
+    return device.type == "cpu" or size <= free_memory(device) / 2
+
+
 def check_memory(
     where: object, key: str, what: str, needed: float, todo: str = "give less", device: torch.device = CPU
 ) -> None:

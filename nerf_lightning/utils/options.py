@@ -96,7 +96,8 @@ def _fits(value: Any, hint: Any) -> bool:
     """Whether a value from YAML fits an annotation; annotations other than plain values always fit."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        return _fits(value, arguments[0]) and all(_is_within(value, bound) for bound in arguments[1:])
+        bounds = [bound for bound in arguments[1:] if isinstance(bound, Bound)]
+        return _fits(value, arguments[0]) and all(bound.holds(value, bound.value) for bound in bounds)
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, argument) for argument in arguments)
     if origin is Literal:
@@ -113,11 +114,6 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, hint)
     # YAML cannot hold other classes, but a mapping may describe one (with a target of its own).
     return hint is Any or not inspect.isclass(hint) or isinstance(value, (hint, Mapping, list))
-
-
-def _is_within(value: Any, bound: Any) -> bool:
-    """Whether a number keeps a bound; other annotations are none."""
-    return not isinstance(bound, Bound) or bound.holds(value, bound.value)
 
 
 def _describe(hint: Any) -> str:

@@ -3,15 +3,13 @@
 import io
 import json
 import lzma
-import math
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import yaml
@@ -101,29 +99,9 @@ def read_yaml(path: Path, expected: str, todo: str = "") -> Any:
         raise InputError(path, "", f"no YAML ({type(error).__name__}: {error})", expected, todo) from error
 
 
-@dataclass(frozen=True)
-class Header:
-    """Shape and type of an array that has not been read yet."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-
-    @property
-    def size(self) -> int:
-        return math.prod(self.shape)
-
-    @property
-    def nbytes(self) -> int:
-        return self.size * self.dtype.itemsize
-
-
-Headers = Mapping[str, Header]
-
-
 def read_npz(
     source: Path | bytes,
     known: Iterable[str] | None,
-    check: Callable[[Headers], None],
     where: object = None,
     expected: str = "plain numeric arrays in a whole .npz file",
 ) -> dict[str, np.ndarray]:
@@ -132,7 +110,6 @@ def read_npz(
     Args:
         source: the file, or its content.
         known: names of the arrays to read, as far as they are there; None reads all.
-        check: gets their headers before any is unpacked, and raises InputError for what should not be.
         where: a content came from, for messages.
         expected: for messages.
 
@@ -145,12 +122,7 @@ def read_npz(
     with _reporting_damage(where, expected), zipfile.ZipFile(file) as archive:
         members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
         names = list(members) if known is None else [name for name in known if name in members]
-        headers = {}
-        for name in names:
-            with archive.open(members[name]) as stream:
-                headers[name] = _read_header(stream, members[name].file_size)
-        check(headers)
-        check_memory(where, "", "arrays", sum(header.nbytes for header in headers.values()))
+        check_memory(where, "", "arrays", sum(members[name].file_size for name in names))
         arrays = {}
         for name in names:
             with archive.open(members[name]) as stream:
@@ -158,18 +130,15 @@ def read_npz(
         return arrays
 
 
-def read_npy(path: Path, check: Callable[[Header], None]) -> np.ndarray:
-    """The array of an .npy file; `check` gets its header before it is read.
+def read_npy(path: Path) -> np.ndarray:
+    """The array of an .npy file.
 
     Raises:
         InputError: it is no such file, is damaged or cut short, or holds pickled objects.
     """
     existing_file(path)
+    check_memory(path, "", "an array", path.stat().st_size)
     with _reporting_damage(path, "an .npy array of numbers"), path.open("rb") as file:
-        header = _read_header(file, path.stat().st_size)
-        check(header)
-        check_memory(path, "", "an array", header.nbytes)
-        file.seek(0)
         return np.lib.format.read_array(file, allow_pickle=False)
 
 
@@ -182,18 +151,3 @@ def _reporting_damage(where: object, expected: str) -> Iterator[None]:
     except DAMAGE_ERRORS as error:
         found = f"something unreadable ({type(error).__name__}: {error})"
         raise InputError(where, "", found, expected, "save or copy it again") from error
-
-
-def _read_header(stream: io.BufferedIOBase | IO[bytes], size: int) -> Header:
-    """An array's header, if as many bytes follow it as it declares; `size` is that of the whole file or entry."""
-    version = np.lib.format.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {version} of the format .npy")  # 3 only adds letters to the names of fields
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(stream)
-    if dtype.hasobject:
-        raise ValueError("Object arrays cannot be loaded")
-    header = Header(shape, dtype)
-    if min(shape, default=0) < 0 or header.nbytes != size - stream.tell():
-        raise ValueError(f"{size - stream.tell()} bytes for an array of shape {shape} and type {dtype}")
-    return header

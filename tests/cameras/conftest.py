@@ -1,11 +1,10 @@
-from collections.abc import Callable
+"""Random cameras, and a reference for their rays."""
 
-import pytest
 import torch
 from torch import Tensor
 
 
-def poses(*batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
+def random_poses(*batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
     """Random rotations (det = 1) and translations."""
     q = torch.linalg.qr(torch.randn(*batch, 3, 3, dtype=torch.float64)).Q
     q = q * torch.linalg.det(q)[..., None, None].sign()
@@ -14,7 +13,7 @@ def poses(*batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
     return c2w.to(dtype)
 
 
-def intrinsics(*batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
+def random_K(*batch: int, dtype: torch.dtype = torch.float64) -> Tensor:
     """Random upper triangular K, with skew."""
     K = torch.zeros(*batch, 3, 3, dtype=torch.float64)
     K[..., 0, 0] = 200 + 300 * torch.rand(batch)
@@ -30,13 +29,3 @@ def cast_ray(K: Tensor, c2w: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     pixel = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1)[..., None]
     directions = (c2w[..., :3, :3] @ torch.linalg.inv(K) @ pixel)[..., 0]
     return c2w[..., :3, 3].expand_as(directions), torch.nn.functional.normalize(directions, dim=-1)
-
-
-@pytest.fixture
-def random_poses() -> Callable[..., Tensor]:
-    return poses
-
-
-@pytest.fixture
-def random_K() -> Callable[..., Tensor]:
-    return intrinsics

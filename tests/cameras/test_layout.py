@@ -4,8 +4,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nerf_lightning.cameras import Layout, classify_layout, gaze_point
-from tests.helpers.camera_paths import CENTRE, RADIUS, corridor, dome, forward, pan, ring, toward, walk
+from nerf_lightning.cameras import Layout, classify_layout
+from tests.helpers.camera_paths import CENTRE, corridor, dome, forward, pan, ring, toward, walk
 
 EVERY = [
     *((f"ring {yaw}", ring(yaw=yaw), Layout.INWARD) for yaw in (0, 30)),
@@ -16,7 +16,6 @@ EVERY = [
     ("one", ring(1), Layout.PAN),
     ("pure pan", pan(), Layout.PAN),
     ("half a pure pan", pan(degrees=180), Layout.PAN),
-    *((f"pan {seed}", pan(0.02, seed=seed), Layout.PAN) for seed in range(3)),
     ("walk", walk(), Layout.WALK),
     ("arm's length", toward(CENTRE + 0.6 * pan()[:, :3, 2], torch.linspace(0, 6, 24), torch.zeros(24)), Layout.WALK),
     ("corridor", corridor(), Layout.WALK),
@@ -32,13 +31,6 @@ def test_classify_layout_any_frame_and_unit(c2w: torch.Tensor, layout: Layout):
     moved[:, :3, 3] = 70 * moved[:, :3, 3] + 30
     assert classify_layout(moved) == layout
     assert classify_layout(c2w.float()) == layout
-
-
-@pytest.mark.parametrize("yaw", [0, 20])
-def test_gaze_point_ring_is_its_middle(yaw: int):
-    assert (gaze_point(ring(yaw=yaw)) - CENTRE).norm() < 0.05 * RADIUS
-    dense_half = torch.cat([torch.arange(32), torch.arange(32, 64, 4)])
-    assert (gaze_point(ring(64, yaw)[dense_half]) - CENTRE).norm() < 0.1 * RADIUS
 
 
 def test_classify_layout_points_tell_pan_from_walk():

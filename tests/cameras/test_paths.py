@@ -7,6 +7,7 @@ import torch
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Cameras, orbit_like, pivot_of, spiral_like
+from nerf_lightning.dataset.region import find_region
 from tests.helpers.camera_paths import CENTRE, RADIUS, UP, corridor, dome, forward, pan, ring, walk
 
 CAPTURES = {
@@ -30,11 +31,16 @@ def cameras_at(c2w: torch.Tensor) -> Cameras:
     return Cameras.of_size(torch.eye(3).repeat(len(c2w), 1, 1) * 20, c2w.float(), 32, 24)
 
 
+def orbit_at(c2w: torch.Tensor, frames: int) -> Cameras:
+    region = find_region(c2w)
+    return orbit_like(cameras_at(c2w), region.layout, region.centre, frames)
+
+
 @pytest.mark.parametrize("frames", [1, 60])
 @pytest.mark.parametrize("c2w", CAPTURES.values(), ids=CAPTURES.keys())
 def test_orbit_like_and_spiral_stay_near_the_photos(c2w: torch.Tensor, frames: int):
     cameras = cameras_at(c2w)
-    orbit = orbit_like(cameras, frames)
+    orbit = orbit_at(c2w, frames)
     spiral = spiral_like(orbit, frames)
     for path in (orbit, spiral):
         assert len(path) == frames
@@ -58,9 +64,8 @@ def test_orbit_like_and_spiral_stay_near_the_photos(c2w: torch.Tensor, frames: i
 
 @pytest.mark.parametrize("yaw", [0, 20])
 def test_orbit_like_ring_is_a_full_turn(yaw: int):
-    cameras = cameras_at(ring(yaw=yaw))
-    orbit = orbit_like(cameras, 8)
-    assert (orbit.width, orbit.height) == (32, 24) and torch.equal(orbit.K, cameras.K[:8])
+    orbit = orbit_at(ring(yaw=yaw), 8)
+    assert (orbit.width, orbit.height) == (32, 24) and torch.equal(orbit.K, cameras_at(ring()).K[:8])
     offset = orbit.centres - CENTRE.float()
     torch.testing.assert_close(offset.norm(dim=1), torch.full((8,), RADIUS), atol=0.05, rtol=0)
     torch.testing.assert_close(orbit.c2w[:, :3, 2], -normalize(offset, dim=1), atol=0.05, rtol=0)
@@ -70,8 +75,15 @@ def test_orbit_like_ring_is_a_full_turn(yaw: int):
     torch.testing.assert_close(pivot_of(orbit), CENTRE.float(), atol=0.05, rtol=0)
 
 
+def test_orbit_like_photos_on_their_side_get_an_upright_view_of_their_shape():
+    quarter = torch.eye(4, dtype=torch.float64)[[1, 0, 2, 3]] * torch.tensor([1.0, -1, 1, 1])
+    orbit = orbit_at(ring() @ quarter, 8)
+    assert (orbit.width, orbit.height) == (24, 32)
+    assert (orbit.c2w[:, :3, 1] @ UP.float()).max() < -0.5, "upright"
+
+
 def test_orbit_like_arc_and_half_pan_swing():
-    arc, pans = orbit_like(cameras_at(ring(24, degrees=150)), 60), orbit_like(cameras_at(pan(degrees=150)), 60)
+    arc, pans = orbit_at(ring(24, degrees=150), 60), orbit_at(pan(degrees=150), 60)
     offset = arc.centres - CENTRE.float()
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.02, rtol=0)
     assert float((pans.centres - CENTRE.float()).abs().max()) < 1e-6
@@ -82,7 +94,7 @@ def test_orbit_like_arc_and_half_pan_swing():
 
 @pytest.mark.parametrize(("degrees", "outermost", "innermost"), [(150, 50, 25), (360, 60, 25)])
 def test_spiral_like_winds_in(degrees: float, outermost: float, innermost: float):
-    orbit = orbit_like(cameras_at(ring(24, degrees=degrees)), 60)
+    orbit = orbit_at(ring(24, degrees=degrees), 60)
     offset = spiral_like(orbit, 60).centres - CENTRE.float()
     middle = normalize(orbit.centres.mean(0) - CENTRE.float(), dim=0)
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.05, rtol=0)

@@ -3,10 +3,11 @@ import pytest
 import torch
 
 from nerf_lightning.cameras import pixel_to_camera, transform, transform_directions
+from tests.cameras.conftest import random_K, random_poses
 
 
 @pytest.mark.parametrize(("cameras", "points"), [((), ()), ((4, 1), (1, 3))])
-def test_transforms_are_homogeneous_products(cameras, points, random_poses, random_K):
+def test_transforms_are_homogeneous_products(cameras, points):
     c2w, x = random_poses(*cameras), torch.randn(*points, 3, dtype=torch.float64)
     for function, w in ((transform, 1.0), (transform_directions, 0.0)):
         homogeneous = np.concatenate([x.numpy(), np.full((*points, 1), w)], -1)[..., None]

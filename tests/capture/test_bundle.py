@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerf_lightning.cameras import Distortion
-from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS, Bundle, Problem, lens_vector, refine, simplified
+from nerf_lightning.capture.poses.bundle import LENS_PARAMETERS, Bundle, Problem, lens_vector, refine
 from nerf_lightning.capture.poses.geometry import angle_between, inverse, project, to_matrix
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import SQUARE
@@ -86,10 +86,3 @@ def test_refine_of_twisted_tag_finds_twist():
     flat, bent = refine(start), refine(start, free_twists=True)
     assert bent.bic < flat.bic and bent.total_rms < 0.3 * flat.total_rms
     assert bent.bundle.twists[0] == pytest.approx(twist, rel=0.1)
-
-
-def test_simplified_lens_has_plain_values():
-    lens = replace(LENS, fy=910.0, distortion=Distortion(k1=-0.2, k2=0.05, p1=0.01, p2=0.02, k3=0.03))
-    assert simplified(lens, ()) == lens == simplified(lens, LENS_PARAMETERS)
-    plain = replace(LENS, cx=512.0, cy=384.0, distortion=Distortion(k1=-0.2))
-    assert simplified(lens, ("focal", "k1")) == plain

@@ -58,5 +58,4 @@ def test_resolve_flips_of_scattered_photos_keeps_their_best():
     points = SIX.corners(4)
     seen = [(points, project(LENS, inverse(pose), points) + 0.1 * rng.standard_normal((4, 2))) for pose in c2w]
     options = [mark_poses(LENS, Mark(SIZE * SQUARE, pixels)) for _, pixels in seen]
-    world = [(SIZE * SQUARE, pixels) for _, pixels in seen]
-    assert resolve_flips(LENS, options, world) == [0] * 15
+    assert resolve_flips(options, [SIZE * SQUARE] * 15) == [0] * 15

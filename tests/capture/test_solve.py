@@ -10,7 +10,6 @@ from nerf_lightning.capture.poses.geometry import angle_between, inverse, projec
 from nerf_lightning.capture.poses.solve import place_tags, solve, solve_without_misfits
 from nerf_lightning.capture.tags.detect import Mark
 from nerf_lightning.capture.tags.layout import SQUARE
-from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.errors import InputError
 from tests.helpers.tag_views import LENS, ONE, SIX, SIZE, cameras, sightings
 
@@ -118,9 +117,3 @@ def test_calibrate_with_too_few_or_frontal_photos_raises():
         calibrate(FOLDER, [*two, *(replace(s, marks={}) for s in none)], None)
     with pytest.raises(InputError, match="tilt the camera by 20 to 45 degrees"):
         calibrate(FOLDER, sightings(SIX, cameras(4, tilt=1.0), noise=0.5), None)
-
-
-def test_calibrate_with_small_coverage_warns():
-    far = Intrinsics(1024, 768, 900.0, 900.0, 512.0, 384.0)
-    found = calibrate(FOLDER, sightings(SIX, cameras(6, distance=1.2), far), None)
-    assert any("of the picture" in text for text in found.warnings)

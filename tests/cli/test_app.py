@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from nerf_lightning.cli.app import app
+from nerf_lightning.cli.app import app, find_cause
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = [name for name in app.resolved_commands() if not name.startswith("-")]
@@ -26,15 +26,6 @@ def test_help_of_each_command_fits_a_screen(inside, monkeypatch: pytest.MonkeyPa
         code, out, err = inside(name, "--help")
         assert (code, err) == (0, "") and out.startswith(f"Usage: nerf_lightning {name}")
         assert len(out.splitlines()) <= 45
-
-
-def test_install_completion_writes_a_script(inside, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr(Path, "home", lambda: tmp_path)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("SHELL", "/bin/bash")
-    code, out, err = inside("--install-completion")
-    assert code == 0, err
-    assert any("rightsize" in file.read_text() for file in tmp_path.rglob("*") if file.is_file()), out
 
 
 def test_front_page_lists_commands_in_the_order_of_the_work_and_first_steps(inside):
@@ -59,3 +50,8 @@ def test_front_page_lists_commands_in_the_order_of_the_work_and_first_steps(insi
 def test_wrong_arguments_give_one_line_and_exit_code_2(arguments: list[str], words: str, inside):
     code, _, err = inside(*arguments)
     assert code == 2 and err.count("\n") == 1 and words in err
+
+
+def test_torchvision_for_another_pytorch_says_how_to_mend_it():
+    found = find_cause(RuntimeError("operator torchvision::nms does not exist"))
+    assert "pip install --force-reinstall --no-deps torchvision" in str(found)

@@ -6,7 +6,7 @@ import random
 import numpy as np
 import pandas as pd
 
-from nerf_lightning.comparison.points import compute_points, conditions_of, find_frontier, typical_run
+from nerf_lightning.comparison.points import compute_points, find_frontier, typical_run
 from tests.helpers.run_results import MakeRun
 
 
@@ -41,18 +41,14 @@ def test_compute_points_other_conditions_stand_apart_and_the_fullest_come_first(
         make_run("white", background=[1.0, 1.0, 1.0]),
         make_run("machine", machine=machine),
         make_run("threads", threads=1),
+        make_run("gpu", device="cuda:1", machine={"accelerator": "H100"}),
         make_run("unknown", machine=None, background="nothing", scene="toy"),
     ]
     found = compute_points(runs)
-    assert [len(points) for _, points in found] == [2, 1, 1, 1, 1, 1]
+    assert [len(points) for _, points in found] == [2, 1, 1, 1, 1, 1, 1]
     assert found[0][0] == (
         "toy", "8x6", "9 training and 2 held-out views", "black background", "abacus, 2 threads on 2 cores", "abababab",
     )  # fmt: skip
-
-
-def test_conditions_of_devices_are_kept_apart(make_run: MakeRun):
-    runs = [make_run("cpu"), make_run("gpu", device="cuda:1", machine={"accelerator": "H100"})]
-    assert [conditions_of(run).machine for run in runs] == ["abacus, 2 threads on 2 cores", "H100 (cuda)"]
 
 
 def test_compute_points_a_collapsed_seed_counts_as_the_worst(make_run: MakeRun):

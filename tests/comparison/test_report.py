@@ -5,13 +5,12 @@ import re
 from pathlib import Path
 
 import imageio.v3 as imageio
-import numpy as np
 import pytest
 
 from nerf_lightning.cli.compare import compare
-from nerf_lightning.comparison.charts import MAX_NAMED, draw_cost, draw_quality
-from nerf_lightning.comparison.images import CROP, collect_images, find_differences
+from nerf_lightning.comparison.charts import draw_cost
 from nerf_lightning.comparison.points import PUBLISHED, compute_points, read_references
+from nerf_lightning.comparison.report import collect_images
 from nerf_lightning.errors import InputError
 from tests.comparison.conftest import run_maker
 from tests.helpers.run_results import MakeRun
@@ -93,23 +92,11 @@ def test_draw_cost_names_few_points_and_publications_beyond_the_axis_with_their_
     assert axes.get_legend() is None, "one size, so one point on the frontier and no key"
 
 
-def test_draw_quality_is_sorted_and_never_joins_categories(make_run: MakeRun):
-    runs = [make_run(f"{n}", {"recipe": f"r{n}"}, psnr=20.0 + n) for n in range(MAX_NAMED + 2)]
-    points = compute_points(runs)[0][1].assign(style=[("black", "o")] * len(runs))
-    (axes,) = draw_quality(points).axes
-    assert [tick.get_text() for tick in axes.get_yticklabels()][:2] == ["r9", "r8"]
-    assert all(line.get_linestyle() == "None" for line in axes.lines)
-
-
-def test_collect_images_truth_comes_first_and_the_crop_is_where_images_differ(make_run: MakeRun):
-    images = [np.full((40, 80, 3), 100, np.uint8) for _ in range(2)]
-    images[1][25:30, 50:60] = 200
-    top, left = find_differences(images)
-    assert 30 - 40 // CROP <= top <= 25 and 60 - 80 // CROP <= left <= 50
+def test_collect_images_truth_comes_first(make_run: MakeRun):
     found = collect_images(compute_points([make_run("a"), make_run("b", {"recipe": "b"})])[0][1])
     assert [caption.partition("\n")[0] for caption, _ in found] == ["truth", "grid", "b"]
     assert [int(image[-1, -1, 0]) for _, image in found] == [200, 100, 100]
-    assert {image.shape for _, image in found} == {(320 * 2 + 4, 480, 3)}
+    assert {image.shape for _, image in found} == {(320, 480, 3)}
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import Views, estimate_bounds
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -43,24 +42,8 @@ def test_estimate_bounds_broken_silhouettes_are_forgiven_or_ignored(
     views.images[7] = 0
     assert_snug(estimate_bounds(views, BLACK).aabb, ball_box, 1.23)
     views.images[::3] = 0  # the ball is missing from a third of the views: no voxel convinces enough of them
-    torch.testing.assert_close(estimate_bounds(views, BLACK).aabb, cube(1.6), atol=1e-4, rtol=0)
-
-
-def cube(half: float) -> torch.Tensor:
-    return torch.tensor([[-half] * 3, [half] * 3])
-
-
-def test_estimate_bounds_noise_gives_what_cameras_see(views: Views):
+    # What cameras see: 4 away from the origin, half of 48 pixels wide at a focal length of 60.
+    seen = torch.tensor([[-1.6] * 3, [1.6] * 3])
+    torch.testing.assert_close(estimate_bounds(views, BLACK).aabb, seen, atol=1e-4, rtol=0)
     noise = torch.randint(0, 256, (*views.images.shape[:3], 3), generator=torch.manual_seed(0)).to(torch.uint8)
-    bounds = estimate_bounds(Views.of(noise, views.cameras), BLACK)
-    # Cameras 4 away from the origin, half of 48 pixels wide at a focal length of 60.
-    torch.testing.assert_close(bounds.aabb, cube(4 * 24 / 60), atol=1e-4, rtol=0)
-
-
-def test_estimate_bounds_one_spot_gives_a_box():
-    c2w = torch.eye(4).repeat(2, 1, 1)
-    c2w[:, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
-    K = torch.tensor([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]).repeat(2, 1, 1)
-    noise = torch.randint(0, 256, (2, 8, 8, 3), generator=torch.manual_seed(0)).to(torch.uint8)
-    box = estimate_bounds(Views.of(noise, Cameras.of_size(K, c2w, 8, 8)), BLACK).aabb
-    torch.testing.assert_close(box, torch.tensor([1.0, 2.0, 3.0]) + cube(0.5))
+    torch.testing.assert_close(estimate_bounds(Views.of(noise, views.cameras), BLACK).aabb, seen, atol=1e-4, rtol=0)

@@ -50,10 +50,11 @@ def test_focus_weights_make_the_draw_unbiased(masked: bool):
         torch.testing.assert_close(share[part].sum(), known[part].sum() / known.sum(), rtol=0.05, atol=0)
 
 
-def test_views_draw_finds_known_pixels():
+def test_views_draw_known_pixels_evenly():
     views = photos(masked=True)
-    number = torch.randint(int(views.known.sum()), (3000,), generator=seeded())
-    assert torch.equal(views.draw(3000, seeded()), views.known.nonzero()[:, 0][number])
+    counts = torch.bincount(views.draw(200_000, seeded()), minlength=len(views.pixels)).double()
+    expected = views.mask * (200_000 / int(views.mask.sum()))
+    assert (counts[~views.mask] == 0).all() and ((counts - expected).abs() < 6 * expected.sqrt() + 1).all()
 
 
 def test_focus_draws_where_the_error_is():
@@ -71,17 +72,16 @@ def test_focus_draws_where_the_error_is():
 def test_focus_state_resumes_exactly():
     views = photos()
     errors = torch.rand(len(views.pixels), generator=seeded())
-    whole = taught(views, errors, steps=EVERY + 5)
-    other = Focus(views, 0.5)
+    whole, other = taught(views, errors, steps=EVERY + 5), Focus(views, 0.5)
     other.load_state_dict(whole.state_dict())
     for step in range(EVERY):
-        drawn = [focus.draw(300, seeded(step)) for focus in (whole, other)]
-        assert torch.equal(drawn[0][0], drawn[1][0]) and torch.equal(drawn[0][1], drawn[1][1])
-        whole.note(errors[drawn[0][0]])
-        order = torch.randperm(300)
+        places, weights = whole.draw(300, seeded(step))
+        assert all(map(torch.equal, other.draw(300, seeded(step)), (places, weights)))
+        whole.note(errors[places])
+        order = torch.randperm(300)  # sums do not depend on it
         other.drawn = other.drawn[order]
-        other.note(errors[drawn[1][0]][order])
-    assert all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), other.state_dict().values(), strict=True))
+        other.note(errors[places][order])
+    assert all(map(torch.equal, whole.state_dict().values(), other.state_dict().values()))
 
 
 def test_ray_data_follows_noted_errors():
@@ -97,6 +97,4 @@ def test_ray_data_follows_noted_errors():
     assert torch.equal(resumed.draw(EVERY).pixels, data.draw(EVERY).pixels)
     data.start_again()
     assert torch.equal(data.draw(0).pixels, first.pixels)
-    alike = RayDataModule(scene, rays=500, focus=0)
-    alike.note_errors(torch.ones(500))
-    assert alike.draw(0).weights is None
+    assert RayDataModule(scene, rays=500, focus=0).draw(0).weights is None

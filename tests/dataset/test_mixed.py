@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.cameras import Cameras
-from nerf_lightning.dataset import Views, draw_rays, open_scene
+from nerf_lightning.cameras import Bounds, Cameras
+from nerf_lightning.dataset import RayDataModule, Scene, Views, open_scene
+from nerf_lightning.dataset.rays import make_batch
 from nerf_lightning.dataset.shots import PhotoLoadOptions
 from nerf_lightning.errors import InputError
 from tests.helpers.colmap_files import cameras_of, photos, write_colmap
@@ -40,13 +41,11 @@ def test_views_several_sizes_are_stored_without_padding():
     following = views[torch.tensor([1, 2])]
     assert torch.equal(following.image(1), views.image(2))
     assert following.pixels.data_ptr() == views.image(1).data_ptr(), "no copy"
-    with pytest.raises(ValueError, match="values to unpack"):
-        _ = views.images
 
 
-def test_draw_rays_several_sizes_match_their_colours():
+def test_make_batch_several_sizes_match_their_colours():
     views = mixed()
-    batch = draw_rays(views, 2000, torch.Generator().manual_seed(0))
+    batch = make_batch(views, views.draw(2000, torch.Generator().manual_seed(0)))
     directions = torch.cat([views.cameras.view_rays(view).directions for view in range(3)])
     number = (batch.pixels[:, None] == views.pixels).all(2).int().argmax(1)
     torch.testing.assert_close(batch.rays.directions, directions[number])
@@ -54,7 +53,18 @@ def test_draw_rays_several_sizes_match_their_colours():
     assert len(counts) == 29 and float(((counts - 2000 / 29) ** 2 * 29 / 2000).sum()) < 28 + 5 * 56**0.5, "chi squared"
 
 
-def capture(folder: Path, views: Views, edit: Callable[[int, np.ndarray], np.ndarray] = lambda i, x: x) -> Path:
+def test_ray_data_held_out_masked_view_knows_its_pixels():
+    views = mixed()
+    known = torch.ones(29, dtype=torch.bool)
+    known[3:9], known[11:13], known[22:] = False, False, False
+    views = Views(views.pixels, views.cameras, known)
+    assert torch.equal(views[torch.tensor([1])].mask_of(0), views.mask_of(1))
+    scene = Scene("mixed", "test", views, views, views.cameras, Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])))
+    batch = RayDataModule(scene).held_out(1)
+    assert (batch.width, batch.height) == (2, 5) and torch.equal(batch.known, known[12:22])
+
+
+def capture(folder: Path, views: Views) -> Path:
     """A COLMAP capture whose photos are RGB on grey noise."""
     rng = np.random.default_rng(0)
     rgb = []
@@ -62,29 +72,30 @@ def capture(folder: Path, views: Views, edit: Callable[[int, np.ndarray], np.nda
         image = views.image(i).numpy()
         alpha = image[..., 3:] / 255
         noise = rng.integers(0, 255, image.shape[:2])[..., None]
-        rgb.append(edit(i, np.rint(image[..., :3] * alpha + noise * (1 - alpha)).astype(np.uint8)))
+        rgb.append(np.rint(image[..., :3] * alpha + noise * (1 - alpha)).astype(np.uint8))
     names = photos(folder / "images", Views.of(torch.from_numpy(np.stack(rgb)), views.cameras))
     write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
     return folder
 
 
-def write_masks(folder: Path, views: Views, ending: str = ".png", side: int = 1, invert: bool = False) -> None:
+def write_masks(folder: Path, views: Views, ending: str = ".png", side: int = 1) -> None:
     """White where the ball is."""
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     for i in range(len(views)):
         mask = (views.image(i)[..., 3] > 127).numpy().astype(np.uint8) * 255
-        mask = 255 - mask if invert else mask
         imageio.imwrite(folder / f"{i:04d}{ending}", mask.repeat(side, 0).repeat(side, 1))
 
 
-@pytest.mark.parametrize("ending", [".png.png", "-cut.png"])
-def test_open_scene_masks_beside_photos_are_found(ending: str, views: Views, tmp_path: Path):
+def test_open_scene_masks_beside_photos_are_found(views: Views, tmp_path: Path):
     folder = capture(tmp_path, views)
-    write_masks(folder / "masks", views, ending)
-    imageio.imwrite(folder / "masks" / f"0008{ending}", np.zeros((40, 48), np.uint8))
+    write_masks(folder / "masks", views, ".png.png")
+    imageio.imwrite(folder / "masks" / "0008.png.png", np.zeros((40, 48), np.uint8))
     scene = open_scene(str(folder))
     assert scene.train.channels == 3 and len(scene.val) == 2, "a photo without known pixels is not held out"
     assert torch.equal(scene.train.mask_of(0), views.image(1)[..., 3] > 127)
+    write_masks(folder / "masks", views, ".png")
+    with pytest.raises(InputError, match="masks of one photo"):
+        open_scene(str(folder))
 
 
 def write_subfolders(folder: Path, views: Views, masked: tuple[str, ...]) -> Path:
@@ -116,30 +127,24 @@ def test_open_scene_masks_in_subfolders_match_their_photos(views: Views, tmp_pat
     assert hidden == {"back": 0, "front": 40}, "the other camera's masks are not taken"
 
 
-def test_open_scene_inverted_masks_warn(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_open_scene_mask_options_are_followed(views: Views, tmp_path: Path):
     folder = capture(tmp_path, views)
-    write_masks(folder / "masks", views, side=2, invert=True)
-    with caplog.at_level(logging.INFO):
-        straight = open_scene(str(folder))
-    assert "dataset.invert_masks=true takes them so" in caplog.text
-    turned = open_scene(str(folder), options=PhotoLoadOptions(invert_masks=True))
-    assert torch.equal(turned.train.mask, ~straight.train.mask)
+    write_masks(folder / "masks", views, side=2)
+    chosen = PhotoLoadOptions(), PhotoLoadOptions(invert_masks=True), PhotoLoadOptions(masked="empty")
+    straight, turned, empty = (open_scene(str(folder), options=options) for options in chosen)
+    kept = views.image(1)[..., 3] > 127
+    assert torch.equal(straight.train.mask_of(0), kept) and torch.equal(turned.train.mask_of(0), ~kept)
+    assert empty.train.channels == 4 and empty.train.known is None and not empty.bounds.unbounded
+    assert torch.equal(empty.train.image(0)[..., 3], (kept * 255).to(torch.uint8))
 
 
-def test_open_scene_masked_empty_cuts_out(views: Views, tmp_path: Path):
-    folder = capture(tmp_path / "a", views)
+def test_open_scene_fully_masked_view_is_not_held_out(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    folder = capture(tmp_path, views)
     write_masks(folder / "masks", views)
-    scene = open_scene(str(folder), options=PhotoLoadOptions(masked="empty"))
-    assert scene.train.channels == 4 and scene.train.known is None and not scene.bounds.unbounded
-    assert torch.equal(scene.train.image(0)[..., 3], ((views.image(1)[..., 3] > 127) * 255).to(torch.uint8))
-
-    def white(i: int, image: np.ndarray) -> np.ndarray:
-        return np.where(views.image(i).numpy()[..., 3:] > 127, image, 255)
-
-    cut = capture(tmp_path / "b", views, white)
-    write_masks(cut / "images_mask", views)
-    assert open_scene(str(cut)).train.channels == 4, "these photos are cut out already"
-    assert open_scene(str(cut), options=PhotoLoadOptions(masked="unknown")).train.channels == 3
+    imageio.imwrite(folder / "masks" / "0008.png", np.zeros((40, 48), np.uint8))
+    with caplog.at_level(logging.WARNING):
+        assert len(open_scene(str(folder)).val) == 2
+    assert "1 photos are masked entirely: left out" in caplog.text
 
 
 def test_open_scene_several_sizes_keep_their_rays(views: Views, tmp_path: Path):
@@ -159,13 +164,13 @@ def test_open_scene_several_sizes_keep_their_rays(views: Views, tmp_path: Path):
     torch.testing.assert_close(scene.train.cameras.view_rays(1).directions, expected, atol=1e-5, rtol=0)
 
 
-def test_open_scene_too_many_photos_raise_a_size(views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_open_scene_too_many_photos_raise(views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = capture(tmp_path, views)
 
     class Memory:
-        available = 18 * 48 * 40 * 3  # of which four fifths are taken
+        available = 17 * 48 * 40 * 3  # one photo less
 
     monkeypatch.setattr("psutil.virtual_memory", Memory)
-    with pytest.raises(InputError, match="dataset.resize=42 would fit"):
+    with pytest.raises(InputError, match="give a smaller dataset.resize"):
         open_scene(str(folder))
     assert open_scene(str(folder), options=PhotoLoadOptions(resize=42)).train.cameras.size(0) == (42, 35)

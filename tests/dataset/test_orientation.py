@@ -56,6 +56,6 @@ def test_open_scene_square_photos_stay_as_stored(
     folder = write_sideways("transforms", tmp_path / "s", square)
     with caplog.at_level(logging.WARNING):
         stored = open_scene(str(folder))
-    assert "taken to be about the pixels as stored (dataset.orientation=exif" in caplog.text
+    assert "taken as they are stored (dataset.orientation=exif" in caplog.text
     turned = open_scene(str(folder), options=PhotoLoadOptions(orientation="exif"))
     assert torch.equal(stored.train.image(0), torch.rot90(turned.train.image(0), 1))

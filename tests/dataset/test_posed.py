@@ -15,6 +15,13 @@ from tests.helpers.colmap_files import photos, write_transforms
 from tests.helpers.exif_tags import tags
 
 UP = torch.tensor([0.0, 0.0, 1.0])
+RING = orbit_around(torch.zeros(3), UP, 2.0, 0.4, 9)
+
+
+def noise_at(c2w: torch.Tensor) -> Views:
+    K = torch.tensor([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]]).repeat(9, 1, 1)
+    noise = torch.randint(0, 255, (9, 12, 16, 3), generator=torch.manual_seed(0)).to(torch.uint8)
+    return Views.of(noise, Cameras.of_size(K, c2w, 16, 12))
 
 
 @pytest.mark.parametrize("some", [slice(None), slice(0, 4)])
@@ -35,20 +42,15 @@ def test_open_scene_walk_has_no_near(tmp_path: Path):
     """Only where all cameras look at one thing is it known that nothing is near."""
     walk = torch.eye(4).repeat(9, 1, 1)
     walk[:, 0, 3] = torch.linspace(-4, 4, 9)
-    ring = orbit_around(torch.zeros(3), UP, 2.0, 0.4, 9)
-    noise = torch.randint(0, 255, (9, 12, 16, 3), generator=torch.manual_seed(0)).to(torch.uint8)
-    K = torch.tensor([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]]).repeat(9, 1, 1)
-    for name, c2w, near in (("walk", walk, None), ("ring", ring, 0.25)):
-        views = Views.of(noise, Cameras.of_size(K, c2w, 16, 12))
+    for name, c2w, near in (("walk", walk, None), ("ring", RING, 0.25)):
+        views = noise_at(c2w)
         names = photos(tmp_path / name, views)
         write_transforms(tmp_path / name / "transforms.json", views, names, w=16, h=12)
         assert open_scene(str(tmp_path / name)).bounds.near == (near if near is None else pytest.approx(near))
 
 
 def test_open_scene_exposures_come_from_exif(tmp_path: Path):
-    K = torch.tensor([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]]).repeat(9, 1, 1)
-    c2w = orbit_around(torch.zeros(3), UP, 2.0, 0.4, 9)
-    views = Views.of(torch.zeros(9, 12, 16, 3, dtype=torch.uint8), Cameras.of_size(K, c2w, 16, 12))
+    views = noise_at(RING)
     names = photos(tmp_path, views, ".jpg")
     for i, name in enumerate(names):
         Image.new("RGB", (16, 12)).save(tmp_path / name, exif=tags(seconds=2.0**-i, aperture=2.0, speed=100))

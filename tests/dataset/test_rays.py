@@ -7,7 +7,7 @@ import torch
 from nerf_lightning.cameras import Bounds, Cameras, orbit_around
 from nerf_lightning.dataset import RayDataModule, Scene, Views
 from nerf_lightning.dataset.loader import BatchLoader
-from nerf_lightning.dataset.rays import draw_rays, measure_texturelessness
+from nerf_lightning.dataset.rays import make_batch, measure_texturelessness
 from nerf_lightning.renderer import over
 
 VIEWS, HEIGHT, WIDTH = 3, 4, 6
@@ -29,8 +29,8 @@ def scene() -> Scene:
     return Scene("labels", "test", train, val, val.cameras, Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])))
 
 
-def test_draw_rays_colours_belong_to_their_rays(scene: Scene):
-    batch = draw_rays(scene.train, 50, torch.Generator().manual_seed(0))
+def test_make_batch_colours_belong_to_their_rays(scene: Scene):
+    batch = make_batch(scene.train, scene.train.draw(50, torch.Generator().manual_seed(0)))
     assert len(batch.rays) == len(batch.pixels) == 50
     for i, (view, row, col, _) in enumerate(batch.pixels.tolist()):
         K, c2w = scene.train.cameras.K[view].double(), scene.train.cameras.c2w[view].double()
@@ -102,15 +102,10 @@ def test_ray_data_state_keeps_the_number_of_rays(scene: Scene):
     other.load_state_dict(data.state_dict())
     assert other.rays == data.rays != 100
     assert torch.equal(other.draw(3).pixels, data.draw(3).pixels)
-    other.note_samples(0)
-    data.note_samples(0)
-    assert other.rays == data.rays
 
 
 def test_batch_loader_asks_for_the_step_at_each_batch(scene: Scene):
     steps = iter([0, 1, 5, 5])
-    loader = BatchLoader(lambda step: step * 10, iter(lambda: next(steps), None))
-    assert list(islice(loader, 4)) == [0, 10, 50, 50]
-    assert len(loader) > 10**9
+    assert list(islice(BatchLoader(lambda step: step * 10, iter(lambda: next(steps), None)), 4)) == [0, 10, 50, 50]
     first = next(iter(RayDataModule(scene, rays=5, seed=1).train_dataloader()))
     assert torch.equal(first.pixels, RayDataModule(scene, rays=5, seed=1).draw(0).pixels)

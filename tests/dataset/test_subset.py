@@ -20,9 +20,6 @@ def test_pixel_subset_stride_takes_the_middle():
     rows, columns = PixelSubset(stride=3).grid(7, 5)
     assert rows.tolist() == [1, 4] and columns.tolist() == [1, 4]
     assert [len(side) for side in PixelSubset(stride=9).grid(3, 2)] == [1, 1], "never nothing"
-
-
-def test_thin_leaves_at_most_so_many():
     for pixels, most, stride in ((100, 100, 1), (100, 99, 2), (100, 24, 3), (9, 0, 3)):
         assert thin(pixels, most).stride == stride
     assert (thin(100, 100) == WHOLE) and thin(100, 25).strip == 1

@@ -1,6 +1,6 @@
 import numpy as np
 
-from nerf_lightning.drawing.contact_sheet import GAP, contact_sheet, wrap
+from nerf_lightning.drawing.contact_sheet import GAP, contact_sheet
 from nerf_lightning.drawing.ink import VERMILLION, rgb
 
 
@@ -39,8 +39,3 @@ def test_contact_sheet_without_width_keeps_sizes_and_heading_comes_first():
     assert [int(where(sheet, level).sum()) for level in (40, 80)] == [600, 500]
     titled = contact_sheet(images, ["", ""], columns=1, heading="title")
     assert titled.shape[0] > sheet.shape[0] and titled[: titled.shape[0] - sheet.shape[0]].min() < 100
-
-
-def test_wrap_breaks_long_words_and_keeps_line_ends():
-    lines = wrap("a" * 50 + "\nnew \u5bb6", 150, 15)
-    assert max(map(len, lines)) <= 16 and lines[-1] == "new ?" and "".join(lines[:-1]) == "a" * 50

@@ -33,19 +33,6 @@ def test_amplitudes_powers_add_up_to_the_variance():
     assert (amplitudes(grey) ** 2).sum() == pytest.approx((grey**2 * window**2).sum() / (window**2).sum())
 
 
-def test_by_frequency_rings_are_root_mean_squares_and_empty_ones_nan():
-    spectrum = np.random.default_rng(0).random((8, 12))
-    y, x = np.mgrid[-4:4, -6:6]
-    radius = np.hypot(y / 8, x / 12)
-    frequency, size = by_frequency(spectrum, bands=4)
-    assert frequency == pytest.approx([1 / 16, 3 / 16, 5 / 16, 7 / 16])
-    for ring in range(4):
-        inside = (radius >= ring / 8) & (radius < (ring + 1) / 8 + 1e-9 * (ring == 3))  # the last one holds its end
-        assert size[ring] == pytest.approx(math.sqrt((spectrum[inside] ** 2).mean()))
-    _, size = by_frequency(np.ones((4, 4)), bands=8)
-    assert np.isnan(size).tolist() == [False, True, True, True, False, False, True, False]
-
-
 @pytest.mark.parametrize("shape", [(64, 48, 3), (1, 1, 3)])
 def test_spectrum_chart_shows_target_result_and_error(shape: tuple[int, int, int]):
     target = np.random.default_rng(0).random(shape)

@@ -15,9 +15,8 @@ import torch
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.evaluate import perceptual
-from nerf_lightning.evaluate.metrics import DIGITS, format_table, to_json
-from nerf_lightning.evaluate.perceptual import perceptual_distance
+from nerf_lightning.evaluate import metrics
+from nerf_lightning.evaluate.metrics import DIGITS, format_table, load_lpips, to_json
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.device import CPU
@@ -43,7 +42,7 @@ def test_every_view_is_judged_as_the_run_was(run: Path, capsys: pytest.CaptureFi
     assert found["mean"]["psnr"] == pytest.approx(results["psnr"], abs=0.02)  # which is rounded
     assert min(one["psnr"] for one in found["views"]) == pytest.approx(results["psnr_worst_view"], abs=0.02)
     assert found["mean"]["ssim"] == pytest.approx(results["ssim"], abs=1e-3)
-    assert found["mean"]["lpips"] is None and "no LPIPS: photos of less than 64 pixels" in out
+    assert found["mean"]["lpips"] is None and "no LPIPS: " in out
     assert out.count("<- worst") == 1 and f"{found['mean']['psnr']:.2f} dB over 2 held-out views" in out
     assert (found["device"], found["machine"]["accelerator"]) == ("cpu", None) and "held-out views on cpu;" in out
     both = imageio.imread(run / "evaluation" / "worst.png")
@@ -72,21 +71,23 @@ def test_figures_that_a_view_lacks_have_no_mean():
     assert format_table(views).splitlines()[1].split() == ["0", "20.00", "-", "-", "1.000", "<-", "worst"]
 
 
-def test_lpips_is_told_where_its_weights_are_and_nothing_is_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_load_lpips_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    image = torch.ones(80, 100, 3)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    assert perceptual_distance() == (None, "torchvision is not installed: pip install 'nerf_lightning[lpips]'")
+    assert math.isnan(load_lpips()(image, image)) and "pip install 'nerf_lightning[lpips]'" in capsys.readouterr().out
     monkeypatch.setitem(sys.modules, "torchvision", types.ModuleType("torchvision"))
-    assert perceptual_distance() == (None, f"{tmp_path}/checkpoints/alexnet-owt-7be5be79.pth is not there")
-    (tmp_path / "checkpoints").mkdir()
-    (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").write_bytes(b"")
+    assert math.isnan(load_lpips()(image, image))
+    weights = tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth"
+    assert f"{weights} is not there" in capsys.readouterr().out
+    weights.parent.mkdir()
+    weights.touch()
     asked = {}
 
     def metric(first: torch.Tensor, second: torch.Tensor, net_type: str, normalize: bool) -> torch.Tensor:
         asked.update(shape=first.shape, net=net_type, normalize=normalize)
         return (first - second).abs().mean()
 
-    monkeypatch.setattr(perceptual, "learned_perceptual_image_patch_similarity", metric)
-    distance, why = perceptual_distance()
-    assert distance is not None and why == ""
-    assert distance(torch.ones(80, 100, 3), torch.zeros(80, 100, 3)) == 1.0
-    assert asked == {"shape": (1, 3, 80, 100), "net": "alex", "normalize": True}, "pictures in [0, 1], channels first"
+    monkeypatch.setattr(metrics, "learned_perceptual_image_patch_similarity", metric)
+    assert load_lpips()(image, torch.zeros(80, 100, 3)) == 1.0
+    assert asked == {"shape": (1, 3, 80, 100), "net": "alex", "normalize": True}, "images in [0, 1], channels first"
+    assert math.isnan(load_lpips()(image[:50], image[:50]))

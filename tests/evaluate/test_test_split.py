@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from nerf_lightning.callbacks import Evaluation
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, Scene
@@ -48,13 +47,6 @@ def test_its_figures_stand_beside_those_of_held_out_views(scene: Scene, tmp_path
         assert judged["mean"]["ssim"] == pytest.approx(expected["ssim"], abs=1e-3)
         worst = min(view["psnr"] for view in judged["views"])
         assert worst == pytest.approx(expected["psnr_worst_view"], abs=0.02)
-
-
-def test_where_there_is_not_time_for_all_some_of_it_is_evaluated(scene: Scene, tmp_path: Path, monkeypatch, capsys):
-    monkeypatch.setattr(Evaluation, "share", lambda self, trainer, system, pixels=None: 0.5 if pixels is None else 1.0)
-    train(composed(OPTIONS, tmp_path), scene=scene)
-    assert (results(tmp_path)["test"]["views"], results(tmp_path)["test"]["views_in_split"]) == (2, 5)
-    assert "dB on 2 of 5 test views, after" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("split", "words"), [("test", "have no test split"), ("all", "one of val, test")])

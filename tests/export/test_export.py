@@ -98,7 +98,6 @@ def test_export_shapes_and_photos_are_written_by_their_suffix(planes: Path, tmp_
         (export_mesh, {"output": Path("mesh.fbx")}, "output: found mesh.fbx"),
         (export_mesh, {"threshold": 1.0}, "threshold: found 1"),
         (export_mesh, {"box": (0, 0, 0, 1, -1, 1)}, "box: found 0 0 0 1 -1 1"),
-        (export_compact, {"precision": "double"}, "precision: found 'double'"),
     ],
 )
 def test_export_bad_options_are_refused(export: Any, given: dict[str, Any], message: str, planes: Path):

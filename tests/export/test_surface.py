@@ -72,7 +72,7 @@ def test_nothing_there_is_told():
 
 def test_what_no_camera_sees_is_solid_and_what_one_sees_is_not():
     run = ball_run(torch.eye(4))
-    one = sample_volume(run.system, N)
+    one = sample_volume(run, N)
     lit = lit_cells(run.system, one, run.orbit)
     radius = (one.centres - CENTRE).norm(dim=-1).numpy()
     assert not lit[radius < RADIUS - 2.5 * one.cell].any()

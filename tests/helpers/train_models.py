@@ -14,8 +14,7 @@ import torch
 
 from nerf_lightning.callbacks import Checkpoints
 from nerf_lightning.config.compose import composed
-from nerf_lightning.refine import corrections
-from nerf_lightning.system import aligned
+from nerf_lightning.system import photos, trial
 from nerf_lightning.training.train import train
 
 SCENE = [
@@ -42,15 +41,15 @@ ANOTHER = "siren, another seed"
 STEPS = 14
 
 
-aligned.TOGETHER = aligned.APART = 1  # held-out photos are not what is compared
+photos.STEPS_TOGETHER = photos.STEPS_APART = 1  # held-out photos are not what is compared
 
 
 class Stop(Exception):
     """Training is to end here."""
 
 
-@patch.dict(corrections.MIN_GAIN, poses=-1.0, light=-1.0)  # refine=auto begins with its first trial
-@patch.multiple(corrections, FIRST_TRIAL_STEP=2, EARLY_STEPS=2)
+@patch.dict(trial.MIN_GAIN, poses=-1.0, light=-1.0)  # refine=auto begins with its first trial
+@patch.multiple(trial, FIRST_TRIAL_STEP=2, EARLY_STEPS=2)
 def fingerprints(folder: Path, stop: int) -> dict[str, str]:
     save = Checkpoints.on_train_batch_end
 

@@ -7,9 +7,10 @@ import torch
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds
+from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import hash_interpolate
 from nerf_lightning.model import HashGrid, HashGridField, TensoRFField, density_activation, sinusoidal, truncated_exp
-from nerf_lightning.model.hashgrid import level_resolutions
+from nerf_lightning.model.hashgrid import cubic_cells, level_resolutions
 
 
 def test_truncated_exp_any_input_keeps_gradient():
@@ -22,14 +23,19 @@ def test_truncated_exp_any_input_keeps_gradient():
     assert torch.autograd.gradcheck(truncated_exp, torch.linspace(-10, 10, 9).double().requires_grad_())
 
 
-@pytest.mark.parametrize(
-    ("name", "at_zero", "at_three"),
-    [("relu", 0.0, 3.0), ("softplus", math.log1p(math.exp(-1)), math.log1p(math.exp(2))), ("exp", 1.0, math.exp(3))],
-)
-def test_density_activation_any_name_gives_formula(name, at_zero, at_three):
-    values = density_activation(name)(torch.tensor([0.0, 3.0, -5.0]))
-    torch.testing.assert_close(values[:2], torch.tensor([at_zero, at_three]))
-    assert values.min() >= 0
+def test_density_activations_follow_formulas():
+    x, softplus = torch.tensor([0.0, 3.0, -5.0]), lambda x: (x - 1).exp().log1p()
+    for name, formula in (("relu", torch.relu), ("softplus", softplus), ("exp", torch.exp)):
+        torch.testing.assert_close(density_activation(name)(x), formula(x))
+
+
+def test_softened_relu_is_softplus_and_saved():
+    softened, loaded = density_activation("relu"), density_activation("relu")
+    softened.soften()
+    loaded.load_state_dict(softened.state_dict())
+    x = torch.linspace(-3, 3, 7)
+    for relu in (softened, loaded):
+        assert torch.equal(relu(x), density_activation("softplus")(x))
 
 
 @pytest.mark.parametrize(("name", "dtype"), [("softplus", torch.float16), ("exp", torch.bfloat16)])
@@ -41,31 +47,22 @@ def test_density_activation_half_precision_stays_finite(name: str, dtype: torch.
     assert values[3] > 0.9 * (11 if name == "softplus" else math.exp(12)), "e^12 is beyond half precision"
 
 
-@pytest.mark.parametrize(("frequencies", "shape"), [(0, (5, 3)), (1, (2,)), (4, (2, 3, 1))])
+@pytest.mark.parametrize(("frequencies", "shape"), [(0, (5, 3)), (4, (2, 3, 2))])
 def test_sinusoidal_any_shape_matches_loop(frequencies, shape):
     x = torch.randn(shape)
-    rows = []
-    for row in x.reshape(-1, shape[-1]).tolist():
-        out = list(row)
-        for octave in range(frequencies):
-            out += [math.sin(2**octave * math.pi * v) for v in row]
-            out += [math.cos(2**octave * math.pi * v) for v in row]
-        rows.append(out)
-    expected = torch.tensor(rows).view(*shape[:-1], shape[-1] * (1 + 2 * frequencies))
-    torch.testing.assert_close(sinusoidal(x, frequencies), expected, atol=1e-5, rtol=1e-5)
+    waves = [wave(2**octave * math.pi * x) for octave in range(frequencies) for wave in (torch.sin, torch.cos)]
+    torch.testing.assert_close(sinusoidal(x, frequencies), torch.cat([x, *waves], dim=-1), atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("levels", "coarsest", "finest", "expected"),
-    [(1, 16, 256, [16]), (2, 3, 50, [3, 50]), (5, 16, 256, [16, 32, 64, 128, 256]), (3, 7, 7, [7, 7, 7])],
-)
-def test_level_resolutions_grow_from_coarsest_to_finest(levels, coarsest, finest, expected):
-    assert level_resolutions(levels, coarsest, finest) == expected
+def test_level_resolutions_grow_from_coarsest_to_finest():
+    assert level_resolutions(1, 16, 256) == [16] and level_resolutions(5, 16, 256) == [16, 32, 64, 128, 256]
+    with pytest.raises(InputError, match="model.coarsest"):
+        level_resolutions(2, 20, 10)
 
 
 def test_hash_grid_small_levels_have_one_entry_a_vertex():
-    grid = HashGrid(levels=3, log2_entries=9, features=4, coarsest=4, finest=16)
-    assert grid.resolutions == [4, 8, 16] and grid.sizes == [125, 512, 512]
+    grid = HashGrid(cubic_cells(3, 4, 16), log2_entries=9, features=4)
+    assert grid.cells == [(4,) * 3, (8,) * 3, (16,) * 3] and grid.sizes == [125, 512, 512]
     assert grid.tables.shape == (125 + 512 + 512, 4) and grid.width == 12
     assert 0 < grid.tables.abs().max() <= 1e-4
     unit = torch.rand(7, 3)

@@ -48,7 +48,7 @@ SAME = [
     (hashgrid, {}, {"entries": 13, "width": 12}),
     (tensorf, {"degree": 1}, {"degree": 3, "finest": 12, "width": 16, "components": 8, "colours": 8}),
     (voxels, {}, {"degree": 2, "finest": 12}),
-    (mlp, {"depth": 4, "skip": 2}, {"depth": 4, "skip": 2, "width": 16}),
+    (mlp, {}, {"depth": 4, "width": 16}),
 ]
 
 
@@ -76,7 +76,7 @@ def test_warm_start_larger_field_is_same_function_and_learns(make: Callable[...,
 
 def hashgrid2d(levels: int = 2, finest: int = 8, width: int = 8) -> PictureField:
     field = HashGrid2DField((32, 24), levels=levels, log2_entries=10, coarsest=4, finest=finest, width=width)
-    torch.nn.init.normal_(field.tables)
+    torch.nn.init.normal_(field.grid.tables)
     return field
 
 

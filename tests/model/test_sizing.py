@@ -20,7 +20,7 @@ BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 1.0]])
 
 def hashgrid(bounds: Bounds, coarsest: int, finest: int, size: str) -> list[int]:
     field = HashGridField(bounds, levels=3, log2_entries=8, coarsest=coarsest, finest=finest, size=size)
-    return field.grid.resolutions
+    return [side for side, *_ in field.grid.cells]
 
 
 def tensorf(bounds: Bounds, coarsest: int, finest: int, size: str) -> list[int]:

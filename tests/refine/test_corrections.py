@@ -16,7 +16,6 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import use_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
 from nerf_lightning.refine import Corrections, summarize_corrections
-from nerf_lightning.refine.corrections import FIRST_TRIAL_STEP
 from nerf_lightning.refine.gauge import gauge_directions
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.runs.data import data_again
@@ -25,7 +24,8 @@ from nerf_lightning.runs.scene_file import load_scene
 from nerf_lightning.sampler import Samples, UniformSampler
 from nerf_lightning.synthetic import corruptions
 from nerf_lightning.synthetic.bricks import bricks
-from nerf_lightning.system import aligned
+from nerf_lightning.system import photos
+from nerf_lightning.system.trial import FIRST_TRIAL_STEP
 from nerf_lightning.training.train import train
 from tests.helpers.soft_ball import BOX, cameras_around_ball, soft_ball
 
@@ -199,7 +199,8 @@ def test_corrections_gradients_match_differences_for_each_field(name: str, camer
 
 
 def test_run_with_corrections_reports_and_exports_them(tmp_path: Path, capsys, monkeypatch):
-    monkeypatch.setattr(aligned, "PIXELS", 64)
+    monkeypatch.setattr(photos, "ALIGN_PIXELS", 64)
+    monkeypatch.setattr(photos, "SCORED_PIXELS", 512)
     few = ["dataset.size=16", "dataset.train_views=4", "dataset.val_views=1", "dataset.rays=64", "budget.steps=12"]
     train(composed(["+experiment=smoke_3d", "refine=both", *few, *OFF], tmp_path))
     assert "refine: cameras turned by up to" in capsys.readouterr().out

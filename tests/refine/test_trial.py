@@ -10,21 +10,20 @@ from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Views
 from nerf_lightning.refine import Corrections
 from nerf_lightning.refine.color_correction import GAMMA
-from nerf_lightning.refine.corrections import (
-    EARLY_FACTOR,
-    EARLY_STEPS,
-    FAST_FACTOR,
-    FIRST_TRIAL_STEP,
-    LAST_TRIAL,
-    LR_FINAL_FACTOR,
-    MIN_GAIN,
-    START,
-    TRIAL_GROWTH,
-)
+from nerf_lightning.refine.corrections import FAST_FACTOR, LR_FINAL_FACTOR, START
 from nerf_lightning.renderer import RenderOutput, VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
-from nerf_lightning.system.fits import misfits
-from nerf_lightning.system.trial import least_squares, worth
+from nerf_lightning.system import misfits
+from nerf_lightning.system.trial import (
+    EARLY_STEPS,
+    FIRST_TRIAL_STEP,
+    MAX_TRIAL_PROGRESS,
+    MIN_GAIN,
+    choose,
+    least_squares,
+    list_candidates,
+    measure_gains,
+)
 from tests.helpers.soft_ball import BOX, cameras_around_ball, soft_ball
 
 VIEWS, SIZE = 6, 24
@@ -59,7 +58,7 @@ def tried(views: Views, given: Cameras | None = None) -> dict[str, float]:
     views = replace(views, cameras=given or views.cameras)
     corrections = Corrections(views.cameras, BOX, auto=True)
     before = [p.clone() for p in corrections.parameters()]
-    found = worth(see, views, BLACK, corrections, torch.Generator().manual_seed(1))
+    found = measure_gains(see, views, BLACK, corrections, torch.Generator().manual_seed(1))
     torch.testing.assert_close(list(corrections.parameters()), before)
     return found
 
@@ -103,39 +102,30 @@ def test_least_squares_is_damped():
     assert not found[:, 2].any()
 
 
-def test_trial_schedule_corrects_what_helps_and_retries_rest(views: Views):
-    corrections = Corrections(views.cameras, BOX, auto=True)
-    assert set(corrections.lr_factors(1.0).values()) == {0.0} and not corrections.enabled_at
-    assert not corrections.is_trial_due(FIRST_TRIAL_STEP - 1, START) and corrections.is_trial_due(
-        FIRST_TRIAL_STEP, START
-    )
-    assert not corrections.is_trial_due(FIRST_TRIAL_STEP, LAST_TRIAL + 0.01), "too late"
-    assert not Corrections(views.cameras, BOX, poses=False, auto=True).is_trial_due(FIRST_TRIAL_STEP, START), (
-        "too early for gains"
-    )
-    assert FIRST_TRIAL_STEP < EARLY_STEPS and corrections.list_candidates(FIRST_TRIAL_STEP) == ["poses"], (
-        "too early for gains"
-    )
+def test_trials_come_at_doubled_steps_and_gains_later(views: Views):
+    both, light = (Corrections(views.cameras, BOX, poses=poses, auto=True) for poses in (True, False))
+    steps = [FIRST_TRIAL_STEP * factor for factor in (1, 2, 4, 8)]
+    assert [step for step in range(200) if list_candidates(both, step, START)] == steps
+    assert [step for step in range(200) if list_candidates(light, step, START)] == steps[2:]
+    assert not list_candidates(both, steps[0], MAX_TRIAL_PROGRESS + 0.01), "too late"
+    assert list_candidates(both, steps[0], START) == ["poses"] and steps[2] > EARLY_STEPS
+    assert list_candidates(both, steps[2], START) == ["poses", "light"]
     enough = {"poses": 1.5 * MIN_GAIN["poses"], "light": 0.0}
-    assert (
-        EARLY_FACTOR > 1.5
-        and not corrections.choose(FIRST_TRIAL_STEP, enough)
-        and corrections.choose(EARLY_STEPS, enough) == ["poses"]
-    )
-    assert corrections.choose(FIRST_TRIAL_STEP, enough, 0.5) == ["poses"]
-    assert not corrections.choose(FIRST_TRIAL_STEP, enough, 0.8)
-    corrections.decide(FIRST_TRIAL_STEP, START, {"poses": 0.3})
-    assert corrections.poses.motions.requires_grad and not corrections.color.log_gains.requires_grad
-    assert not corrections.is_trial_due(EARLY_STEPS - 1, START) and corrections.is_trial_due(EARLY_STEPS, START)
-    assert not any(corrections.lr_factors(START - 0.001).values())
-    assert corrections.lr_factors(START) == {"poses": FAST_FACTOR, "light": 0.0}
-    assert corrections.lr_factors(1.0) == {"poses": LR_FINAL_FACTOR, "light": 0.0}
-    again = Corrections(views.cameras, BOX, auto=True)
+    assert choose(["poses"], steps[0], enough) == [] and choose(["poses", "light"], steps[2], enough) == ["poses"]
+    assert choose(["poses"], steps[0], enough, 0.5) == ["poses"] and choose(["poses"], steps[0], enough, 0.8) == []
+
+
+def test_decided_corrections_are_learned_and_resumed(views: Views):
+    corrections, again = (Corrections(views.cameras, BOX, auto=True) for _ in range(2))
+    assert set(corrections.lr_factors(1.0).values()) == {0.0} and not corrections.enabled_at
+    corrections.decide(START, ["poses"], {"poses": 0.3}, False)
+    assert not list_candidates(corrections, FIRST_TRIAL_STEP, START)
     again.load_trial_state(corrections.trial_state())
-    assert again.poses.motions.requires_grad and again.trial_state() == corrections.trial_state()
-    corrections.decide(10 * EARLY_STEPS, START, {"poses": 0.0, "light": 0.005, "stated": 0.0})
-    assert not corrections.is_trial_due(10 * EARLY_STEPS, START)
-    assert corrections.is_trial_due(int(10 * EARLY_STEPS * TRIAL_GROWTH), START)
+    for one in (corrections, again):
+        assert one.poses.motions.requires_grad and not one.color.log_gains.requires_grad
+        assert not any(one.lr_factors(START - 0.001).values())
+        assert one.lr_factors(START) == {"poses": FAST_FACTOR, "light": 0.0}
+        assert one.lr_factors(1.0) == {"poses": LR_FINAL_FACTOR, "light": 0.0}
 
 
 def test_gains_start_from_exposures_that_explain_photos(views: Views):
@@ -149,9 +139,9 @@ def test_gains_start_from_exposures_that_explain_photos(views: Views):
             return replace(seen := see(rays, behind), rgb=seen.rgb * brightness)
 
         corrections = Corrections(views.cameras, BOX, exposures=exposures, auto=True)
-        found = worth(darker, photos, BLACK, corrections, torch.Generator().manual_seed(1))
+        found = measure_gains(darker, photos, BLACK, corrections, torch.Generator().manual_seed(1))
         assert (found["stated"] > 0.5) == fits
-        corrections.decide(EARLY_STEPS, START, found | {"light": 1.0})
+        corrections.decide(START, ["light"], {"light": 1.0}, found["stated"] > 0)
         torch.testing.assert_close(corrections.color.log_gains.data, gains * fits)
     assert torch.equal(
         Corrections(views.cameras, BOX, exposures=exposures).color.log_gains.data, corrections.color.stated

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from nerf_lightning.cameras import Cameras, orbit_around, resample_path
 from nerf_lightning.errors import InputError
-from nerf_lightning.render.camera_path import build_path
+from nerf_lightning.render.camera_path import SPLITS, build_path
 from nerf_lightning.render.path_file import read_path
 from nerf_lightning.synthetic.bricks import bricks
 
@@ -47,7 +47,7 @@ def test_resample_path_open_keeps_its_ends_and_fewer_are_spread():
 )
 def test_build_path_words(path: str, frames: int | None, count: int):
     scene = bricks(size=16, train_views=4, val_views=2, orbit_views=6)
-    route = build_path(path, frames, scene.orbit, scene, torch.eye(4))
+    route = build_path(path, frames, scene.orbit, scene if path in SPLITS else None, torch.eye(4))
     assert len(route.cameras) == len(route.views) == count
     if path == "train":
         assert route.views == [0, 2, 3] or len(set(route.views)) == 3
@@ -106,11 +106,8 @@ PATH = '{"width": 4, "height": 4, "K": [[%s,0,2],[0,1,2],[0,0,1]], "c2w": %s}'
     ("content", "message"),
     [
         ('{"width": 4}', "KeyError: 'height'"),
-        (PATH % (1, "[]"), "shape"),
         (PATH % ("NaN", "[[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]"), "nan"),
-        (PATH.replace("4", "10000000") % (1, "[]"), "pixels that take at least"),
         (PATH % (0, "[[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]"), "K: found"),
-        ('{"render_width": 1e999, "render_height": 4, "camera_path": []}', "cannot convert float infinity"),
         (THEIRS % (4, 0), "division by zero"),
         (PATH % (1, "[[[-1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]"), "mirror"),
         ('{"path": [{"R": [0,0,0,0], "T": [0,0,0], "fov": 50}]}', "zero norm"),

@@ -6,21 +6,16 @@ import pytest
 import torch
 
 from nerf_lightning.kernels import volume_weights
-from nerf_lightning.renderer.depth import median_depth
 from nerf_lightning.renderer.losses import distortion_loss, near_loss, view_loss
+from nerf_lightning.renderer.renderer import median_depth
 from nerf_lightning.sampler import Samples
 from tests.helpers.ragged_samples import COUNTS, ragged_samples
 
 
-def packed(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, Samples]:
+def packed(counts: list[int]) -> tuple[torch.Tensor, Samples]:
     """Densities of rays with so many samples each, in double precision."""
-    generator = torch.Generator().manual_seed(seed)
-    edges = [0.2 + torch.rand(n + 1, generator=generator, dtype=torch.float64).cumsum(0) for n in counts]
-    t = torch.cat([(e[1:] + e[:-1]) / 2 for e in edges])
-    dt = torch.cat([e.diff() for e in edges])
-    ray = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
-    offsets = torch.tensor([0, *counts]).cumsum(0)
-    return torch.rand(len(t), generator=generator, dtype=torch.float64), Samples(t, dt, ray, offsets)
+    samples = ragged_samples(counts, torch.float64)
+    return torch.rand(len(samples), dtype=torch.float64), samples
 
 
 def weights(density: torch.Tensor, samples: Samples) -> torch.Tensor:
@@ -48,7 +43,7 @@ def test_distortion_loss_matches_sum_over_pairs(counts: list[int]):
 
 
 def test_near_loss_falls_with_distance():
-    density, samples = packed([6, 6], seed=1)
+    density, samples = packed([6, 6])
     nearness = 0.5 / (samples.t + 0.5)
     w = weights(density, samples)
     torch.testing.assert_close(near_loss(w, samples, 0.5), (w * nearness**4).view(2, 6).sum(1).mean())
@@ -58,7 +53,7 @@ def test_near_loss_falls_with_distance():
 
 
 def test_view_loss_has_no_gradient_of_weights():
-    density, samples = packed([6, 0, 3], seed=2)
+    density, samples = packed([6, 0, 3])
     view_part = torch.rand(9, 3, dtype=torch.float64, requires_grad=True)
     w = weights(density.requires_grad_(), samples)
     loss = view_loss(w, view_part, samples)
@@ -70,7 +65,7 @@ def test_view_loss_has_no_gradient_of_weights():
 
 
 def test_view_loss_plain_places_cost_more():
-    density, samples = packed([6, 0, 3], seed=2)
+    density, samples = packed([6, 0, 3])
     w, plain = weights(density, samples), torch.tensor([1.0, 0.3, 0.5], dtype=torch.float64)
     view_part = 0.1 + torch.rand(9, 3, dtype=torch.float64)
     sizes = w * view_part.norm(dim=1)

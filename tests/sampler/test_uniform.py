@@ -37,9 +37,9 @@ def test_uniform_sampler_takes_equal_steps(count: int, box: Bounds, rays: Rays):
         torch.testing.assert_close(samples.t[part], middle, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize(("count", "unbounded"), [(1, False), (16, False), (16, True)])
-def test_uniform_sampler_jitter_stays_in_stratum(count: int, unbounded: bool, box: Bounds, rays: Rays):
-    bounds = replace(box, unbounded=unbounded)
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_uniform_sampler_jitter_stays_in_stratum(unbounded: bool, box: Bounds, rays: Rays):
+    bounds, count = replace(box, unbounded=unbounded), 16
     sampler = UniformSampler(bounds, count, stratified=True)
     near, far = bounds.near_far(rays)
     rays, near, far = (x[near < far] for x in (rays, near, far))
@@ -49,35 +49,21 @@ def test_uniform_sampler_jitter_stays_in_stratum(count: int, unbounded: bool, bo
     torch.testing.assert_close(jittered[0][:, [0, -1]], sampler.edges(rays, None)[:, [0, -1]])
     inner = jittered[:, :, 1:-1]
     assert (inner >= strata[:, :-1] - 1e-4).all() and (inner <= strata[:, 1:] + 1e-4).all()
-    if count > 1:  # and uses the whole of it
-        share = (inner - strata[:, :-1]) / strata.diff(dim=1)
-        assert share.amin() < 0.05 and share.amax() > 0.95
-        if not unbounded:
-            assert abs(float(share.mean()) - 0.5) < 0.05
+    share = (inner - strata[:, :-1]) / strata.diff(dim=1)
+    assert share.amin() < 0.05 and share.amax() > 0.95, "and uses the whole of it"
+    assert unbounded or abs(float(share.mean()) - 0.5) < 0.05
 
 
-@pytest.mark.parametrize("kind", ["random", "one", "none", "sparse"])
-def test_inverse_cdf_any_weights_inverts_cumulated_weights(kind: str):
-    edges = torch.rand(20, 11).cumsum(1)
-    weights = {
-        "random": torch.rand(20, 10),
-        "one": torch.eye(10).repeat(2, 1),
-        "none": torch.zeros(20, 10),
-        "sparse": torch.rand(20, 10) * (torch.rand(20, 10) < 0.3),
-    }[kind]
-    u = torch.rand(20, 40)
-    u[:, :2] = torch.tensor([0.0, 1.0])
-    actual = inverse_cdf(edges, weights, u).numpy()
+def test_inverse_cdf_inverts_cumulated_weights():
+    edges, u = torch.rand(20, 11).cumsum(1), torch.rand(20, 40)
+    weights = torch.rand(20, 10) * (torch.rand(20, 10) < 0.3)
+    weights[0] = 0  # falls back to uniform in the interval's number
+    found = inverse_cdf(edges, weights, u)
     for r in range(20):
-        # The floor lets an empty ray fall back to uniform in the interval's number.
-        cdf = np.concatenate([[0], np.cumsum(weights[r].double().numpy() + 1e-5)])
-        expected = np.interp(u[r].double().numpy(), cdf / cdf[-1], edges[r].double().numpy())
+        cdf = torch.cat([torch.zeros(1), (weights[r].double() + 1e-5).cumsum(0)])
         # What counts is the probability mass between the two answers: distances jump where there is no weight.
-        mass = np.interp(actual[r], edges[r].double().numpy(), cdf / cdf[-1]) - u[r].double().numpy()
+        mass = np.interp(found[r], edges[r], cdf / cdf[-1]) - u[r].numpy()
         assert np.abs(mass).max() < 1e-4
-        if kind in ("random", "none"):
-            np.testing.assert_allclose(actual[r], expected, atol=2e-3)
-        assert actual[r].min() >= edges[r, 0] and actual[r].max() <= edges[r, -1]
 
 
 def ball(radius: float, density: float):

@@ -1,4 +1,5 @@
 import functools
+import math
 
 import pytest
 import torch
@@ -6,7 +7,8 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays
 from nerf_lightning.dataset import Picture, PictureBatch, PixelDataModule, ViewBatch
-from nerf_lightning.model import Field, PictureField
+from nerf_lightning.dataset.picture import builtin_picture
+from nerf_lightning.model import Field, PictureField, PictureMLP
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
 from nerf_lightning.system import NeRF2D, NeRF3D, constant
@@ -86,3 +88,30 @@ def test_render_rays_past_bounds_show_background(slab: NeRF3D):
     away = Rays(torch.full((3, 3), 5.0), torch.eye(3))
     seen = slab.render(away)
     assert torch.equal(seen.rgb, torch.ones(3, 3)) and (seen.depth == 0).all()
+
+
+@pytest.fixture
+def sunset() -> PictureBatch:
+    return PixelDataModule(Picture("sunset", "test", builtin_picture(20))).held_out(0)
+
+
+def test_diagnose_field_of_one_colour_is_told(sunset: PictureBatch):
+    field = PictureMLP((20, 20), width=16)
+    assert NeRF2D(field, ADAM, constant).diagnose(sunset) == ""
+    field.net[-1].bias.data += 100  # saturates
+    assert "same colour" in NeRF2D(field, ADAM, constant).diagnose(sunset)
+
+
+class Wave(PictureField):
+    """A cosine of one cycle across the picture."""
+
+    def forward(self, uv: torch.Tensor) -> torch.Tensor:
+        return (0.5 + 0.4 * torch.cos(2 * torch.pi * uv[:, :1])).expand(-1, 3)
+
+
+def test_between_pixels_compares_with_mean_of_neighbours(sunset):
+    system = NeRF2D(Wave((20, 20)), ADAM, constant)
+    # Neighbours of the wave are 18 degrees apart: their mean falls short of it by 1 - cos(9 degrees).
+    expected = -10 * math.log10((0.4 * (1 - math.cos(math.radians(9)))) ** 2 / 2)
+    found = system.between(PictureBatch(sunset.uv, system.colours(sunset.uv), 20, 20))
+    assert found == pytest.approx(expected, abs=0.3)

@@ -1,4 +1,5 @@
 import math
+from itertools import pairwise
 
 import pytest
 
@@ -9,21 +10,19 @@ STEPS = [i / 200 for i in range(201)]
 
 
 @SCHEDULES
-@pytest.mark.parametrize("warmup", [0.05, 0.3])
-def test_schedule_warmup_rises_linearly(schedule, warmup):
-    assert 0 < schedule(0.0, 0, warmup) < 0.05, "small, but no step is lost"
-    assert schedule(warmup, 0, warmup) == pytest.approx(schedule(warmup, 0, 0.0))
-    rising = [schedule(p, 0, warmup) / schedule(p, 0, 0.0) for p in STEPS if p <= warmup]
-    assert all(a < b for a, b in zip(rising, rising[1:], strict=False))
-    slopes = [b - a for a, b in zip(rising, rising[1:], strict=False)]
-    assert max(slopes) == pytest.approx(min(slopes)), "in a straight line"
+def test_schedule_warmup_rises_linearly(schedule):
+    assert 0 < schedule(0.0, 0, 0.3) < 0.05, "small, but no step is lost"
+    rising = [schedule(p, 0, 0.3) / schedule(p, 0, 0.0) for p in STEPS if p <= 0.3]
+    assert rising[-1] == pytest.approx(1)
+    slopes = [b - a for a, b in pairwise(rising)]
+    assert min(slopes) > 0 and max(slopes) == pytest.approx(min(slopes)), "in a straight line"
 
 
-@pytest.mark.parametrize(("schedule", "final"), [(exponential, 0.1), (exponential, 0.01), (cosine, 0.0), (cosine, 0.2)])
+@pytest.mark.parametrize(("schedule", "final"), [(exponential, 0.1), (cosine, 0.2)])
 def test_schedule_falls_to_final_factor(schedule, final):
     values = [schedule(p, 0, 0.0, final) for p in STEPS]
     assert values[0] == 1 and values[-1] == pytest.approx(final)
-    assert all(a > b for a, b in zip(values, values[1:], strict=False))
+    assert all(a > b for a, b in pairwise(values))
     halfway = math.sqrt(final) if schedule is exponential else (1 + final) / 2
     assert values[100] == pytest.approx(halfway)
 

@@ -9,7 +9,6 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
-from nerf_lightning.callbacks.evaluation import peak_memory_bytes
 from nerf_lightning.config.build import build_system, build_trainer, device_of
 from nerf_lightning.config.compose import composed
 from nerf_lightning.config.limits import Limits, limits_of
@@ -20,8 +19,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.runs.owner import LOCK, MARKER
 from nerf_lightning.synthetic.objects import MARBLE, make_scene
 from nerf_lightning.system import NeRF2D
-from nerf_lightning.utils.device import CPU, devices, synchronize, the_device
-from nerf_lightning.utils.machine import device_in_words
+from nerf_lightning.utils.device import CPU, devices, the_device
 
 
 @pytest.fixture
@@ -31,13 +29,6 @@ def plain_torch(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(kind, "is_available", lambda: False)
     for kind in (torch.backends.cuda, torch.backends.mps):
         monkeypatch.setattr(kind, "is_built", lambda: False)
-
-
-@pytest.mark.parametrize("device", ["cuda", "nonsense"])
-def test_missing_device_is_refused_before_anything_is_written(device: str, inside, plain_torch: None, tmp_path: Path):
-    code, _, err = inside("dataset.path=nowhere.npz", "dataset=photos", f"device={device}")
-    assert code == 2 and err.count("\n") == 1 and f"config: device: found '{device}'" in err, err
-    assert not list(tmp_path.iterdir())
 
 
 def test_resumed_run_may_use_another_device(inside, small_run: Path, plain_torch: None, tmp_path: Path):
@@ -120,18 +111,3 @@ def test_resumed_batch_is_scaled_to_the_device():
     other = RayDataModule(scene, 100)
     other.load_state_dict(fixed.state_dict())
     assert other.rays == 100
-
-
-def test_accelerators_are_named_measured_and_waited_for(monkeypatch: pytest.MonkeyPatch):
-    waited = []
-    for kind, name, memory in ((torch.cuda, "get_device_name", "max_memory_allocated"), (torch.mps, "", "")):
-        monkeypatch.setattr(kind, "synchronize", lambda kind=kind: waited.append(kind))
-        if name:
-            monkeypatch.setattr(kind, name, lambda device: "H100")
-            monkeypatch.setattr(kind, memory, lambda device: 5)
-    words = [device_in_words(torch.device(name)) for name in ("cpu", "cuda:1", "xpu")]
-    assert words == ["cpu", "cuda (H100)", "xpu"]
-    assert peak_memory_bytes(torch.device("cuda:1")) == 5 and (peak_memory_bytes(CPU) or 0) > 1000
-    for name in ("cpu", "cuda", "mps"):
-        synchronize(torch.device(name))
-    assert waited == [torch.cuda, torch.mps]

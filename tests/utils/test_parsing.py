@@ -92,38 +92,33 @@ def npy_of_shape(shape: str) -> bytes:
     return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(6)
 
 
-def read_all(content: bytes) -> dict[str, np.ndarray]:
-    return read_npz(content, None, lambda headers: None, "given.npz")
-
-
 def test_read_npz_reads_known_arrays_only():
     content = archive(("a.npy", npy(ROWS)), ("b.npy", b"damaged"), ("note.txt", b"hello"))
-    seen: list[object] = []
-    read = read_npz(content, ("a", "c"), seen.append)
-    assert list(read) == ["a"] and (read["a"] == ROWS).all() and str(seen[0]).count("shape=(2, 3)") == 1
+    read = read_npz(content, ("a", "c"))
+    assert list(read) == ["a"] and (read["a"] == ROWS).all()
 
 
 @pytest.mark.parametrize(
     ("content", "found"),
     [
         (archive(("a", b"text")), "unreadable"),
-        (archive(("a.npy", npy(ROWS)[:-1])), "47 bytes for an array"),
-        (archive(("a.npy", npy_of_shape("(10000, 10000, 10000)"))), "6 bytes for an array"),
+        (archive(("a.npy", npy(ROWS)[:-1])), "EOF"),
+        (archive(("a.npy", npy_of_shape("(100000, 100000, 100000)"))), "allocate"),
         (archive(("a.npy", npy(np.array([{}])))), "Object arrays"),
         (b"PK", "BadZipFile"),
     ],
 )
 def test_read_npz_refuses_damage(content: bytes, found: str):
     with pytest.raises(InputError, match="given.npz") as caught:
-        read_all(content)
+        read_npz(content, None, "given.npz")
     assert found in str(caught.value)
 
 
 @pytest.mark.parametrize(
     "read",
     [
-        lambda path: read_all(archive(("a.npy", path.read_bytes()))),
-        lambda path: read_npy(path, lambda _: None),
+        lambda path: read_npz(archive(("a.npy", path.read_bytes())), None),
+        read_npy,
         lambda path: read_json(path, "figures"),
     ],
 )

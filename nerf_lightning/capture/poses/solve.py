@@ -156,8 +156,7 @@ def solve(
     if not options:
         folder = sightings[0].path.parent
         raise InputError(folder, "", "tags that fit no camera", "photos of flat, undamaged tags, of the size given")
-    seen = [points_and_pixels(s.marks, tags) for s, _ in options]
-    chosen = resolve_flips(lens, [found for _, found in options], seen)
+    chosen = resolve_flips([found for _, found in options], [points_and_pixels(s.marks, tags)[0] for s, _ in options])
     ids = tuple(sorted({tag for s, _ in options for tag in s.marks if tag in tags}))
     row = {tag: n for n, tag in enumerate(ids)}
     bundle = Bundle(

@@ -13,9 +13,6 @@ from nerf_lightning.utils.parsing import read_yaml
 SQUARE = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) / 2
 """Corners of a tag of side 1 in its own frame, in OpenCV's order: the printed top left first, then clockwise."""
 
-MAX_TAGS = 2320
-"""In the largest of OpenCV's families, DICT_APRILTAG_36h10."""
-
 SHEETS = Path(__file__).parent / "sheets"
 """Layouts that come with the package."""
 
@@ -68,8 +65,8 @@ def read_layout(path: Path, dictionary: str, size: float) -> TagLayout:
     for tag, entry in tags.items():
         given = {"turn": 0.0} | (entry if isinstance(entry, dict) else {})
         plain = [type(number) in (int, float) and abs(number) <= FARTHEST for number in given.values()]
-        if type(tag) is not int or not 0 <= tag < MAX_TAGS or set(given) != {"x", "y", "turn"} or not all(plain):
-            expected = f"an id below {MAX_TAGS} with x and y in metres, and optionally turn in degrees"
+        if type(tag) is not int or tag < 0 or set(given) != {"x", "y", "turn"} or not all(plain):
+            expected = "an id with x and y in metres, and optionally turn in degrees"
             raise InputError(path, f"tags.{tag}", repr(entry), expected)
         poses[tag] = flat_pose(given["x"], given["y"], given["turn"])
     return TagLayout(dictionary, size, poses)

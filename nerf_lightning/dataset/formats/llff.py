@@ -34,7 +34,7 @@ def load_llff(folder: Path, name: str | None = None, options: PhotoLoadOptions =
         InputError: a damaged file, or as many photos as poses are not there.
     """
     path = folder / POSES
-    rows = checks.parse_floats(path, "", read_npy(path, lambda header: None))
+    rows = checks.parse_floats(path, "", read_npy(path))
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise InputError(path, "", f"shape {rows.shape}", "numbers of shape (photos, 17)")
     columns = rows[:, :15].reshape(-1, 3, 5)

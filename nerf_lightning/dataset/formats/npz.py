@@ -15,10 +15,9 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.posed import Hints, assemble_scene, split_shots
-from nerf_lightning.dataset.resize import fit_size, resize_views
+from nerf_lightning.dataset.resize import area_resize, choose_resize, fit_size
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions
-from nerf_lightning.dataset.size import choose_resize
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic
@@ -49,20 +48,22 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     Raises:
         InputError: anything missing, malformed or contradictory.
     """
-    data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS), lambda headers: None)
+    data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS))
     checks.require_keys(path, data, NEEDED)
     images = {key: read_images(path, key, data) for key in PAIRS if key in data}
     count, height, width, channels = images["images_train"].shape
-    longest = choose_resize(path, [(width, height)] * count, channels, options.resize)
+    size = fit_size(width, height, choose_resize(path, [(width, height)] * count, channels, options.resize))
     K = read_intrinsics(path, data, width, height)
 
     def read_poses(key: str) -> Cameras:
         c2w = torch.from_numpy(checks.check_poses(path, key + "[{}]", data[key]))
-        return Cameras.of_size(K.repeat(len(c2w), 1, 1), c2w, width, height)
+        return Cameras.of_size(K.repeat(len(c2w), 1, 1), c2w, width, height).resized(size)
 
-    train, *held_out = (
-        resize_views(Views.of(torch.from_numpy(some), read_poses(PAIRS[key])), longest) for key, some in images.items()
-    )
+    def make_views(key: str, stack: UInt8[np.ndarray, "V H W C"]) -> Views:
+        resized = stack if size == (width, height) else np.stack([area_resize(image, *size) for image in stack])
+        return Views.of(torch.from_numpy(resized), read_poses(PAIRS[key]))
+
+    train, *held_out = (make_views(key, stack) for key, stack in images.items())
     if not held_out:
         log.warning("%s: no held-out photos: every %d-th training photo is held out", path, options.holdout)
         split = split_shots(path, len(train), options.holdout)
@@ -73,7 +74,7 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     has_path = "c2ws_test" in data and "images_test" not in data
     hints = Hints(
         keep_frame=True,
-        path=read_poses("c2ws_test").resized(fit_size(width, height, longest)) if has_path else None,
+        path=read_poses("c2ws_test") if has_path else None,
         background=read_background(path, data["background"]) if "background" in data else None,
         bounds=read_bounds(path, data, options) if "aabb" in data else None,
         to_source=checks.check_similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,

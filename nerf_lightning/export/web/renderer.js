@@ -27,7 +27,7 @@ class Renderer {
     const lines = Object.entries(constants).map(([name, value]) => `#define ${name} ${value}\n`);
     this.program = this.link(TRIANGLE, "#version 300 es\n" + lines.join("") + this.source);
     gl.useProgram(this.program);
-    const gaps = gapsOf(this.compact.bits("sampler.occupied"), sampler.cells), cells = [sampler.cells, sampler.cells, sampler.cells];
+    const gaps = gapsOf(this.compact.bits("sampler.grid.occupied"), sampler.cells), cells = [sampler.cells, sampler.cells, sampler.cells];
     const textures = { gaps: makeTexture(gl, gl.TEXTURE_3D, "whole", cells, gaps, false), ...field.textures };
     Object.entries(textures).forEach(([name, { target, texture }], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);

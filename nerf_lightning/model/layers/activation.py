@@ -1,7 +1,7 @@
 """From a network's raw output to a density."""
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -45,25 +45,21 @@ def shifted_softplus(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 class SoftenableReLU(torch.nn.Module):
     """ReLU, the original NeRF's density. Zero density has no gradient, so a field can die: `soften` is the way out."""
 
-    soft: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("soft", torch.tensor(False))  # saved in checkpoints, as it changes what the weights mean
-        self._soft = False
-        """The same on the host."""
+    is_soft = False
 
     def soften(self) -> None:
         """From now on `shifted_softplus`."""
-        self.soft.fill_(True)
-        self._soft = True
+        self.is_soft = True
 
     def forward(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        return shifted_softplus(x) if self._soft else torch.relu(x)
+        return shifted_softplus(x) if self.is_soft else torch.relu(x)
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        super()._load_from_state_dict(state_dict, prefix, *rest)
-        self._soft = bool(self.soft)
+    def get_extra_state(self) -> Tensor:
+        """Saved in checkpoints, as it changes what the weights mean."""
+        return torch.tensor(self.is_soft)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        self.is_soft = bool(state)
 
 
 Activation = Literal["relu", "softplus", "exp"]

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf_lightning.kernels import spherical_harmonics
 from nerf_lightning.kernels.constants import constant
 
 
@@ -19,3 +20,13 @@ def sinusoidal(x: Float[Tensor, "*batch D"], frequencies: int) -> Float[Tensor, 
 @constant
 def _octaves(frequencies: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "L 1"]:
     return math.pi * 2.0 ** torch.arange(frequencies, device=device, dtype=dtype)[:, None]
+
+
+def num_sh_bases(degree: int) -> int:
+    """Number of spherical harmonics up to a degree, including the constant one."""
+    return (degree + 1) ** 2
+
+
+def encode_directions(directions: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "N count"]:
+    """The first `count` spherical harmonics of unit directions."""
+    return spherical_harmonics(directions)[:, :count]

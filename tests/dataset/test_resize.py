@@ -12,10 +12,10 @@ import torch
 from nerf_lightning.config.build import build_data
 from nerf_lightning.config.compose import composed
 from nerf_lightning.dataset import RayDataModule, Views, open_scene, save_npz
-from nerf_lightning.dataset import size as size_module
+from nerf_lightning.dataset import resize as resize_module
 from nerf_lightning.dataset.intrinsics import Intrinsics
+from nerf_lightning.dataset.resize import AutoResize, auto_resize, choose_resize, find_reduced
 from nerf_lightning.dataset.shots import PhotoLoadOptions, Shot, read_shots
-from nerf_lightning.dataset.size import AutoResize, auto_resize, choose_resize, find_reduced
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config, save_config
@@ -44,14 +44,14 @@ def test_auto_resize_work_decides_the_side():
 
 def test_choose_resize_divides_by_a_whole_number(monkeypatch: pytest.MonkeyPatch):
     for size, longest in (((4032, 3024), 1008), ((1080, 1920), 960), ((1440, 1080), None)):
-        assert choose_resize("here", [(300, 200), size], 3, AutoResize(1000, "180 s on 2 threads")) == longest
-    monkeypatch.setattr(size_module, "free_memory", lambda: 2.5 * 100 * 3 * 700 * 525)
-    assert choose_resize("here", [(4000, 3000)] * 100, 3, AutoResize(1000, "much time")) == 667, "no room for a quarter"
+        assert choose_resize("here", [(300, 200), size], 3, AutoResize(1000)) == longest
+    monkeypatch.setattr(resize_module, "free_memory", lambda: 2.5 * 100 * 3 * 700 * 525)
+    assert choose_resize("here", [(4000, 3000)] * 100, 3, AutoResize(1000)) == 667, "no room for a quarter"
     with pytest.raises(InputError, match="expected auto, null or the longest side"):
         choose_resize("here", [(4, 3)], 3, "large")
 
 
-def test_open_scene_reduced_copies_are_used(views: Views, tmp_path: Path):
+def test_open_scene_reduced_copies_that_fit_are_used(views: Views, tmp_path: Path):
     write_scene("colmap", tmp_path, views)
     names = [file.name for file in (tmp_path / "images").iterdir()]
     for factor in (2, 4):
@@ -62,17 +62,11 @@ def test_open_scene_reduced_copies_are_used(views: Views, tmp_path: Path):
     half = open_scene(str(tmp_path), options=PhotoLoadOptions(24))
     assert (half.train.pixels == 72).all() and half.train.cameras.size(0) == (24, 20)
     torch.testing.assert_close(half.train.cameras.K[0], views.cameras.resized((24, 20)).K[0], atol=1e-4, rtol=0)
-
-
-def test_find_reduced_size_and_channels_fit(tmp_path: Path):
-    for folder, factor in (("images", 1), ("images_2", 2), ("images_4", 4)):
-        (tmp_path / folder / "left").mkdir(parents=True)
-        imageio.imwrite(tmp_path / folder / "left" / "a.png", np.zeros((40 // factor, 48 // factor, 4), np.uint8))
-    photo = tmp_path / "images" / "left" / "a.png"
+    photo = tmp_path / "images" / names[0]
     for size, folder in (((25, 21), "images"), ((13, 11), "images_2"), ((12, 10), "images_4")):
-        assert find_reduced(photo, size, False) == tmp_path / folder / "left" / "a.png"
-    imageio.imwrite(tmp_path / "images_4" / "left" / "a.png", np.zeros((10, 12, 3), np.uint8))
-    assert find_reduced(photo, (12, 10), False).parts[-3] == "images_2", "without alpha it is another photo"
+        assert find_reduced(photo, size, False) == tmp_path / folder / names[0]
+    imageio.imwrite(tmp_path / "images_4" / names[0], np.zeros((10, 12, 3), np.uint8))
+    assert find_reduced(photo, (12, 10), False).parts[-2] == "images_2", "without alpha it is another photo"
 
 
 def test_read_shots_reduced_jpeg_is_averaged(tmp_path: Path):
@@ -98,8 +92,8 @@ def test_read_shots_reduced_jpeg_is_averaged(tmp_path: Path):
 def test_data_again_keeps_the_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Whatever its budget, the threads and the memory are by then."""
     save_npz(bricks(size=48, train_views=4, val_views=2), tmp_path / "scene.npz")
-    monkeypatch.setattr(size_module, "MIN_LONGEST_PX", 16)
-    monkeypatch.setattr(size_module, "LONGEST_PX", 400)
+    monkeypatch.setattr(resize_module, "MIN_LONGEST_PX", 16)
+    monkeypatch.setattr(resize_module, "LONGEST_PX", 400)
     options = ["dataset=photos", f"dataset.path={tmp_path / 'scene.npz'}", "budget.steps=1", "threads=2"]
     cfg = composed(options, tmp_path)
     data = build_data(cfg)
