@@ -1,15 +1,17 @@
 """Data that can be read but cannot be learned from: wrong poses, wrong background, a box that is too small."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds
+from nerf_lightning.cameras import Bounds, Layout
+from nerf_lightning.cameras.layout import find_convergence
 from nerf_lightning.dataset.extent import MAX_VIEWS, border_colour, hull_coverage, silhouettes, visible_cube
 from nerf_lightning.dataset.matching.judge import Doubt, judge_cameras
+from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.errors import InputError
 
@@ -31,6 +33,13 @@ MAX_CONTENT = 0.9
 """Mean share of the photos up to which silhouettes say anything."""
 IN_BOX = 0.9
 """Coverage inside the box below which content lies outside it, provided the hull without the box fits well."""
+AROUND, OFF_CENTRE = 0.35, 0.5
+"""Mean of the directions to cameras up to which they stand all around, and the largest offset of the box, as a share of their
+distance."""
+FAR_OFF = 8.0
+"""Largest distance of cameras from the box's centre, in its half-sizes, in an unbounded scene."""
+BACKWARD = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+"""Turns a camera around."""
 CUT = 0.02
 """Mean share of a ray's way through the box that near or far may cut off."""
 
@@ -46,9 +55,7 @@ def check_scene(scene: Scene, corrected: bool = False) -> list[Doubt]:
         InputError: no method can learn anything from the data.
     """
     doubts = []
-    checks: list[Callable[[Scene], Iterable[Doubt]]] = [check_content, lambda _: judge_cameras(scene)[0]]
-    checks += [check_background, check_silhouettes, check_repeats, check_near_far]
-    for check in checks:
+    for check in (check_content, check_cameras, check_background, check_silhouettes, check_repeats, check_bounds):
         for doubt in check(scene):
             if doubt.hopeless and not (corrected and doubt.inexact):
                 expected = "photos and poses that fit each other"
@@ -66,6 +73,17 @@ def check_content(scene: Scene) -> Iterator[Doubt]:
         images = views.images
         if all(float((image.float() - images[0].float()).abs().mean()) < ALIKE for image in images[1:]):
             yield Doubt("training photos that are all alike", hopeless=True, todo=todo)
+
+
+def check_cameras(scene: Scene) -> Iterator[Doubt]:
+    """Cameras that do not fit the photos, by the matches between these; without matches, ones that look away."""
+    doubts, fits = judge_cameras(scene)
+    yield from doubts
+    c2w = scene.train.cameras.c2w
+    if doubts or fits or len(c2w) <= 2 or find_convergence(c2w) is not None:
+        return
+    if find_convergence(c2w @ BACKWARD) is not None:
+        yield Doubt("cameras with their backs to the point where their axes meet")
 
 
 def check_background(scene: Scene) -> Iterator[Doubt]:
@@ -120,11 +138,27 @@ def find_same_pose(some: Float[Tensor, "A 4 4"], others: Float[Tensor, "B 4 4"])
     return torch.where(alike.any(1), alike.int().argmax(1), -1)
 
 
+def check_bounds(scene: Scene) -> Iterator[Doubt]:
+    """A box beside what cameras all around look at, or far too small for it; near and far that leave out parts of the box."""
+    bounds, cameras = scene.bounds, scene.train.cameras
+    if not bounds.unbounded and (bounds.near, bounds.far) != (None, None):
+        yield from check_near_far(scene)
+    region = find_region(cameras.c2w)
+    off, size = float((region.centre - bounds.centre)[:2].norm()), bounds.longest
+    toward = torch.nn.functional.normalize(cameras.centres - region.centre.float(), dim=1)
+    around = region.layout == Layout.INWARD and float(toward[:, :2].mean(0).norm()) < AROUND
+    if around and off > OFF_CENTRE * region.unit:
+        yield Doubt(
+            f"cameras stand around a place {off:.2g} beside the box's centre, at a distance of {region.unit:.2g}: the box"
+            " misses what they look at"
+        )
+    elif bounds.unbounded and float((cameras.centres - bounds.centre).norm(dim=1).median()) > FAR_OFF * size:
+        yield Doubt(f"cameras stand more than {FAR_OFF:g} times the box's half-size of {size:.2g} off its centre")
+
+
 def check_near_far(scene: Scene) -> Iterator[Doubt]:
     """near and far that leave out parts of the box, by the rays of a few photos."""
     bounds, cameras = scene.bounds, scene.train.cameras
-    if bounds.unbounded or (bounds.near, bounds.far) == (None, None):
-        return
     rays = [Bounds(bounds.aabb).near_far(cameras.view_rays(view)) for view in range(min(len(cameras), 4))]
     near, far = map(torch.cat, zip(*rays, strict=True))
     meets = far > near

@@ -10,23 +10,26 @@ from typing import Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from nerf_lightning.cameras import Cameras, Lenses
 from nerf_lightning.dataset.formats.decode import THREADS, image_header, read_pixels, stated_exposure
 from nerf_lightning.dataset.intrinsics import Intrinsics
-from nerf_lightning.dataset.masks import read_mask
+from nerf_lightning.dataset.masks import MIN_KEPT, is_cut_out_by_mask, is_inverted, read_mask
 from nerf_lightning.dataset.orientation import has_shape
 from nerf_lightning.dataset.resize import AutoResize, area_resize, choose_resize, find_reduced, fit_size
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.text import subsample
 
 log = logging.getLogger(__name__)
 
 Masked = Literal["auto", "unknown", "empty"]
 Orientation = Literal["auto", "stored", "exif"]
+MAX_INSPECTED_MASKS, INSPECTED_SIDE_PX = 8, 1000
+"""Photos, evenly chosen, that tell what their masks mean, and the size at which that shows."""
 MIN_KNOWN = 250
 """Share of a pixel, in 1/255, that must be known after averaging for the pixel to be known."""
 
@@ -40,7 +43,7 @@ class PhotoLoadOptions:
             keeps their size.
         holdout: every N-th photo is held out, in the order of their names, where the format has no split of its own.
         masked: what masks and alpha leave out is "unknown" (a passer-by: not drawn, not scored) or "empty" (the subject is
-            cut out); "auto" takes alpha as empty and masks as unknown.
+            cut out); "auto" takes alpha as empty, and masks as empty where what they leave out is of one colour.
         invert_masks: masks are black where the photo is kept.
         bounded: "true", "false", or "auto", which decides by what the photos show, see `dataset.kind`.
         orientation: "stored", "exif", or "auto", see `dataset.orientation`.
@@ -83,8 +86,8 @@ def read_shots(source: Path, shots: Sequence[Shot], options: PhotoLoadOptions) -
     for shot, (width, height, _) in zip(shots, headers, strict=True):
         check_shape(source, shot, width, height)
     has_alpha = any(alpha for _, _, alpha in headers)
-    has_masks = any(shot.mask is not None for shot in shots)
-    cuts_out = has_masks and options.masked == "empty"
+    masked = interpret_masks(shots, options)
+    cuts_out = masked == "empty"
     channels = 4 if cuts_out or (has_alpha and options.masked != "unknown") else 3
     sizes = [(width, height) for width, height, _ in headers]
     longest = choose_resize(source, sizes, channels, options.resize)
@@ -92,7 +95,7 @@ def read_shots(source: Path, shots: Sequence[Shot], options: PhotoLoadOptions) -
     starts = np.cumsum([0] + [width * height for width, height in sizes])
     check_memory(source, "", f"{len(shots)} photos", float(starts[-1]) * channels, "give a smaller dataset.resize")
     pixels = np.empty((starts[-1], channels), np.uint8)
-    known = np.ones(starts[-1] if has_masks or has_alpha else 0, bool)
+    known = np.ones(starts[-1] if masked or has_alpha else 0, bool)
 
     def read(i: int) -> None:
         file = shots[i].photo if longest is None else find_reduced(shots[i].photo, sizes[i], shots[i].upright)
@@ -108,9 +111,6 @@ def read_shots(source: Path, shots: Sequence[Shot], options: PhotoLoadOptions) -
     with ThreadPoolExecutor(THREADS) as pool:
         for _ in tracked(pool.map(read, range(len(shots))), len(shots), "reading photos"):
             pass
-    if not known.all():
-        text = "%s: %.0f %% of the pixels are masked; dataset.masked and dataset.invert_masks say how masks are read"
-        log.info(text, source, 100 * (1 - known.mean()))
     exposures = [exposure for shot in shots if (exposure := stated_exposure(shot.photo)) is not None]
     return Views(
         torch.from_numpy(pixels),
@@ -153,3 +153,26 @@ def make_cameras(shots: Sequence[Shot]) -> Cameras:
         lenses = Lenses(coefficients.float(), torch.tensor([one.projection for one in optics]))
     K, c2w = (torch.from_numpy(np.stack(x)) for x in ([one.K for one in optics], [shot.c2w for shot in shots]))
     return Cameras(K.float(), c2w, torch.tensor([(one.width, one.height) for one in optics]), lenses)
+
+
+def interpret_masks(shots: Sequence[Shot], options: PhotoLoadOptions) -> str | None:
+    """What masks in files of their own leave out, see `PhotoLoadOptions`; None where there are none. A few are looked at."""
+    masks = [(shot, shot.mask) for shot in shots if shot.mask is not None]
+    if not masks:
+        return None
+    kept: list[Bool[np.ndarray, "_ _"]] = []
+    cut = []
+    for shot, mask in (masks[i] for i in subsample(len(masks), MAX_INSPECTED_MASKS)):
+        size = image_header(shot.photo, shot.upright)[:2]
+        image = read_pixels(shot.photo, shot.upright, fit_size(*size, INSPECTED_SIDE_PX))
+        kept.append(read_mask(mask, image.shape[1], image.shape[0], options.invert_masks) >= MIN_KEPT)
+        cut.append(is_cut_out_by_mask(image, kept[-1]))
+    if is_inverted(kept):
+        text = "most masks leave out one spot in the middle: are they inverted? dataset.invert_masks=%s takes them so"
+        log.warning(text, str(not options.invert_masks).lower())
+    meaning = options.masked
+    if meaning == "auto":
+        meaning = "empty" if np.mean(cut) > 0.5 else "unknown"
+    share = 1 - float(np.mean([one.mean() for one in kept]))
+    log.info("masks leave out about %.0f %% of the pixels: taken as %s", 100 * share, meaning)
+    return meaning

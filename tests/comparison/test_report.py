@@ -101,7 +101,12 @@ def test_collect_images_truth_comes_first(make_run: MakeRun):
 
 @pytest.mark.parametrize(
     "text",
-    ["one: 35 dB", f"one:\n{METHODS}", f"one:\n{ENTRY}  scenes: {{Toy: {{a: [35, 0]}}}}", f"one:\n{ENTRY}  scenes: {{Toy: {{a: 35}}}}"],
+    [
+        "one: 35 dB",
+        f"one:\n{METHODS}",
+        f"one:\n{ENTRY}  scenes: {{Toy: {{a: [35, 0]}}}}",
+        f"one:\n{ENTRY}  scenes: {{Toy: {{a: 35}}}}",
+    ],
 )
 def test_read_references_damaged_file_is_one_error(text: str, tmp_path: Path):
     (tmp_path / "mine.yaml").write_text(text)

@@ -64,14 +64,14 @@ def test_ray_data_held_out_masked_view_knows_its_pixels():
     assert (batch.width, batch.height) == (2, 5) and torch.equal(batch.known, known[12:22])
 
 
-def capture(folder: Path, views: Views) -> Path:
-    """A COLMAP capture whose photos are RGB on grey noise."""
+def capture(folder: Path, views: Views, background: int | None = None) -> Path:
+    """A COLMAP capture whose photos are RGB on grey noise, or on one grey."""
     rng = np.random.default_rng(0)
     rgb = []
     for i in range(len(views)):
         image = views.image(i).numpy()
         alpha = image[..., 3:] / 255
-        noise = rng.integers(0, 255, image.shape[:2])[..., None]
+        noise = rng.integers(0, 255, image.shape[:2])[..., None] if background is None else background
         rgb.append(np.rint(image[..., :3] * alpha + noise * (1 - alpha)).astype(np.uint8))
     names = photos(folder / "images", Views.of(torch.from_numpy(np.stack(rgb)), views.cameras))
     write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
@@ -86,15 +86,15 @@ def write_masks(folder: Path, views: Views, ending: str = ".png", side: int = 1)
         imageio.imwrite(folder / f"{i:04d}{ending}", mask.repeat(side, 0).repeat(side, 1))
 
 
-def test_open_scene_masks_beside_photos_are_found(views: Views, tmp_path: Path):
+@pytest.mark.parametrize("ending", [".png.png", "-removebg-preview.png"])
+def test_open_scene_masks_beside_photos_are_found(ending: str, views: Views, tmp_path: Path):
     folder = capture(tmp_path, views)
-    write_masks(folder / "masks", views, ".png.png")
-    imageio.imwrite(folder / "masks" / "0008.png.png", np.zeros((40, 48), np.uint8))
+    write_masks(folder / "masks", views, ending)
     scene = open_scene(str(folder))
-    assert scene.train.channels == 3 and len(scene.val) == 2, "a photo without known pixels is not held out"
+    assert scene.train.channels == 3
     assert torch.equal(scene.train.mask_of(0), views.image(1)[..., 3] > 127)
-    write_masks(folder / "masks", views, ".png")
-    with pytest.raises(InputError, match="masks of one photo"):
+    imageio.imwrite(folder / "masks" / f"0001{ending.replace('.png', '.PNG')}", np.zeros((40, 48), np.uint8))
+    with pytest.raises(InputError, match="2 masks for 0001.png"):
         open_scene(str(folder))
 
 
@@ -127,11 +127,19 @@ def test_open_scene_masks_in_subfolders_match_their_photos(views: Views, tmp_pat
     assert hidden == {"back": 0, "front": 40}, "the other camera's masks are not taken"
 
 
-def test_open_scene_mask_options_are_followed(views: Views, tmp_path: Path):
+def test_open_scene_masks_over_one_colour_cut_out(views: Views, tmp_path: Path):
+    folder = capture(tmp_path, views, background=255)
+    write_masks(folder / "images_mask", views)
+    assert open_scene(str(folder)).train.channels == 4, "these photos are cut out already"
+    assert open_scene(str(folder), options=PhotoLoadOptions(masked="unknown")).train.channels == 3
+
+
+def test_open_scene_mask_options_are_followed(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     folder = capture(tmp_path, views)
     write_masks(folder / "masks", views, side=2)
     chosen = PhotoLoadOptions(), PhotoLoadOptions(invert_masks=True), PhotoLoadOptions(masked="empty")
     straight, turned, empty = (open_scene(str(folder), options=options) for options in chosen)
+    assert "are they inverted? dataset.invert_masks=false takes them so" in caplog.text
     kept = views.image(1)[..., 3] > 127
     assert torch.equal(straight.train.mask_of(0), kept) and torch.equal(turned.train.mask_of(0), ~kept)
     assert empty.train.channels == 4 and empty.train.known is None and not empty.bounds.unbounded

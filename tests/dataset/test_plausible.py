@@ -2,18 +2,21 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.dataset import Scene, Views, plausible
+from nerf_lightning.dataset import Scene, Views, load_npz, plausible, save_npz
+from nerf_lightning.dataset.extent import border_colour
 from nerf_lightning.dataset.kind import check_visible
-from nerf_lightning.dataset.plausible import check_scene
+from nerf_lightning.dataset.plausible import check_bounds, check_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.synthetic.corruptions import change_poses, flip_axes, shuffle_poses
-from nerf_lightning.synthetic.objects import PILE, ROD, make_scene
+from nerf_lightning.synthetic.objects import MARBLE, PILE, ROD, make_scene
 
 WHITE = (1.0, 1.0, 1.0)
 Change = Callable[[Scene], Scene]
@@ -28,9 +31,18 @@ def pile() -> Scene:
     return make_scene(PILE, size=32)
 
 
-def test_check_scene_good_scene_has_no_doubt(pile: Scene):
-    others = make_scene(PILE, None, size=32), make_scene(ROD, WHITE, size=32), bricks(32, 12, 2)
-    assert [check_scene(scene) for scene in (pile, *others)] == [[]] * 4
+@pytest.mark.parametrize(
+    "scene",
+    [
+        lambda: make_scene(PILE, size=32),
+        lambda: make_scene(PILE, None, size=32),
+        lambda: make_scene(ROD, WHITE, size=32),
+        lambda: bricks(size=32, train_views=12, val_views=2),
+    ],
+    ids=["pile", "alpha", "rod", "bricks"],
+)
+def test_check_scene_good_scene_has_no_doubt(scene: Callable[[], Scene]):
+    assert check_scene(scene()) == []
 
 
 @pytest.mark.parametrize(
@@ -63,13 +75,35 @@ def test_check_scene_without_matches_judges_outlines(pile: Scene):
     assert "outlines that no body has" in doubt.text and not doubt.far_off
 
 
-def test_check_scene_empty_data_raises(pile: Scene):
-    images = pile.train.images[:1].repeat(len(pile.train), 1, 1, 1)
+@pytest.mark.usefixtures("no_matches")
+def test_check_scene_cameras_looking_away_are_doubted(pile: Scene):
+    away = flip_axes(replace(pile, bounds=Bounds(pile.bounds.aabb, unbounded=True)), 0)
+    (doubt,) = check_scene(away)
+    assert "cameras with their backs to the point" in doubt.text and not doubt.hopeless
+
+
+def black(scene: Scene) -> Scene:
+    return replace(scene, train=replace(scene.train, pixels=torch.zeros_like(scene.train.pixels)))
+
+
+def alike(scene: Scene) -> Scene:
+    images = scene.train.images[:1].repeat(len(scene.train), 1, 1, 1)
     images[1::2, ::5] ^= 1  # noise
-    alike, one = Views.of(images, pile.train.cameras), pile.train[torch.tensor([3])]
-    for views, words in ((one, "one photo to train on"), (alike, "all alike")):
-        with pytest.raises(InputError, match=words):
-            check_scene(replace(pile, train=views), corrected=True)
+    return replace(scene, train=Views.of(images, scene.train.cameras))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda scene: replace(scene, train=scene.train[torch.tensor([3])]), "one photo to train on"),
+        (black, "all alike"),
+        (alike, "all alike"),
+    ],
+    ids=["one", "black", "alike"],
+)
+def test_check_scene_empty_data_raises(change: Change, words: str, pile: Scene):
+    with pytest.raises(InputError, match=words):
+        check_scene(change(pile), corrected=True)
 
 
 def test_check_scene_doubtful_scene_warns(pile: Scene):
@@ -95,3 +129,24 @@ def test_check_visible_nothing_to_see_raises(pile: Scene):
     for hidden in (transparent, replace(views, known=torch.zeros(len(views.pixels), dtype=torch.bool))):
         with pytest.raises(InputError, match="leave out all of the training photos"):
             check_visible("photos", hidden)
+
+
+def test_border_colour_is_the_background(pile: Scene, tmp_path: Path):
+    assert border_colour(pile.train) == (0.0, 0.0, 0.0)
+    assert border_colour(make_scene(PILE, None, size=32).train) is None
+    path = tmp_path / "white.npz"
+    save_npz(make_scene(MARBLE, WHITE, size=32), path)
+    arrays = dict(np.load(path))
+    assert arrays.pop("background").tolist() == [1, 1, 1]
+    np.savez(path, **arrays)
+    assert load_npz(path).background == WHITE, "also where the file does not say"
+
+
+def test_check_bounds_box_beside_the_subject_is_doubted(pile: Scene):
+    aside = replace(pile.bounds, aabb=pile.bounds.aabb + torch.tensor([3.0, 0, 0]))
+    (text,) = (doubt.text for doubt in check_bounds(replace(pile, bounds=aside)))
+    assert "cameras stand around a place 3 beside the box's centre" in text
+    tiny = replace(pile.bounds, aabb=0.1 * pile.bounds.aabb, unbounded=True)
+    (text,) = (doubt.text for doubt in check_bounds(replace(pile, bounds=tiny)))
+    assert "times the box's half-size" in text
+    assert not list(check_bounds(replace(pile, bounds=replace(pile.bounds, unbounded=True))))
